@@ -38,7 +38,7 @@ from appliance.audit.verify import verify
 from appliance.channel.admin import PolicyWanted
 from appliance.channel.answers.policy import Granted
 from appliance.policy.grant import UngrantableError
-from appliance.shares.table import REST_EXPORTS, REST_STREAM_PEERS, REST_STREAMS
+from appliance.shares.table import REST_STREAM_PEERS, REST_STREAMS
 
 _T = TypeVar("_T")
 _SEARCHES = 4
@@ -137,7 +137,6 @@ class Desk:
     def __init__(self, services: Services) -> None:
         self.path = services.audit_log
         self.searches = asyncio.Semaphore(_SEARCHES)
-        self.exports = Streams(REST_EXPORTS, REST_EXPORTS, REST_EXPORTS.bounds.whole)
         self.streams = Streams(REST_STREAMS, REST_STREAM_PEERS, services.settings.api_limits.streams)
         self.verification = asyncio.Semaphore(1)
 
@@ -235,7 +234,7 @@ def routes(services: Services) -> Routes:
         proves it on any machine, with the appliance's public key.
         """
         entries = await desk.read(lambda: _begun(evidence(desk.path, wanted)))
-        give_back = desk.exports.take(bearer, peer_of(request), "exports")
+        give_back = services.exports.take(bearer, peer_of(request), "exports")
         return Held(StreamingResponse(_lines(entries), media_type="application/x-ndjson"), give_back)
 
     @router.get(

@@ -9,7 +9,7 @@ from appliance.api.access import Bearer, Role
 from appliance.api.control import ControlLink
 from appliance.api.gate import BEARER
 from appliance.api.problems import ProblemError
-from appliance.channel.admin import A, AdminAnswer, AdminRequest
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble
 
 _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token add`")
 
@@ -59,6 +59,10 @@ def answered(answer: AdminAnswer[A]) -> A:
     """The body of an answer. Raises `ProblemError` for a refusal."""
     if answer.ok:
         return answer.given()
-    status, kind = _PROBLEMS.get(answer.trouble, (503, "not-available"))
-    detail = "\n".join([answer.error, *answer.findings])
-    raise ProblemError(status, kind, detail)
+    raise problem_of(answer.trouble, "\n".join([answer.error, *answer.findings]))
+
+
+def problem_of(trouble: Trouble, detail: str) -> ProblemError:
+    """How a refusal is answered."""
+    status, kind = _PROBLEMS.get(trouble, (503, "not-available"))
+    return ProblemError(status, kind, detail)

@@ -8,14 +8,16 @@ from appliance.api.access import Doorkeeper
 from appliance.api.control import ControlLink
 from appliance.api.history import History
 from appliance.api.journal import Journal
+from appliance.api.streams import Streams
 from appliance.config import Settings
+from appliance.shares.table import REST_EXPORTS
 
 
 @dataclass(frozen=True, slots=True)
 class Services:
     """The parts that the routes share; `stopping` is set when the process is to end.
 
-    `judging` bounds the policy texts that are compiled at once."""
+    `judging` bounds the policy texts that are compiled at once, `exports` those of the audit log."""
 
     settings: Settings
     control: ControlLink
@@ -24,6 +26,9 @@ class Services:
     stopping: asyncio.Event
     history: History
     judging: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+    exports: Streams = field(
+        default_factory=lambda: Streams(REST_EXPORTS, REST_EXPORTS, REST_EXPORTS.bounds.whole)
+    )
 
     @property
     def audit_log(self) -> Path:

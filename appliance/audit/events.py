@@ -56,6 +56,7 @@ EVENTS: dict[str, str] = {
     "recording missed": "A trigger made no recording: `reason` says why (the hour's number, the disk).",
     "topic looked into": "Somebody has messages of a topic shown; `detail` has who, and the `seconds` it covers.",
     "rest call": "A REST call was answered; `detail` has who (the token's name), method and status.",
+    "evidence exported": "A bundle of evidence was made; `detail` has who, the hash of its manifest and its span.",
     "order refused": "RVMaster refused what was asked over REST: no token, role or proof; `detail.verb` says what.",
     "token added": "An access token for REST was made; `detail` has its name, role, id and end.",
     "token revoked": "An access token for REST was ended before its time.",

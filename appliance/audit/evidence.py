@@ -60,9 +60,10 @@ def _placed(path: Path, entries: list[Entry], *, whole: bool) -> Iterator[tuple[
     following = [entry.sequence for entry in entries[1:]] + ([0] if whole else [])
     with reading(path) as connection:
         connection.execute("BEGIN")
-        reader = _Reader(connection)
+        places = Places(connection)
         placed = [
-            (entry, reader.place(entry, after)) for entry, after in zip(entries, following, strict=False)
+            (entry, places.place(entry.sequence, after))
+            for entry, after in zip(entries, following, strict=False)
         ]
     for entry, chain in placed:
         if chain is None:
@@ -72,8 +73,8 @@ def _placed(path: Path, entries: list[Entry], *, whole: bool) -> Iterator[tuple[
         yield entry, chain
 
 
-class _Reader:
-    """Looks into one state of a log, at sequences that grow."""
+class Places:
+    """The places of records in one state of a log, asked for at sequences that grow."""
 
     def __init__(self, connection: sqlite3.Connection) -> None:
         self._connection = connection
@@ -82,22 +83,22 @@ class _Reader:
         self._unsealed = False
         self._before: tuple[int, str] = (-1, "")
 
-    def place(self, entry: Entry, following: int) -> Chain | None:
+    def place(self, sequence: int, following: int) -> Chain | None:
         """The place of a record, as far as the next one that is exported (0: none is); None if it is gone by now."""
         query = "SELECT hash FROM record WHERE sequence = ?"
-        row = self._connection.execute(query, (entry.sequence,)).fetchone()
+        row = self._connection.execute(query, (sequence,)).fetchone()
         if row is None:
             return None
         digest: bytes = row[0]
-        checkpoint = self._checkpoint(entry.sequence)
+        checkpoint = self._checkpoint(sequence)
         ends = checkpoint if checkpoint and (not following or checkpoint.sequence < following) else None
         upto = ends.sequence if ends else following - 1
-        previous = self._previous(entry.sequence)
-        self._before = entry.sequence, digest.hex()
+        previous = self._previous(sequence)
+        self._before = sequence, digest.hex()
         return Chain(
             previous=previous,
             hash=digest.hex(),
-            then=self._contents(digest, entry.sequence, upto) if upto > entry.sequence else [],
+            then=self._contents(digest, sequence, upto) if upto > sequence else [],
             checkpoint=ends,
         )
 

@@ -132,6 +132,7 @@ KINDS: dict[str, Kind] = {
     "recording removed": Kind(API, _DELETE),
     "recording missed": Kind(FINDING, _FOUND, _LOGGED),
     "topic looked into": Kind(API, _READ),
+    "evidence exported": Kind(API, _READ),
     "rest call": Kind(API, _BY_CALL),
     "order refused": Kind(API, _BY_CALL),
     "token added": Kind(ENTITY, _CREATE, about="Token"),

@@ -9,11 +9,12 @@ passes on `RestRequest`, which cannot make tokens, and gets the same document ba
 """
 
 import functools
-from typing import Any, Generic, Literal, TypeVar, cast, get_args
+from typing import Annotated, Any, Generic, Literal, TypeVar, cast, get_args
 
 import msgspec
 
 from appliance.channel.answers import (
+    evidence,
     graph,
     hosts,
     inventory,
@@ -376,6 +377,22 @@ class AuthorityWanted(AdminRequest[hosts.AuthorityCertificate], frozen=True, tag
     """The authority's certificate, in PEM."""
 
 
+class LogSealed(AdminRequest[evidence.Sealed], frozen=True, tag="audit seal"):
+    """Have all that was recorded sealed by a signed checkpoint, now."""
+
+
+class EvidenceExported(AdminRequest[evidence.Sealed], frozen=True, tag="evidence exported"):
+    """Record that a bundle was made whose manifest has this hash, and have that sealed.
+
+    It has so many `records`, from `since` until before `until` (nanoseconds since the epoch).
+    """
+
+    manifest: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+    since: int
+    until: int
+    records: int
+
+
 class ChallengeWanted(AdminRequest[tokens.Challenge], frozen=True, tag="challenge"):
     """A challenge, under which the next order over REST is signed."""
 
@@ -388,7 +405,7 @@ _Common = (
     StatusWanted | InventoryWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted
     | PolicyRevisions
     | RegistrationsWanted | GraphWanted | TopicLook | MetricsWanted | MonitorsWanted | MonitorRevisions
-    | MonitorRevisionWanted | MonitorChange | TokenList | TokenRevoke
+    | MonitorRevisionWanted | MonitorChange | TokenList | TokenRevoke | LogSealed | EvidenceExported
     | HostRequest
 )  # fmt: skip
 RestRequest = _Common | ChallengeWanted

@@ -73,6 +73,8 @@ OPERATIONS = (
     Operation(admin.MonitorSwitch, "operator", "PATCH", "/v1/monitors/{names}"),
     Operation(admin.MonitorResume, "operator", "PATCH", "/v1/monitors", says={"held": False}),
     Operation(admin.MonitorResume, "operator", "PATCH", "/v1/monitors/{names}", says={"held": False}),
+    Operation(admin.LogSealed, "operator"),
+    Operation(admin.EvidenceExported, "operator"),
     Operation(admin.TokenList, "admin", "GET", "/v1/tokens"),
     Operation(admin.TokenRevoke, "admin", "DELETE", "/v1/tokens/{name}"),
     Operation(admin.HostList, "viewer", "GET", "/v1/hosts"),

@@ -27,6 +27,23 @@ VERBS: dict[str, Verb | Group] = {
         "appliance.cli.protect:protect", "Close the ROS ports of this machine to all but the appliance."
     ),
     "audit": Verb("appliance.cli.audit.verbs:app", "Review the audit log and prove that it is complete."),
+    "evidence": Group(
+        "Evidence: what happened, in one file that proves itself elsewhere.",
+        {
+            "export": Verb(
+                "appliance.cli.evidence:export_evidence",
+                "Write what the log has of a time, and what was in force, as a bundle that proves itself anywhere.",
+            ),
+            "verify": Verb(
+                "appliance.cli.evidence:verify",
+                "Hold a bundle against what the appliance signed: exit status 0 right, 1 not, 2 when it is no bundle.",
+            ),
+            "verifier": Verb(
+                "appliance.cli.evidence:verifier",
+                "Write the verifier that comes with this version, for who does not trust the one in a bundle.",
+            ),
+        },
+    ),
     "policy": Verb(
         "appliance.cli.policy.verbs:app", "Check, explain, test, compare, learn and change access policies."
     ),

@@ -1,8 +1,8 @@
 """What operators can do with the running appliance, over the admin socket and over REST alike.
 
 One core for both: a request of `appliance.channel.admin` in, an answer out. A request is answered by the method that
-takes it: of `Looks`, `PolicyOrders`, `MonitorOrders`, `HostOrders`, `TokenOrders` or `RecordingOrders`. To add a
-question, write the request and the struct that answers it, and such a method.
+takes it: of `Looks`, `PolicyOrders`, `MonitorOrders`, `HostOrders`, `TokenOrders`, `RecordingOrders` or
+`EvidenceOrders`. To add a question, write the request and the struct that answers it, and such a method.
 """
 
 import inspect
@@ -13,6 +13,7 @@ from typing import Any
 from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
 from appliance.control.host_orders import HostOrders
 from appliance.control.looks import Looks
 from appliance.control.monitor_orders import MonitorOrders
@@ -44,8 +45,9 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     HostRefusedError: "refused",
     TokenRefusedError: "refused",
     RecorderAwayError: "failed",
+    NotSealedError: "failed",
 }
-_Orders = PolicyOrders | MonitorOrders | HostOrders | TokenOrders | RecordingOrders
+_Orders = PolicyOrders | MonitorOrders | HostOrders | TokenOrders | RecordingOrders | EvidenceOrders
 _Method = Callable[..., Awaitable[Any]]
 
 

@@ -29,6 +29,7 @@ from appliance.control.admin import AdminServer
 from appliance.control.administration import Administration
 from appliance.control.assembly import INNER, RVMASTER, Foundation, Parts
 from appliance.control.doors import Doors
+from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.forwarder import Forwarded
 from appliance.control.host_orders import HostOrders
 from appliance.control.lifeline import ControlLifeline
@@ -245,6 +246,7 @@ class _Control:
             HostOrders(self._hosts),
             TokenOrders(self._tokens),
             self._recordings,
+            EvidenceOrders(self._audit, base.trail),
         )
         self._rest = RestLink(
             administration,

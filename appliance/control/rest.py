@@ -23,12 +23,14 @@ from appliance.channel import messages
 from appliance.channel.admin import (
     AdminAnswer,
     ChallengeWanted,
+    EvidenceExported,
     HostAdd,
     HostEnrol,
     HostRenew,
     HostRenewed,
     HostRenewItself,
     HostToken,
+    LogSealed,
     TopicLook,
     encode,
     verb_of,
@@ -45,7 +47,9 @@ _TEXT = 300
 _DENIED = (401, 403, 421, 429)
 _ORDERS = ("POST", "PUT", "PATCH", "DELETE")  # refused in whatever way, nothing was changed
 _CHANGES = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
-_SLOW = HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself | TopicLook
+_SLOW = (
+    HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself | TopicLook | LogSealed | EvidenceExported
+)
 _MOST_SLOW = 16
 
 

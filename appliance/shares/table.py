@@ -221,7 +221,7 @@ REST_STREAM_PEERS = Share(
     _STREAMS_SHOWN_BY,
 )
 REST_EXPORTS = Share(
-    "exports of the audit log under way (a host here is a token, one without a registration is a viewer's)",
+    "exports of the log and of evidence under way (a host here is a token, one without a registration is a viewer's)",
     Bounds(whole=4, host=2, strangers=0, kept=1),
     "",
     "503 with the reason and Retry-After",

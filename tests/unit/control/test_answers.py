@@ -10,6 +10,7 @@ from appliance.channel import admin, messages
 from appliance.channel.admin import answer_to
 from appliance.channel.answers.graph import TopicMessage
 from appliance.control import (
+    evidence_orders,
     host_orders,
     looks,
     monitor_orders,
@@ -28,6 +29,7 @@ METHODS = [
         host_orders.HostOrders,
         token_orders.TokenOrders,
         recording_orders.RecordingOrders,
+        evidence_orders.EvidenceOrders,
     )
     for _name, method in inspect.getmembers(part, inspect.iscoroutinefunction)
 ]

@@ -1,0 +1,294 @@
+"""A bundle of evidence: what the log has of a span of time, what was in force, and what proves it, as one ZIP file.
+
+Invariants:
+1. Everything under the manifest is the same, byte for byte, whenever the same span is exported: the members are made
+   twice, once for their hashes and once to be written, and a difference ends the export.
+2. The manifest has the hash of every member. The audit record of the export has the manifest's, and is sealed by a
+   signed checkpoint before the first byte is given out. `proof.json` is that record: the one member that no hash is of.
+3. Records are given as they are stored, so that `verify.py` makes their hashes without our code.
+4. A run has every record between its ends. Records whose time is out of their order (the clock was set back, retention
+   wrote them again) make runs of their own when they are far from the others.
+"""
+
+import hashlib
+import heapq
+import io
+import itertools
+import json
+import sqlite3
+import time
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from appliance.audit.chain import StoredColumns
+from appliance.audit.database import COLUMNS, LogUnreadableError, reading
+from appliance.audit.evidence import Places
+from appliance.audit.signatures import pinned_key_path
+from appliance.channel.admin import (
+    A,
+    AdminAnswer,
+    AdminRequest,
+    EvidenceExported,
+    LogSealed,
+    MonitorRevisionWanted,
+    PolicyWanted,
+    Trouble,
+)
+from appliance.evidence.page import Page
+from appliance.fingerprints import file_name
+
+FORMAT = "rosrv evidence 1"
+MOST_RECORDS = 1_000_000
+VERIFIER = Path(__file__).with_name("verify.py")
+Ask = Callable[[AdminRequest[Any]], AdminAnswer[Any]]
+Member = tuple[str, Iterable[bytes]]
+_PAGE = 500
+_APART = 1000  # records between two runs
+_MOMENT = (1980, 1, 1, 0, 0, 0)  # of every member, the first that a ZIP file can have
+_POLICY, _SPECIFICATIONS = "policy loaded", "specifications loaded"
+_LOAD = "SELECT event, revision, detail FROM record WHERE sequence = ?"
+_LOADS = "SELECT sequence FROM record INDEXED BY record_event WHERE sequence BETWEEN ? AND ? AND event = ?"
+_REVISIONS = "SELECT DISTINCT revision FROM record WHERE sequence BETWEEN ? AND ? AND revision > 0"
+_LAST_LOAD = "SELECT max(sequence) FROM record INDEXED BY record_event WHERE event = ? AND sequence < ?"
+
+
+class BundleError(Exception):
+    """There is no bundle; the text says why, `trouble` whose fault it is."""
+
+    def __init__(self, text: str, trouble: Trouble) -> None:
+        super().__init__(text)
+        self.trouble = trouble
+
+
+class Span(NamedTuple):
+    """From `since` until before `until`, nanoseconds since the epoch."""
+
+    since: int
+    until: int
+
+
+def export(log: Path, span: Span, ask: Ask) -> Iterator[bytes]:
+    """The bytes of a bundle; when this returns it is sealed and recorded. `ask` asks the running appliance.
+
+    Raises `BundleError` and `LogUnreadableError`, both also while it is given out.
+    """
+    _given(ask(LogSealed()))
+    span = Span(span.since, min(span.until, time.time_ns()))
+    bundle = _Bundle(log, span, ask)
+    manifest = bundle.manifest()
+    text = json.dumps(manifest, indent=1).encode() + b"\n"
+    order = EvidenceExported(hashlib.sha256(text).hexdigest(), *span, bundle.count)
+    proof = _proof(log, _given(ask(order)).record)
+    return _zipped(
+        itertools.chain(bundle.checked(manifest), [("manifest.json", [text]), ("proof.json", [proof])])
+    )
+
+
+class _Bundle:
+    """The members of a bundle."""
+
+    def __init__(self, log: Path, span: Span, ask: Ask) -> None:
+        self._log, self._span, self._ask = log, span, ask
+        with reading(log) as connection:
+            connection.execute("BEGIN")
+            self._find(connection.execute)
+        self.count = sum(last - first + 1 for first, last in self._runs)
+
+    def _find(self, execute: Callable[..., sqlite3.Cursor]) -> None:
+        """Which records, policies and specifications belong to it."""
+        (self._id,) = execute("SELECT id FROM log").fetchone()
+        (sealed,) = execute("SELECT max(sequence) FROM checkpoint WHERE signature IS NOT NULL").fetchone()
+        found = execute(
+            "SELECT sequence FROM record INDEXED BY record_time WHERE time >= ? AND time < ? AND sequence <= ?"
+            " ORDER BY sequence LIMIT ?",
+            (*self._span, sealed or 0, MOST_RECORDS + 1),
+        ).fetchall()
+        self._runs = _runs([sequence for (sequence,) in found])
+        if not found:
+            raise BundleError("the log has no record of that time", "unknown")
+        if len(found) > MOST_RECORDS:
+            raise BundleError(f"these are more than {MOST_RECORDS} records: export a shorter time", "request")
+        begin = self._runs[0][0]
+        loads = {execute(_LAST_LOAD, (event, begin)).fetchone()[0] for event in (_POLICY, _SPECIFICATIONS)}
+        self._policies: set[int] = set()
+        for run in self._runs:
+            loads |= {sequence for (sequence,) in execute(_LOADS, (*run, _SPECIFICATIONS))}
+            for (revision,) in execute(_REVISIONS, run).fetchall():
+                self._policies.add(revision)
+                loads.add(
+                    execute(f"{_LAST_LOAD} AND revision = ?", (_POLICY, run[1] + 1, revision)).fetchone()[0]
+                )
+        loads.discard(None)
+        self._specifications: set[int] = set()
+        for sequence in loads:
+            event, revision, detail = execute(_LOAD, (sequence,)).fetchone()
+            if event == _POLICY:
+                self._policies.add(revision)
+            else:
+                self._specifications.add(json.loads(detail)["revision_of_specifications"])
+        edges = {edge for first, last in self._runs for edge in (first - 1, last + 1) if edge <= sealed}
+        there = {edge for edge in edges if execute(_LOAD, (edge,)).fetchone()}
+        self._alone = sorted(loads | there)
+
+    def manifest(self) -> dict[str, Any]:
+        """The hashes of all members, made by making them, and what there should be and is not."""
+        manifest: dict[str, Any] = {
+            "format": FORMAT, "log": self._id, "since": self._span.since, "until": self._span.until, "recording": "",
+            "runs": self._runs, "missing": [], "members": {},
+        }  # fmt: skip
+        for name, pieces in self.members(manifest):
+            digest, size = hashlib.sha256(), 0
+            for piece in pieces:
+                digest.update(piece)
+                size += len(piece)
+            manifest["members"][name] = {"sha256": digest.hexdigest(), "bytes": size}
+        return manifest
+
+    def checked(self, manifest: dict[str, Any]) -> Iterator[Member]:
+        """The members once more. Raises `BundleError` where they are others than before."""
+        left = dict(manifest["members"])
+        for name, pieces in self.members({**manifest, "missing": []}):
+            digest = hashlib.sha256()
+            yield name, _noted(pieces, digest.update)
+            if left.pop(name, {}).get("sha256") != digest.hexdigest():
+                raise BundleError(f"{name} was changed while it was exported: export again", "failed")
+        if left:
+            raise BundleError(f"{', '.join(left)} went while it was exported: export again", "failed")
+
+    def members(self, manifest: dict[str, Any]) -> Iterator[Member]:
+        """All members, one after the other; what is missing is noted in the manifest."""
+        yield "verify.py", [VERIFIER.read_bytes()]
+        yield "audit.pub", [pinned_key_path(self._log).read_bytes()]
+        for revision in sorted(self._policies):
+            place = f"policies/{revision}.ini"
+            if (policy := self._text(PolicyWanted(revision), place, manifest)) is not None:
+                yield place, [policy.text.encode()]
+                yield from _signatures({place: policy.signature})
+        for revision in sorted(self._specifications):
+            place = f"specifications/{revision}/"
+            if (texts := self._text(MonitorRevisionWanted(revision), place, manifest)) is not None:
+                named = {**texts.files, **{f"msg/{name}": text for name, text in texts.definitions.items()}}
+                yield from (
+                    (place + file_name(name), [text.encode()]) for name, text in sorted(named.items())
+                )
+                yield from _signatures(
+                    {
+                        place + file_name(name if name in texts.files else f"msg/{name}"): signature
+                        for name, signature in sorted(texts.signatures.items())
+                    }
+                )
+        page = Page()
+        within = itertools.chain.from_iterable(range(first, last + 1) for first, last in self._runs)
+        yield "records.ndjson", _noted(_records(self._log, heapq.merge(self._alone, within)), page.add)
+        yield "index.html", (page.html(manifest) for _once in "1")
+
+    def _text(self, request: AdminRequest[A], place: str, manifest: dict[str, Any]) -> A | None:
+        answer: AdminAnswer[A] = self._ask(request)
+        if answer.trouble == "unknown":
+            manifest["missing"].append(place)
+            return None
+        return _given(answer)
+
+
+def _given(answer: AdminAnswer[A]) -> A:
+    if not answer.ok:
+        raise BundleError(answer.error, answer.trouble)
+    return answer.given()
+
+
+def _runs(sequences: list[int]) -> list[tuple[int, int]]:
+    """First and last of the sequences that stand near each other."""
+    runs: list[tuple[int, int]] = []
+    for sequence in sequences:
+        if runs and sequence - runs[-1][1] <= _APART:
+            runs[-1] = runs[-1][0], sequence
+        else:
+            runs.append((sequence, sequence))
+    return runs
+
+
+def _signatures(signatures: dict[str, str]) -> Iterator[Member]:
+    return ((f"signatures/{name}.sig", [text.encode()]) for name, text in signatures.items() if text)
+
+
+def _noted(pieces: Iterable[bytes], note: Callable[[bytes], object]) -> Iterator[bytes]:
+    for piece in pieces:
+        note(piece)
+        yield piece
+
+
+def _records(log: Path, sequences: Iterable[int]) -> Iterator[bytes]:
+    """Records as they are stored, each with its place in the chain: a line of NDJSON each, a page in memory at a time.
+
+    Raises `LogUnreadableError`.
+    """
+    unique = (sequence for sequence, _same in itertools.groupby(sequences))
+    pairs = itertools.pairwise(itertools.chain(unique, [0]))
+    while page := list(itertools.islice(pairs, _PAGE)):
+        with reading(log) as connection:
+            connection.execute("BEGIN")
+            places = Places(connection)
+            lines = [_line(connection, places, *pair) for pair in page]
+        yield b"".join(lines)
+
+
+def _line(connection: sqlite3.Connection, places: Places, sequence: int, following: int) -> bytes:
+    query = f"SELECT {COLUMNS} FROM record WHERE sequence = ?"  # noqa: S608  fixed names
+    row = connection.execute(query, (sequence,)).fetchone()
+    chain = places.place(sequence, following)
+    if row is None or chain is None:
+        raise LogUnreadableError(
+            f"record {sequence} was removed by retention while it was exported: export again"
+        )
+    stored = StoredColumns(*row)._asdict()
+    stored["detail"] = row[-1].decode("utf-8", "surrogateescape")
+    return json.dumps({**stored, "chain": msgspec.to_builtins(chain)}, separators=(",", ":")).encode() + b"\n"
+
+
+def _proof(log: Path, record: str) -> bytes:
+    """The record of the export, as far as the checkpoint that seals it."""
+    with reading(log) as connection:
+        (sequence,) = connection.execute(
+            "SELECT max(sequence) FROM record WHERE id = ?", (record,)
+        ).fetchone()
+    return b"".join(_records(log, [sequence]))
+
+
+class _Pipe(io.RawIOBase):
+    """Takes what is written, until it is taken out."""
+
+    def __init__(self) -> None:
+        self._held = bytearray()
+
+    def writable(self) -> bool:
+        """It is."""
+        return True
+
+    def write(self, data: Any) -> int:
+        """Hold it."""
+        self._held += data
+        return len(data)
+
+    def take(self) -> bytes:
+        """What was written since."""
+        taken = bytes(self._held)
+        self._held.clear()
+        return taken
+
+
+def _zipped(members: Iterable[Member]) -> Iterator[bytes]:
+    pipe = _Pipe()
+    with zipfile.ZipFile(pipe, "w") as archive:
+        for name, pieces in members:
+            about = zipfile.ZipInfo(name, _MOMENT)
+            about.external_attr = 0o644 << 16
+            about.compress_type = zipfile.ZIP_STORED if name.endswith(".bag") else zipfile.ZIP_DEFLATED
+            with archive.open(about, "w", force_zip64=True) as member:
+                for piece in pieces:
+                    member.write(piece)
+                    yield pipe.take()
+    yield pipe.take()

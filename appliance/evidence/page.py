@@ -1,0 +1,113 @@
+"""The page of a bundle for people: what it has, what happened, how it is proved. The same input gives the same page."""
+
+import html
+import json
+from collections import Counter
+from typing import Any
+
+from appliance.audit.output import printable, rfc3339
+
+_MOST_ROWS = 2000
+_SEVERE = ("notice", "warning", "alarm")
+_HEAD = """\
+<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'">
+<meta name="viewport" content="width=device-width">
+<title>Evidence of a ROSRV appliance</title>
+<style>
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; padding: 0 1rem;
+  color-scheme: light dark }
+table { border-collapse: collapse; width: 100% }
+td, th { text-align: left; vertical-align: top; padding: .15rem .6rem .15rem 0 }
+tr { border-top: 1px solid #8884 }
+td { overflow-wrap: anywhere }
+code, .time { font-family: ui-monospace, monospace }
+.time { white-space: nowrap }
+.warning, .deny { color: #b50 }
+.alarm { color: #d00; font-weight: 600 }
+</style>
+<h1>Evidence of a ROSRV appliance</h1>
+"""
+_PROOF = """\
+<h2>Prove it</h2>
+<p>This page proves nothing. On any machine with Python 3.8 and OpenSSL 3.0, in the folder of the bundle:</p>
+<p><code>python3 verify.py --key audit.pub</code></p>
+<p>with the <code>audit.pub</code> and, better, the <code>verify.py</code> that you got elsewhere: whoever changes a
+bundle can change those in it. It names what was changed or is missing.</p>
+"""
+
+
+class Page:
+    """Collects what the page shows while the records go by."""
+
+    def __init__(self) -> None:
+        self._events: Counter[str] = Counter()
+        self._rows: list[str] = []
+        self._left_out = 0
+
+    def add(self, lines: bytes) -> None:
+        """Records of the bundle, as it has them."""
+        for line in lines.splitlines():
+            self._add(json.loads(line))
+
+    def _add(self, record: dict[str, Any]) -> None:
+        self._events[record["event"]] += 1
+        if record["severity"] not in _SEVERE and record["decision"] in (None, "allow"):
+            return
+        if len(self._rows) == _MOST_ROWS:
+            self._left_out += 1
+            return
+        kind = record["severity"] if record["decision"] in (None, "allow") else "deny"
+        who = " ".join(filter(None, (record["host"], record["caller_id"], _who(record["detail"]))))
+        cells = [str(record["sequence"]), record["event"], record["decision"] or "", who, record["resource"] or "",
+                 record["reason"]]  # fmt: skip
+        shown = "".join(f"<td>{_text(cell)}" for cell in cells)
+        self._rows.append(f'<tr class="{kind}"><td class="time">{rfc3339(record["time"])}{shown}\n')
+
+    def html(self, manifest: dict[str, Any]) -> bytes:
+        """The page; `manifest` has all members but this one."""
+        runs = ", ".join(f"{first} to {last}" for first, last in manifest["runs"])
+        facts = {
+            "span": f"{rfc3339(manifest['since'])} to {rfc3339(manifest['until'])}",
+            "log": manifest["log"],
+            "records": runs,
+            "recording": manifest["recording"],
+        }
+        parts = [_HEAD, "<table>\n"]
+        parts += [f"<tr><th>{name}<td>{_text(value)}\n" for name, value in facts.items() if value]
+        parts += ["</table>\n", _PROOF, "<h2>What happened</h2>\n<table>\n"]
+        parts += [
+            "<tr><th>time<th>record<th>event<th>decision<th>who<th>what<th>reason\n",
+            *self._rows,
+            "</table>\n",
+        ]
+        if self._left_out:
+            parts.append(f"<p>{self._left_out} more of this kind are in records.ndjson only.</p>\n")
+        parts.append("<h2>All records by event</h2>\n<table>\n")
+        parts += [f"<tr><td>{_text(event)}<td>{count}\n" for event, count in sorted(self._events.items())]
+        parts.append("</table>\n<h2>What is in the bundle</h2>\n<table>\n")
+        parts += [
+            f'<tr><td><a href="{_text(name).replace("%", "%25")}">{_text(name)}</a><td>{about["bytes"]} bytes'
+            f"<td><code>{about['sha256']}</code>\n"
+            for name, about in manifest["members"].items()
+            if name != "index.html"
+        ]
+        parts += [
+            f"<tr><td>{_text(place)}<td>the appliance does not have it\n" for place in manifest["missing"]
+        ]
+        return "".join([*parts, "</table>\n"]).encode()
+
+
+def _who(detail: str) -> str:
+    """The token that asked, where one did."""
+    try:
+        found = json.loads(detail).get("who")
+    except ValueError:  # somebody spoilt it
+        return ""
+    return str(found) if found else ""
+
+
+def _text(text: str) -> str:
+    return html.escape(printable(text).encode("utf-8", "replace").decode())

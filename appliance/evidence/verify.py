@@ -1,0 +1,321 @@
+#!/usr/bin/env python3
+"""Holds a bundle of evidence of a ROSRV appliance against what the appliance signed, and names what differs.
+
+    python3 verify.py [BUNDLE.zip, or its folder] [--key audit.pub] [--checkpoints copies.ndjson]
+
+It takes Python 3.8 or newer and the command `openssl` (3.0 or newer). Exit status 0: right; 1: not; 2: not a bundle.
+
+1. manifest.json has the SHA-256 of every member but proof.json, and there is no other member.
+2. proof.json is the audit record of this export, and has the SHA-256 of manifest.json.
+3. Every audit record has the hash of the one before, up to a checkpoint that the appliance's key signed. A run of
+   records is complete, and the records beside it are of another time.
+4. Policies, specifications and the recording have the hashes that the log has of them.
+
+All of it rests on the key: give one that was kept elsewhere with --key. Whoever is root on the appliance can sign what
+he likes; checkpoints that another machine got before (--checkpoints) show it. A bundle can have a changed copy of this
+program in it: take it from an appliance (`rosrv evidence verifier`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any, Callable, Iterator
+
+FORMAT = "rosrv evidence 1"
+OWN = ("manifest.json", "proof.json")
+COLUMNS = (
+    "sequence", "id", "time", "version", "event", "severity", "decision", "host", "caller_id", "category", "resource",
+    "rule", "rule_key", "rule_file", "rule_line", "revision", "reason", "duration_us",
+)  # fmt: skip
+CHAIN = {"previous", "hash", "then", "checkpoint"}
+SEALED = ("log", "number", "sequence", "hash", "time", "previous", "removed")
+Opener = Callable[[str], Any]
+
+
+def sha256(data: bytes) -> bytes:
+    return hashlib.sha256(data).digest()
+
+
+def unhexed(text: str) -> bytes:
+    data = bytes.fromhex(text)
+    if data.hex() != text:
+        raise ValueError(f"{text[:80]!a} is not written as a hash is")
+    return data
+
+
+def packed(value: Any) -> bytes:
+    """A column of a record in MessagePack: what the appliance hashed."""
+    if value is None:
+        return b"\xc0"
+    if isinstance(value, int):
+        if -32 <= value < 128:
+            return value.to_bytes(1, "big", signed=True)
+        power = next(power for power in range(4) if -1 << (8 << power) - 1 <= value < 1 << (8 << power))
+        kind = 0xCC if value > 0 else 0xD0
+        return bytes([kind + power]) + value.to_bytes(1 << power, "big", signed=value < 0)
+    data: bytes = value if isinstance(value, bytes) else value.encode("utf-8", "surrogateescape")
+    if data is not value and len(data) < 32:
+        return bytes([0xA0 + len(data)]) + data
+    power = next(power for power in range(3) if len(data) < 1 << (8 << power))
+    return bytes([(0xC4 if data is value else 0xD9) + power]) + len(data).to_bytes(1 << power, "big") + data
+
+
+def opened(place: Path) -> tuple[list[str], Opener]:
+    """The names in a ZIP file or a folder, and what opens one."""
+    if not place.is_dir():
+        archive = zipfile.ZipFile(place)
+        return archive.namelist(), archive.open
+    paths = [path for path in place.rglob("*") if path.is_symlink() or not path.is_dir()]
+    ours = {path: path.relative_to(place).as_posix() for path in paths}
+    names = [
+        f"{ours[path]}" if path.is_file() and not path.is_symlink() else f"{ours[path]} (no file)"
+        for path in paths
+    ]
+    return names, lambda name: (place / name).open("rb")
+
+
+class Verifier:
+    """What is wrong with a bundle (`findings`), and what it does not prove (`notes`)."""
+
+    def __init__(
+        self, names: list[str], opener: Opener, key: Path, copies: dict[int, dict[str, Any]]
+    ) -> None:
+        self.names, self.open, self.key, self.copies = names, opener, key, copies
+        order = ["openssl", "pkey", "-pubin", "-outform", "DER", "-in", str(key)]
+        self.raw_key = subprocess.run(order, check=True, capture_output=True).stdout[-32:].hex()
+        self.findings: list[str] = []
+        self.notes: list[str] = []
+        self.manifest: dict[str, Any] = {}
+        self.sums: dict[str, str] = {}  # of the members
+        self.loads: dict[str, Any] = {}  # what came into force, and the hash that the log has of it
+        self.checkpoints = self.agreeing = 0
+
+    def run(self) -> None:
+        """Look at everything; what cannot be read is a finding as well."""
+        looks = {
+            "manifest.json": self.look_at_members, "proof.json": self.look_at_proof,
+            "records.ndjson": self.look_at_records, "what the log has the hashes of": self.look_at_texts,
+        }  # fmt: skip
+        for what, look in looks.items():
+            try:
+                look()
+            except Exception as error:  # whatever somebody wrote into it
+                self.findings.append(f"{what}: cannot be read: {type(error).__name__} {error}")
+
+    def read(self, name: str) -> bytes:
+        with self.open(name) as file:
+            return bytes(file.read())
+
+    def look_at_members(self) -> None:
+        """Rule 1."""
+        self.manifest = json.loads(self.read("manifest.json"))
+        members = self.manifest["members"]
+        if self.manifest["format"] != FORMAT:
+            self.findings.append(f"manifest.json: is not of the format {FORMAT!r}")
+        for name in sorted(set(self.names)):
+            if name not in members and name not in OWN:
+                self.findings.append(f"{name!a}: does not belong to the bundle")
+            if self.names.count(name) > 1:
+                self.findings.append(f"{name!a}: is there more than once")
+        for name in members.keys() - set(self.names):
+            self.findings.append(f"{name!a}: is missing")
+        for name in sorted(members.keys() & set(self.names)):
+            digest = hashlib.sha256()
+            try:
+                with self.open(name) as file:
+                    for piece in iter(lambda: file.read(1 << 20), b""):
+                        digest.update(piece)
+            except Exception as error:  # a damaged ZIP file raises whatever it likes
+                self.findings.append(f"{name!a}: cannot be read: {error}")
+            self.sums[name] = digest.hexdigest()
+            if self.sums[name] != members[name]["sha256"]:
+                self.findings.append(f"{name!a}: was changed")
+
+    def look_at_proof(self) -> None:
+        """Rule 2."""
+        (record,) = self.records("proof.json")
+        if record["event"] != "evidence exported":
+            self.findings.append("proof.json: is not the record of an export")
+        if json.loads(record["detail"])["manifest"] != sha256(self.read("manifest.json")).hex():
+            self.findings.append("manifest.json: is not the one that the log has the hash of")
+
+    def look_at_records(self) -> None:
+        """Rule 3, and of rule 4 what the records say."""
+        runs, since, until = (self.manifest[name] for name in ("runs", "since", "until"))
+        beside = {edge: False for first, last in runs for edge in (first - 1, last + 1)}
+        count, revisions = 0, set()
+        for record in self.records("records.ndjson"):
+            sequence, event, detail = record["sequence"], record["event"], record["detail"]
+            if any(first <= sequence <= last for first, last in runs):
+                count += 1
+                revisions.add(record["revision"])
+            elif sequence in beside:
+                beside[sequence] = True
+                if since <= record["time"] < until:
+                    self.findings.append(f"record {sequence}: is of this time, and its run ends before it")
+            if event == "policy loaded":
+                self.loads[f"policies/{record['revision']}.ini"] = json.loads(detail).get("sha256")
+            elif event == "specifications loaded":
+                about = json.loads(detail)
+                self.loads[f"specifications/{about['revision_of_specifications']}/"] = about.get("sha256")
+        missing = sum(last - first + 1 for first, last in runs) - count
+        if missing:
+            self.findings.append(f"records.ndjson: {missing} records of its runs are not there")
+        if not beside[runs[0][0] - 1] and runs[0][0] > 1:
+            self.notes.append(f"what was before record {runs[0][0]}: retention has removed it")
+        if not beside[runs[-1][1] + 1]:
+            self.notes.append(f"that record {runs[-1][1]} was the last of this time: the log ended there")
+        for place in sorted(f"policies/{revision}.ini" for revision in revisions if revision):
+            if place not in self.loads:
+                self.notes.append(f"{place}: the log has no record of its load")
+        if not any(place.startswith("specifications/") for place in self.loads):
+            self.notes.append("which specifications were in force: the log has no record of a load")
+
+    def look_at_texts(self) -> None:
+        """Rule 4."""
+        for place, wanted in self.loads.items():
+            inside = sorted(name for name in self.sums if name.startswith(place))
+            lines = "".join(f"{self.sums[name]}  {name[len(place) :]}\n" for name in inside)
+            found = sha256(lines.encode()).hex() if place.endswith("/") else self.sums.get(place)
+            if place in self.manifest["missing"]:
+                self.notes.append(f"{place}: the appliance does not have it")
+            elif wanted is None:
+                self.notes.append(f"{place}: it was loaded by a version that recorded no hash")
+            elif found != wanted:
+                self.findings.append(f"{place}: is not what the log has the hash of")
+
+    def records(self, name: str) -> Iterator[dict[str, Any]]:
+        """The records of a member, each after it was held against the chain."""
+        place, digest, begin = (
+            0,
+            b"",
+            0,
+        )  # how far the chain leads; the first record that no checkpoint seals yet
+        with self.open(name) as lines:
+            for line in lines:
+                record = json.loads(line)
+                chain, sequence = record["chain"], record["sequence"]
+                written = json.dumps(record, separators=(",", ":")).encode() + b"\n"
+                if line != written or {*record} != {*COLUMNS, "detail", "chain"} or {*chain} - CHAIN:
+                    self.findings.append(f"record {sequence}: is not written as the appliance writes it")
+                detail = record["detail"].encode("utf-8", "surrogateescape")
+                columns = b"\xdc\x00\x13" + b"".join(map(packed, [*(record[one] for one in COLUMNS), detail]))
+                before, own = unhexed(chain["previous"]), unhexed(chain["hash"])
+                # The second is how version 0.1.0 made it.
+                if own not in (sha256(before + b"2" + sha256(columns)), sha256(before + columns)):
+                    self.findings.append(f"record {sequence}: was changed")
+                follows = sequence == place + 1 and before == digest
+                if place and not follows and (begin or sequence <= place + 1):
+                    self.findings.append(f"record {sequence}: does not follow the one before it")
+                begin, place, digest = begin or sequence, sequence, own
+                for content in chain["then"] or ():
+                    place, digest = place + 1, sha256(digest + b"2" + unhexed(content))
+                checkpoint = chain.get("checkpoint")
+                if checkpoint:
+                    begin = 0
+                    self.look_at_checkpoint(checkpoint, place, digest.hex())
+                yield record
+        if begin or not place:
+            self.findings.append(f"{name}: no signed checkpoint seals what begins with record {begin}")
+
+    def look_at_checkpoint(self, checkpoint: dict[str, Any], sequence: int, digest: str) -> None:
+        """Whether the key signed it, it seals these records, and it is the one that another machine has."""
+        number = checkpoint["number"]
+        if (checkpoint["log"], checkpoint["sequence"], checkpoint["hash"]) != (
+            self.manifest["log"],
+            sequence,
+            digest,
+        ):
+            self.findings.append(f"checkpoint {number}: seals other records than those up to {sequence} here")
+        if not self.is_signed(checkpoint) or {*checkpoint} - {*SEALED, "signature", "key"}:
+            self.findings.append(f"checkpoint {number}: is not signed with the key")
+        copy = self.copies.get(number)
+        if copy and any(copy.get(field) != checkpoint.get(field) for field in SEALED):
+            but = "" if self.is_signed(copy) else ", which is not signed with the key"
+            self.findings.append(f"checkpoint {number}: is another one than was kept elsewhere{but}")
+        self.checkpoints, self.agreeing = self.checkpoints + 1, self.agreeing + (copy is not None)
+
+    def is_signed(self, checkpoint: dict[str, Any]) -> bool:
+        """Whether the key signed a checkpoint."""
+        fields = [f"{field} {checkpoint[field]}\n" for field in SEALED if checkpoint.get(field) is not None]
+        version = 1 if checkpoint.get("removed") is None else 2
+        text, signature = (self.key.with_name(name) for name in ("text", "signature"))
+        text.write_bytes(f"rosrv audit checkpoint {version}\n{''.join(fields)}".encode())
+        signature.write_bytes(unhexed(checkpoint["signature"]))
+        order = [
+            "openssl",
+            "pkeyutl",
+            "-verify",
+            "-rawin",
+            "-pubin",
+            "-inkey",
+            str(self.key),
+            "-in",
+            str(text),
+        ]
+        right = subprocess.run([*order, "-sigfile", str(signature)], capture_output=True).returncode == 0
+        return right and checkpoint["key"] == self.raw_key
+
+
+def main(arguments: list[str]) -> int:
+    """Say what is found; the exit status."""
+    parser = argparse.ArgumentParser(description="Proves a bundle of evidence of a ROSRV appliance.")
+    parser.add_argument(
+        "bundle", nargs="?", type=Path, default=Path(__file__).parent, help="ZIP file or folder"
+    )
+    parser.add_argument("--key", type=Path, help="the appliance's public key (PEM), kept elsewhere")
+    parser.add_argument(
+        "--checkpoints", type=Path, help="what `rosrv audit checkpoints` gave, kept elsewhere"
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON object")
+    given = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            names, opener = opened(given.bundle)
+            key = Path(folder, "key")
+            with given.key.open("rb") if given.key else opener("audit.pub") as file:
+                key.write_bytes(file.read())
+            lines = given.checkpoints.read_text().splitlines() if given.checkpoints else []
+            copies = {copy["number"]: copy for copy in map(json.loads, lines)}
+            verifier = Verifier(names, opener, key, copies)
+        except Exception as error:
+            print(f"nothing can be verified: {error}")
+            return 2
+        verifier.run()
+    findings, notes = [*dict.fromkeys(verifier.findings)], verifier.notes
+    if given.json:
+        counts = {"checkpoints": verifier.checkpoints, "kept_elsewhere": verifier.agreeing}
+        print(
+            json.dumps(
+                {
+                    "ok": not findings,
+                    "findings": findings,
+                    "unproven": notes,
+                    "key": verifier.raw_key,
+                    **counts,
+                }
+            )
+        )
+        return 1 if findings else 0
+    for finding in findings:
+        print(f"WRONG     {finding}")
+    for note in notes:
+        print(f"unproven  {note}")
+    if given.checkpoints:
+        print(f"{verifier.agreeing} of {verifier.checkpoints} checkpoints were kept elsewhere, too")
+    print(
+        f"key {verifier.raw_key}{'' if given.key else ', from the bundle: compare it with one kept elsewhere'}"
+    )
+    print("not as it was exported" if findings else "right: this is what the appliance has sealed")
+    return 1 if findings else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

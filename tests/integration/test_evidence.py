@@ -1,0 +1,126 @@
+"""Bundles of a running appliance: over the command line and REST, by whom, on record, and right on another machine."""
+
+import json
+import subprocess
+import xmlrpc.client
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.appliance import OPEN_POLICY, Appliance
+
+CLOSED = OPEN_POLICY.replace("[Publishers]\n", "[Publishers]\n/cmd_vel = 10.9.9.9\n")
+MONITOR = "a() { event said() /chatter std_msgs/String '{}' { } }"
+
+
+@pytest.fixture(scope="module")
+def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
+    """An appliance with REST that was worked with; checkpoints are an hour apart."""
+    config = tmp_path_factory.mktemp("config") / "appliance.yaml"
+    config.write_text("audit: {checkpoint_seconds: 3600}\napi: 127.0.0.1:0\napi_tls: off\n")
+    specification = config.with_name("a.rv")
+    specification.write_text(MONITOR)
+    with Appliance(options=("--config", str(config))) as running:
+        running.rosrv("monitor", "load", str(specification))
+        running.reload(CLOSED)
+        with xmlrpc.client.ServerProxy(running.master_uri) as master:
+            assert (
+                cast(master.registerPublisher("/evil", "/cmd_vel", "std_msgs/String", "http://127.0.0.1:1/"))[
+                    0
+                ]
+                != 1
+            )
+        yield running
+
+
+def cast(answer: Any) -> list[Any]:
+    """What a master answers."""
+    assert isinstance(answer, list)
+    return answer
+
+
+def proved(bundle: Path, key: Path) -> str:
+    """What its own verifier says of it, run by the system's Python without an environment."""
+    with zipfile.ZipFile(bundle) as archive:
+        program = archive.read("verify.py")
+    command = ["/usr/bin/python3", "-I", "-", str(bundle), "--key", str(key)]
+    done = subprocess.run(command, input=program, env={}, capture_output=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout.decode()
+
+
+def records_of(bundle: Path) -> list[dict[str, Any]]:
+    """The records in it."""
+    with zipfile.ZipFile(bundle) as archive:
+        return [json.loads(line) for line in archive.read("records.ndjson").splitlines()]
+
+
+def test_over_the_command_line(appliance: Appliance, tmp_path: Path) -> None:
+    """All up to now is in it and proven though no checkpoint was due; who exported is on record."""
+    bundle = tmp_path / "incident.zip"
+    appliance.rosrv("evidence", "export", "--since", "1h", "-o", str(bundle))
+    assert bundle.stat().st_mode & 0o777 == 0o600
+    said = proved(bundle, appliance.state / "control/audit.pub")
+    assert "unproven  policies" not in said
+    assert "unproven  spec" not in said
+    with zipfile.ZipFile(bundle) as archive:
+        names = archive.namelist()
+        assert archive.read("policies/2.ini").decode() == CLOSED
+        assert archive.read("specifications/1/a.rv").decode() == MONITOR
+        assert "[Publishers] /cmd_vel" in archive.read("index.html").decode()
+    assert "policies/1.ini" in names
+    assert "deny" in [record["decision"] for record in records_of(bundle)]
+    [record] = appliance.recorded("--event", "evidence exported")
+    assert record["detail"]["who"] == "operator"
+    assert appliance.rosrv("evidence", "verify", str(bundle), state=False).stdout.endswith("has sealed\n")
+    again = appliance.rosrv("evidence", "export", "--since", "1h", "-o", str(bundle), check=False)
+    assert (again.returncode, again.stderr) == (2, f"rosrv: {bundle}: File exists\n")
+
+
+def test_over_rest_it_is_for_operators(appliance: Appliance, tmp_path: Path) -> None:
+    """The same bundle as over the socket; a viewer is told so, and what makes no sense is refused in words."""
+    rest = appliance.rest()
+    viewer = appliance.rest(
+        json.loads(appliance.rosrv("token", "add", "eve", "--role", "viewer", "--json").stdout)["token"]
+    )
+    assert viewer.get("/v1/evidence?since=1h").status == 403
+    assert rest.get("/v1/evidence").status == 422
+    assert rest.get("/v1/evidence?since=never").status == 422
+    assert rest.get("/v1/evidence?since=1970-01-01&until=1970-01-02").status == 404
+    since = appliance.audit("--oldest-first")[0]["time"]
+    until = appliance.recorded("--event", "decision")[0]["time"]
+    answer = rest.get(f"/v1/evidence?since={since}&until={until}")
+    assert (answer.status, answer.headers["content-type"]) == (200, "application/zip")
+    bundle, other = tmp_path / "rest.zip", tmp_path / "socket.zip"
+    bundle.write_bytes(answer.body)
+    proved(bundle, appliance.state / "control/audit.pub")
+    appliance.rosrv("evidence", "export", "--since", since, "--until", until, "-o", str(other))
+    manifests = []
+    for place in (bundle, other):
+        with zipfile.ZipFile(place) as archive:
+            manifests.append(archive.read("manifest.json"))
+    assert manifests[0] == manifests[1]
+    by = [record["detail"]["who"] for record in appliance.recorded("--event", "evidence exported", count=2)]
+    assert by[:2] == ["operator", "first"]
+
+
+def test_a_time_of_which_there_is_nothing(appliance: Appliance, tmp_path: Path) -> None:
+    """It is refused in words, and no file is left."""
+    place = tmp_path / "x.zip"
+    span = ("--since", "1970-01-01", "--until", "1970-01-02")
+    done = appliance.rosrv("evidence", "export", *span, "-o", str(place), check=False)
+    assert (done.returncode, done.stderr) == (1, "rosrv: the log has no record of that time\n")
+    assert not place.exists()
+
+
+def test_the_verifier_of_this_version_is_the_one_in_its_bundles(appliance: Appliance, tmp_path: Path) -> None:
+    """Who does not trust the one in a bundle compares it."""
+    bundle = tmp_path / "a.zip"
+    appliance.rosrv("evidence", "export", "--since", "1h", "-o", str(bundle))
+    with zipfile.ZipFile(bundle) as archive:
+        assert (
+            appliance.rosrv("evidence", "verifier", state=False).stdout == archive.read("verify.py").decode()
+        )

@@ -1,0 +1,133 @@
+"""What tests of evidence share: a signed log with loads, denials and strange texts, and the appliance that is asked."""
+
+import asyncio
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.audit.log import AuditLog
+from appliance.audit.record import Severity
+from appliance.audit_trail import AuditTrail
+from appliance.channel import admin
+from appliance.channel.admin import AdminAnswer, AdminRequest
+from appliance.channel.answers.monitors import RevisionTexts
+from appliance.channel.answers.policy import PolicyKnown
+from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
+from appliance.evidence.bundle import Span, export
+from appliance.fingerprints import fingerprint, fingerprint_of_all
+from tests.support.answers import example
+from tests.support.audit import decision, settle
+from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
+
+__all__ = ["key", "make_log", "notary", "path"]
+
+STRANGE: dict[str, Any] = {
+    "text": 'é"\\\n\x1b \u2028\U0001f916',
+    "number": 0.1,
+    "large": 1e300,
+    "whole": -(2**62),
+    "deep": {"b": [1, None], "a": True},
+}
+LENGTHS = (0, 1, 31, 32, 255, 256, 4000)
+NUMBERS = (
+    0,
+    1,
+    -1,
+    -32,
+    -33,
+    127,
+    128,
+    255,
+    256,
+    65535,
+    65536,
+    2**32 - 1,
+    2**32,
+    2**63 - 1,
+    -128,
+    -129,
+    -(2**31) - 1,
+)
+
+
+class Control:
+    """The running appliance of a test, as it is asked by an export."""
+
+    def __init__(self, log: AuditLog) -> None:
+        self.log = log
+        self.trail = AuditTrail(log, strict=False, deny_when_failed=False)
+        self.orders = EvidenceOrders(log, self.trail)
+        self.policies: dict[int, str] = {}
+        self.specifications: dict[int, dict[str, str]] = {}
+        self.begun = time.time_ns()
+        self.worked = 0
+
+    def load_policy(self, revision: int, text: str, **changes: Any) -> None:
+        """A policy comes into force."""
+        self.policies[revision] = text
+        self.trail.revision = revision
+        detail = {"sha256": fingerprint(text), "who": "disk", **changes}
+        self.trail.happened("policy loaded", "it is in force", severity=Severity.NOTICE, more=detail)
+
+    def load_specifications(self, revision: int, files: dict[str, str]) -> None:
+        """Specifications come into force."""
+        self.specifications[revision] = files
+        detail = {"revision_of_specifications": revision, "sha256": fingerprint_of_all(files)}
+        self.trail.happened("specifications loaded", "they are in force", category="monitor", more=detail)
+
+    def work(self, count: int = 20) -> None:
+        """Nodes ask, and every third is denied."""
+        self.worked += count
+        for number in range(self.worked - count, self.worked):
+            length, whole = LENGTHS[number % len(LENGTHS)], NUMBERS[number % len(NUMBERS)]
+            verdict = "deny" if number % 3 == 0 else "allow"
+            self.log.record(
+                decision(self.log, number, decision=verdict, detail={**STRANGE, "n": number}, resource="/r" * length,
+                         duration_us=whole, revision=self.trail.revision, caller_id=None, reason=f"because {number}")
+            )  # fmt: skip
+        assert settle(self.log) is None
+
+    def ask(self, request: AdminRequest[Any]) -> AdminAnswer[Any]:
+        """Answer as control does."""
+        try:
+            match request:
+                case admin.LogSealed():
+                    return AdminAnswer(True, asyncio.run(self.orders.seal(request)))
+                case admin.EvidenceExported():
+                    return AdminAnswer(True, asyncio.run(self.orders.exported(request, "operator")))
+                case admin.PolicyWanted(revision=int(revision)) if revision in self.policies:
+                    text = self.policies[revision]
+                    return AdminAnswer(
+                        True, example(PolicyKnown, text=text, signature=f"signature of {revision}")
+                    )
+                case admin.MonitorRevisionWanted(revision) if revision in self.specifications:
+                    named = self.specifications[revision]
+                    files = {name: text for name, text in named.items() if not name.startswith("msg/")}
+                    definitions = {name[4:]: text for name, text in named.items() if name.startswith("msg/")}
+                    signatures = dict.fromkeys([*files, *definitions], "signature")
+                    texts = {"files": files, "definitions": definitions, "signatures": signatures}
+                    return AdminAnswer(True, example(RevisionTexts, **texts))
+        except NotSealedError as error:
+            return AdminAnswer(False, error=str(error), trouble="failed")
+        return AdminAnswer(False, error="there is no such revision", trouble="unknown")
+
+    def exported(self, place: Path, since: int | None = None, until: int | None = None) -> Path:
+        """A bundle in a file."""
+        span = Span(self.begun if since is None else since, time.time_ns() if until is None else until)
+        place.write_bytes(b"".join(export(self.log.path, span, self.ask)))
+        return place
+
+
+@pytest.fixture
+def control(make_log: MakeLog) -> Control:
+    """An appliance whose policy and specifications were loaded before the time that is exported."""
+    running = Control(make_log(checkpoint_every=12, checkpoint_seconds=3600))
+    running.load_policy(6, "[Nodes]\nold = *\n")
+    running.load_policy(7, "[Nodes]\ndefault = *\né = *\n")
+    running.load_specifications(2, {"a.rv": "a() { }", "msg/p/T.msg": "int32 x\n", "../b\n.rv": "b() { }"})
+    running.work(5)
+    running.begun = time.time_ns()
+    running.work()
+    return running

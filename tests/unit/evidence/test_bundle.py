@@ -1,0 +1,414 @@
+"""A bundle has what happened and what was in force, and proves itself with Python and openssl alone."""
+
+import itertools
+import json
+import random
+import re
+import shutil
+import struct
+import subprocess
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+
+from appliance.audit.copies import signed_checkpoints
+from appliance.audit.log import AuditLog
+from appliance.audit.retention import Retention
+from appliance.evidence import bundle as bundles
+from appliance.evidence import verify
+from appliance.evidence.bundle import VERIFIER, BundleError, Span, export
+from tests.support.audit import decision, settle
+from tests.support.control_parts import OPEN
+from tests.unit.audit.conftest import MakeLog, Notary
+from tests.unit.audit.test_retention import await_removal, make_old
+from tests.unit.evidence.conftest import LENGTHS, NUMBERS, Control
+
+Members = dict[str, bytes]
+
+
+def members_of(bundle: Path) -> Members:
+    """Everything in a bundle."""
+    with zipfile.ZipFile(bundle) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def written(members: Members, place: Path) -> Path:
+    """A bundle with these members."""
+    with zipfile.ZipFile(place, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return place
+
+
+@pytest.fixture
+def bundle(control: Control, tmp_path: Path) -> Path:
+    """A bundle of the appliance's working time."""
+    return control.exported(tmp_path / "bundle.zip")
+
+
+@pytest.fixture
+def pem(key: Ed25519PrivateKey, tmp_path: Path) -> Path:
+    """The key that the reviewer has."""
+    place = tmp_path / "kept.pub"
+    place.write_bytes(key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
+    return place
+
+
+class Reviewer:
+    """Runs the verifier in this process; `said` is what it printed."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str], key: Path) -> None:
+        self._capsys = capsys
+        self._key = key
+        self.said = ""
+
+    def status(self, bundle: Path, *options: object) -> int:
+        """The exit status."""
+        self._capsys.readouterr()
+        status = verify.main([str(bundle), "--key", str(self._key), *map(str, options)])
+        self.said = self._capsys.readouterr().out
+        return status
+
+
+@pytest.fixture
+def reviewer(capsys: pytest.CaptureFixture[str], pem: Path) -> Reviewer:
+    """Somebody with the key."""
+    return Reviewer(capsys, pem)
+
+
+def test_it_proves_itself_on_a_machine_with_nothing(bundle: Path, pem: Path, tmp_path: Path) -> None:
+    """The verifier that is in it, run by the system's Python without an environment, on the file and on the folder."""
+    folder = tmp_path / "unpacked"
+    shutil.unpack_archive(bundle, folder)
+    options: list[list[object]] = [[bundle, "--key", pem], [folder, "--key", pem], []]
+    for arguments in options:
+        command = ["/usr/bin/python3", "-I", *map(str, [folder / "verify.py", *arguments])]
+        done = subprocess.run(command, env={}, capture_output=True, text=True, check=False, cwd="/")
+        assert (done.returncode, done.stderr) == (0, ""), done.stdout
+        assert "right: this is what the appliance has sealed" in done.stdout
+        assert "unproven" not in done.stdout.replace("unproven  that record", "")
+    assert "compare it with one kept elsewhere" in done.stdout
+
+
+def test_it_has_what_happened_and_what_was_in_force(bundle: Path, control: Control) -> None:
+    """All records of the time, the loads before it, the texts with their signatures, and nothing of other revisions."""
+    found = members_of(bundle)
+    specifications = ["%2E%2E/b%0A.rv", "a.rv", "msg/p/T.msg"]
+    assert list(found) == [
+        "verify.py", "audit.pub", "policies/7.ini", "signatures/policies/7.ini.sig",
+        *(f"specifications/2/{name}" for name in specifications),
+        *(f"signatures/specifications/2/{name}.sig" for name in specifications),
+        "records.ndjson", "index.html", "manifest.json", "proof.json",
+    ]  # fmt: skip
+    assert found["policies/7.ini"].decode() == control.policies[7]
+    assert found["verify.py"] == VERIFIER.read_bytes()
+    records = [json.loads(line) for line in found["records.ndjson"].splitlines()]
+    decisions = [record for record in records if record["event"] == "decision"]
+    assert len(decisions) == 20 + 1, "those of the time, and the one before it"
+    assert [record["event"] for record in records[:2]] == ["policy loaded", "specifications loaded"]
+    page = found["index.html"].decode()
+    assert "\x1b" not in page
+    assert page.count('<tr class="deny">') == sum(record["decision"] == "deny" for record in decisions[1:])
+
+
+def test_the_same_time_is_the_same_bundle(control: Control, tmp_path: Path) -> None:
+    """Exported twice, the manifest and all under it are the same bytes; the proof is another record."""
+    until = time.time_ns()
+    control.work(3)
+    first, second = (
+        members_of(control.exported(tmp_path / name, until=until)) for name in ("a.zip", "b.zip")
+    )
+    assert first.pop("proof.json") != second.pop("proof.json")
+    assert first == second
+
+
+def test_every_change_of_a_member_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
+    """Every byte of small members and a sample of the others, made another one: each time the member is named."""
+    members, chance = members_of(bundle), random.Random(5)  # noqa: S311  the same each time
+    for name, data in members.items():
+        places = range(len(data)) if len(data) <= 40 else chance.sample(range(len(data)), 12)
+        for place in places:
+            other = bytes([data[place] ^ (1 << chance.randrange(8))])
+            changed = data[:place] + other + data[place + 1 :]
+            status = reviewer.status(written({**members, name: changed}, tmp_path / "changed.zip"))
+            assert status == 1, (name, place, other)
+            named = {"proof.json": r"proof|record \d+|checkpoint \d+", "manifest.json": "manifest|WRONG"}
+            assert re.search(named.get(name, re.escape(name)), reviewer.said), (name, place, reviewer.said)
+
+
+def test_what_is_removed_added_or_exchanged_is_named(
+    bundle: Path, tmp_path: Path, reviewer: Reviewer
+) -> None:
+    """Each member removed, cut short or put in the place of another, and files that do not belong there."""
+    members = members_of(bundle)
+    for name, data in members.items():
+        without = {other: data for other, data in members.items() if other != name}
+        assert reviewer.status(written(without, tmp_path / "x.zip")) == 1
+        assert f"'{name}': is missing" in reviewer.said or f"{name}: cannot be read" in reviewer.said
+        assert reviewer.status(written({**members, name: data[:-1]}, tmp_path / "x.zip")) == 1
+    names = list(members)
+    for one, other in itertools.pairwise(names):
+        swapped = {**members, one: members[other], other: members[one]}
+        if swapped != members:
+            assert reviewer.status(written(swapped, tmp_path / "x.zip")) == 1
+    for name in (
+        "more.txt",
+        "../evil",
+        "/etc/evil",
+        "a\\b",
+        "policies/8.ini",
+        "specifications/2/c.rv",
+        "x\x1b[2J",
+    ):
+        assert reviewer.status(written({**members, name: b"x"}, tmp_path / "x.zip")) == 1
+        assert "does not belong to the bundle" in reviewer.said
+        assert "\x1b" not in reviewer.said
+
+
+def test_a_name_that_is_there_twice_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
+    """Which of two a tool unpacks nobody knows."""
+    with zipfile.ZipFile(bundle, "a") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr("policies/7.ini", members_of(bundle)["policies/7.ini"])
+    assert reviewer.status(bundle) == 1
+    assert "'policies/7.ini': is there more than once" in reviewer.said
+
+
+def test_a_file_that_is_cut_or_damaged_is_never_right(
+    bundle: Path, tmp_path: Path, reviewer: Reviewer
+) -> None:
+    """Cut anywhere, or with another byte anywhere: it is wrong, or each member is what it was."""
+    whole, members, chance = bundle.read_bytes(), members_of(bundle), random.Random(6)  # noqa: S311  the same each time
+    place = tmp_path / "damaged.zip"
+    for length in [0, 1, len(whole) - 1, *chance.sample(range(len(whole)), 5)]:
+        place.write_bytes(whole[:length])
+        assert reviewer.status(place) == 2
+    for position in chance.sample(range(len(whole)), 60):
+        place.write_bytes(whole[:position] + bytes([whole[position] ^ 0x20]) + whole[position + 1 :])
+        assert reviewer.status(place) or members_of(place) == members, position
+    assert reviewer.status(tmp_path / "missing.zip") == 2
+
+
+@pytest.mark.parametrize("kind", ["link", "fifo", "folder"])
+def test_what_is_no_file_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer, kind: str) -> None:
+    """A link, a pipe or a folder in the place of a member is not followed or waited for."""
+    folder = tmp_path / "unpacked"
+    shutil.unpack_archive(bundle, folder)
+    policy = folder / "policies/7.ini"
+    policy.rename(tmp_path / "7.ini")
+    if kind == "link":
+        policy.symlink_to(tmp_path / "7.ini")
+    elif kind == "folder":
+        policy.mkdir()
+    else:
+        subprocess.run(["mkfifo", policy], check=True)
+    assert reviewer.status(folder) == 1
+    assert "'policies/7.ini': is missing" in reviewer.said
+
+
+def resealed(members: Members) -> Members:
+    """What a forger makes who can hash: the manifest has the hashes of what is there."""
+    manifest = json.loads(members["manifest.json"])
+    for name, about in manifest["members"].items():
+        data = members[name]
+        about["sha256"] = verify.sha256(data).hex()
+    return {**members, "manifest.json": json.dumps(manifest, indent=1).encode() + b"\n"}
+
+
+def lines(members: Members, change: Callable[[list[dict[str, Any]]], None]) -> Members:
+    """The same with other records."""
+    records = [json.loads(line) for line in members["records.ndjson"].splitlines()]
+    change(records)
+    text = "".join(json.dumps(record, separators=(",", ":")) + "\n" for record in records)
+    return resealed({**members, "records.ndjson": text.encode()})
+
+
+def _hide(records: list[dict[str, Any]]) -> None:
+    next(one for one in records if one["decision"] == "deny" and not one["chain"].get("checkpoint"))[
+        "decision"
+    ] = "allow"
+
+
+def _take_out(records: list[dict[str, Any]]) -> None:
+    del records[6]
+
+
+def _swap(records: list[dict[str, Any]]) -> None:
+    records[5], records[6] = records[6], records[5]
+
+
+def _cut(records: list[dict[str, Any]]) -> None:
+    del records[-1]
+
+
+def _unseal(records: list[dict[str, Any]]) -> None:
+    for record in records:
+        record["chain"].pop("checkpoint", None)
+
+
+def _invent(records: list[dict[str, Any]]) -> None:
+    load = next(one for one in records if one["event"] == "policy loaded")
+    load["detail"] = json.dumps({**json.loads(load["detail"]), "sha256": "0" * 64})
+
+
+@pytest.mark.parametrize("change", [_hide, _take_out, _swap, _cut, _unseal, _invent])
+def test_a_forger_who_makes_hashes_anew_has_no_signature(
+    bundle: Path, tmp_path: Path, reviewer: Reviewer, change: Callable[[list[dict[str, Any]]], None]
+) -> None:
+    """Records changed and the manifest made to fit: the log has another manifest, and records do not fit."""
+    assert reviewer.status(written(lines(members_of(bundle), change), tmp_path / "x.zip")) == 1
+    assert "manifest.json: is not the one that the log has the hash of" in reviewer.said
+    assert re.search(r"WRONG +(records?[ .]|checkpoint|policies)", reviewer.said), reviewer.said
+
+
+def test_another_policy_under_a_fitting_manifest_is_named(
+    bundle: Path, tmp_path: Path, reviewer: Reviewer
+) -> None:
+    """The record of the load has the hash of the text."""
+    members = {**members_of(bundle), "policies/7.ini": OPEN.encode(), "specifications/2/a.rv": b"none"}
+    assert reviewer.status(written(resealed(members), tmp_path / "x.zip")) == 1
+    for place in ("policies/7.ini", "specifications/2/"):
+        assert f"{place}: is not what the log has the hash of" in reviewer.said
+
+
+def test_a_bundle_of_another_key_is_not_right(
+    bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whoever signs with a key of his own convinces nobody who kept the right one."""
+    other = Ed25519PrivateKey.generate().public_key()
+    place = tmp_path / "other.pub"
+    place.write_bytes(other.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
+    stranger = Reviewer(capsys, place)
+    assert stranger.status(bundle) == 1
+    assert "is not signed with the key" in stranger.said
+
+
+def test_copies_of_checkpoints_show_a_history_written_anew(
+    bundle: Path, control: Control, tmp_path: Path, reviewer: Reviewer
+) -> None:
+    """They agree, or it is said which does not; a copy that was not signed accuses nobody."""
+    assert reviewer.status(bundle, "--json") == 0
+    said = json.loads(reviewer.said)
+    assert (said["ok"], said["findings"], said["kept_elsewhere"]) == (True, [], 0)
+    copies = [json.loads(one.as_json()) for one in signed_checkpoints(control.log.path)]
+    kept = tmp_path / "copies.ndjson"
+    kept.write_text("".join(json.dumps(one) + "\n" for one in copies))
+    assert reviewer.status(bundle, "--checkpoints", kept) == 0
+    found = re.search(r"(\d+) of (\d+) checkpoints were kept elsewhere", reviewer.said)
+    assert found and found[1] == found[2] != "0"
+    for copy in copies:
+        copy["hash"] = "0" * 64
+    kept.write_text("".join(json.dumps(one) + "\n" for one in copies))
+    assert reviewer.status(bundle, "--checkpoints", kept) == 1
+    assert "is another one than was kept elsewhere, which is not signed with the key" in reviewer.said
+
+
+def test_what_is_not_proven_is_said(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
+    """A load without a hash, a text that the appliance lost, a time before the first load."""
+    control.load_policy(8, "[Nodes]\n", sha256=None)
+    control.work(3)
+    control.load_policy(9, "[Nodes]\n# nine\n")
+    control.work(3)
+    del control.policies[9]
+    assert reviewer.status(control.exported(tmp_path / "a.zip")) == 0
+    assert "unproven  policies/8.ini: it was loaded by a version that recorded no hash" in reviewer.said
+    assert "unproven  policies/9.ini: the appliance does not have it" in reviewer.said
+    assert "unproven  that record" in reviewer.said
+
+
+def test_what_retention_removed_is_said(
+    make_log: MakeLog, path: Path, notary: Notary, tmp_path: Path, reviewer: Reviewer
+) -> None:
+    """Loads that went are named, and that nothing shows what was before."""
+    make_old(make_log, notary)
+    log = make_log(checkpoint_every=100, retention=Retention(days=1))
+    log.record(decision(log))
+    await_removal(path, 1900)
+    log.close()
+    running = Control(make_log())
+    running.begun = 0
+    running.work()
+    assert reviewer.status(running.exported(tmp_path / "a.zip")) == 0
+    assert "unproven  policies/3.ini: the log has no record of its load" in reviewer.said
+    assert "unproven  which specifications were in force" in reviewer.said
+    assert re.search(r"unproven  what was before record \d+: retention has removed it", reviewer.said)
+
+
+def test_records_out_of_their_time_are_runs_of_their_own(
+    control: Control, tmp_path: Path, reviewer: Reviewer
+) -> None:
+    """What retention wrote again at the end of the log, long after, belongs to its time, and nothing between."""
+    until = time.time_ns()
+    for number in range(1200):
+        control.log.record(decision(control.log, number))
+    control.log.record(
+        decision(control.log, time=until - 1, decision="deny", detail={"kept": {"sequence": 1}})
+    )
+    control.log.record(decision(control.log))
+    settle(control.log)
+    bundle = control.exported(tmp_path / "a.zip", until=until)
+    runs = json.loads(members_of(bundle)["manifest.json"])["runs"]
+    assert [last - first for first, last in runs][1:] == [0]
+    assert reviewer.status(bundle) == 0, reviewer.said
+
+
+def test_a_time_without_records_and_one_with_too_many(
+    control: Control, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both are refused in words, and nothing is recorded as exported."""
+    with pytest.raises(BundleError, match="no record of that time"):
+        export(control.log.path, Span(0, 1), control.ask)
+    monkeypatch.setattr(bundles, "MOST_RECORDS", 3)
+    with pytest.raises(BundleError, match="more than 3 records"):
+        export(control.log.path, Span(0, time.time_ns()), control.ask)
+
+
+def test_without_a_signer_there_is_no_bundle(
+    path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A signer that does not answer is waited for so long, and named."""
+    monkeypatch.setattr("appliance.control.evidence_orders.SEAL_SECONDS", 0.2)
+    log = AuditLog(path, signer=lambda _number, _text: None)
+    running = Control(log)
+    running.work()
+    with pytest.raises(BundleError, match=r"cannot be sealed.*the signer has not answered within 0\.2 s"):
+        running.exported(tmp_path / "a.zip")
+    log.close()
+
+
+def test_a_text_that_changes_while_it_is_exported_ends_the_export(control: Control) -> None:
+    """What is written is what the manifest has the hash of, or the bundle breaks off."""
+    pieces = export(control.log.path, Span(control.begun, time.time_ns()), control.ask)
+    control.policies[7] = "[Nodes]\n"
+    with pytest.raises(BundleError, match=r"policies/7\.ini was changed while it was exported"):
+        list(pieces)
+
+
+def test_columns_are_packed_as_the_log_packs_them() -> None:
+    """The verifier's MessagePack is msgspec's, for every length and number at which the form changes."""
+    texts = ["é" * length for length in LENGTHS] + ["x" * length for length in (*LENGTHS, 65535, 65536)]
+    numbers = [sign * (2**power + step) for power in range(63) for step in (-1, 0, 1) for sign in (-1, 1)]
+    values = [None, *texts, *(text.encode() for text in texts), *NUMBERS, *numbers, -(2**63), 2**64 - 1]
+    for value in values:
+        assert verify.packed(value) == msgspec.msgpack.encode(value), repr(value)[:50]
+    with pytest.raises(StopIteration):
+        verify.packed(2**64)
+    assert struct.unpack(">b", verify.packed(-32)) == (-32,)
+
+
+def test_the_verifier_is_a_program_for_python_3_8() -> None:
+    """It imports nothing but the standard library, and has no syntax that came later."""
+    import ast  # noqa: PLC0415
+
+    tree = ast.parse(VERIFIER.read_text(), feature_version=(3, 8))
+    imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
+    imported |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert imported == {
+        "__future__", "argparse", "hashlib", "json", "pathlib", "subprocess", "sys", "tempfile", "typing", "zipfile",
+    }  # fmt: skip
