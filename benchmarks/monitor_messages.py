@@ -29,6 +29,15 @@ REFERENCE = """reference() {
 }
 """
 GROWING = "growing() { event e(std::string f) /cmd geometry_msgs/TwistStamped '{header.frame_id:f}' { f += \"_x\"; } }"
+SCAN = """scan() { double nearest = 0;
+    event e(float[] ranges) /scan sensor_msgs/LaserScan '{ranges:ranges}' {
+        double found = 1e9;
+        for (int i = 0; i < ranges.size(); i++) {
+            if (!std::isnan(ranges[i]) && ranges[i] < found) { found = ranges[i]; }
+        }
+        nearest = found;
+    }
+}"""
 WHOLE = "whole() { geometry_msgs::TwistStamped v; event e() /cmd geometry_msgs/TwistStamped '{}' { v = MESSAGE; } }"
 OTHERS = "".join(
     f"other{number}() {{ event e(int x) /other{number} std_msgs/Int32 '{{data:x}}' {{ x++; }} }}\n"
@@ -42,6 +51,9 @@ def command(frame: bytes = b"base_link") -> bytes:
 
 
 COMMAND = command()
+LASER = struct.pack(
+    "<IIII4s7fI100fI", 1, 2, 3, 4, b"scan", *[0.5] * 7, 100, *(2.0 - n / 100 for n in range(100)), 0
+)
 
 
 def microseconds(action: Callable[[], object], times: int) -> float:
@@ -60,12 +72,12 @@ def monitors(text: str) -> MonitorSet:
     return loaded
 
 
-def batched(messages: int, body: bytes) -> float:
+def batched(messages: int, body: bytes, text: str = REFERENCE, topic: str = "/cmd") -> float:
     """A message in a batch of so many; what the module writes is there already after the first round."""
-    loaded = monitors(REFERENCE)
+    loaded = monitors(text)
     loaded.write_module()
-    loaded.process("/cmd", bytearray(COMMAND), 1)
-    walker, area = loaded.walker("/cmd"), loaded.area
+    loaded.process(topic, bytearray(body), 1)
+    walker, area = loaded.walker(topic), loaded.area
     assert walker is not None
     assert area is not None
     frame = struct.pack("<I", len(body)) + body
@@ -99,6 +111,10 @@ def main() -> None:
         ("reference, comes alone", 1, COMMAND),
     ):
         print(f"{name:32} {batched(messages, body):8.3f} µs")
+    scans = monitors(SCAN)
+    loop = microseconds(lambda: scans.process("/scan", LASER, 1), MESSAGES // 20)
+    print(f"{'a loop over 100 numbers, engine':32} {loop:8.2f} µs")
+    print(f"{'a loop over 100, 64 together':32} {batched(64, LASER, SCAN, '/scan'):8.2f} µs")
     loading = microseconds(lambda: MonitorSet.load({"benchmark.rv": REFERENCE}, DEFINITIONS), 20) / 1000
     print(f"{'loading the reference':32} {loading:8.2f} ms")
     module = microseconds(lambda: monitors(REFERENCE).write_module(), 20) / 1000

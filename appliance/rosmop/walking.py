@@ -23,6 +23,7 @@ from appliance.rosmop.ir.module import UNDO, Cells
 from appliance.rosmop.ir.values import struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
+from appliance.rosmop.runtime.context import Context
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
@@ -37,6 +38,8 @@ _LENGTH = struct.Struct("<I")
 _POSITION = struct.Struct("<II")
 _EFFECT = struct.Struct("<qq")
 _LOG = struct.Struct("<II8s")
+_TIME = struct.Struct("<q")
+_NEVER = (1 << 63) - 1  # comes after every time, so that output is due
 
 
 class Walked(NamedTuple):
@@ -66,13 +69,20 @@ class Home:
     """Where the state of specifications is that share topics or variables."""
 
     def __init__(
-        self, machine: Machine, cells: Cells, namespace: dict[str, Any], running: Sequence[RunningProperty]
+        self,
+        machine: Machine,
+        cells: Cells,
+        namespace: dict[str, Any],
+        running: Sequence[RunningProperty],
+        throttles: Sequence[tuple[Context, int, int]],
     ) -> None:
+        """`throttles`: specification, site, and address of when output there was last due."""
         self.machine = machine
         self._memory = machine.memory
         self._base = cells.base
         self._namespace = namespace
         self._running = running
+        self._throttles = throttles
         self._names = [*cells.variables]
         self._cells = struct.Struct(
             "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in cells.variables.values())
@@ -85,6 +95,8 @@ class Home:
         states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
         values = (self._namespace[name] for name in self._names)
         self._cells.pack_into(self._memory, self._base, *states, *values)
+        for context, site, address in self._throttles:
+            _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
         self.inside = True
 
     def leave(self) -> None:
@@ -272,7 +284,13 @@ def walks_of(compiled: Compiled, monitors: Sequence[Monitor]) -> Walks:
     walks = {}
     for group, cells in zip(found, module.cells, strict=True):
         running = [monitors[number].properties[index] for number, index in group.properties]
-        home = Home(machine, cells, compiled.namespace, running)
+        contexts = {compiled.specifications[number].context for number in group.specifications}
+        throttles = [
+            (compiled.namespace[context], site, address)
+            for (context, site), address in module.throttles.items()
+            if context in contexts
+        ]
+        home = Home(machine, cells, compiled.namespace, running, throttles)
         for number in group.specifications:
             monitors[number].home = home
         for (topic, _), events in zip(group.component.topics, group.events, strict=True):

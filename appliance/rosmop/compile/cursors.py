@@ -14,14 +14,13 @@ from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
-from appliance.rosmop.types.kinds import Type
 
 ALGORITHMS = frozenset({"sort", "reverse", "accumulate"})
 """Functions of `<algorithm>` and `<numeric>` that take a vector from `begin` to `end`."""
 
 
 @dataclass(frozen=True)
-class Cursor(Type):
+class Cursor(kinds.Index):
     """A place in `vector`: before an element, or behind the last."""
 
     vector: Value

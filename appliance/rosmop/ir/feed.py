@@ -88,6 +88,8 @@ class Feed:
 class FeedModule:
     """A module: its bytes, how much memory it has, where frames are put and effects stand, the topics that it takes,
     and where each component keeps its state.
+
+    `throttles`: where it must stand (i64, ns) when output at a site was last due, by the context and the site.
     """
 
     code: bytes
@@ -96,6 +98,7 @@ class FeedModule:
     effects: int
     feeds: Mapping[str, Feed]
     cells: Sequence[Cells]
+    throttles: Mapping[tuple[str, int], int]
 
 
 def module_of(functions: Mapping[str, form.Function], components: Sequence[form.Component]) -> FeedModule:
@@ -120,7 +123,8 @@ def module_of(functions: Mapping[str, form.Function], components: Sequence[form.
             feeds[topic] = walk.feed(f"feed {len(feeds)}")
     frames = writer.take(AREA + _SLACK)
     memory = -(-(frames + AREA + _SLACK) // _PAGE) * _PAGE
-    return FeedModule(_assembled(writer, walks, feeds, tables, memory), memory, frames, effects, feeds, cells)
+    code = _assembled(writer, walks, feeds, tables, memory)
+    return FeedModule(code, memory, frames, effects, feeds, cells, writer.throttles)
 
 
 class _Tables:

@@ -1,12 +1,16 @@
 """The scalar part of the form as WebAssembly: numbers, conditions, loops, fields that are numbers, drops.
 
+Strings of the message, and its vectors of numbers and times, are looked at where they stand: in a local variable is the
+address of the first element, and how many there are.
+
 `Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
 
 - An event takes where the message is in the memory and its size (i32, i32), and returns bits (i32): `HAPPENED`,
   `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`.
-- What is beyond this part (strings, vectors, whole messages, output, recursion) and every fault is `ELSEWHERE`: this
-  message is for Python's functions, and what was done to it is taken back. Within a helper function it is a trap. An
-  event of which no message can come past such a place has no module: `NotScalarError` names what is beyond.
+- What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
+  it is taken back. Within a helper function it is a trap. Beyond are strings and vectors that are made, changed or
+  kept, vectors of strings and of messages, whole messages, what is put out or published, recursion, `sin` and its
+  like. An event of which no message can come past such a place has no module: `NotScalarError` names what is beyond.
 - A variable of the set stands at its address, in 8 bytes. Before a field is written, what stood there is noted in the
   log (address, size, bytes; 16 bytes each) that `UNDO` points behind.
 - What the form charges is taken from the budget of its specification, as everywhere.
@@ -14,11 +18,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from types import MappingProxyType
 from typing import Any
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.interpreter import SHORT
+from appliance.rosmop.ir.interpreter import CHARGED, SHORT
 from appliance.rosmop.ir.values import struct_code, struct_size
 from appliance.rosmop.ir.wasm import (
     ABS,
@@ -44,6 +49,7 @@ from appliance.rosmop.ir.wasm import (
     unsigned,
 )
 from appliance.rosmop.runtime import times
+from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, UNMEASURED
 from appliance.rosmop.runtime.times import BILLION
 from appliance.rosmop.runtime.wire import FEW, MAX_EMPTY
 from appliance.rosmop.types import kinds
@@ -63,11 +69,21 @@ def machine_type(kind: Type) -> int:
     """The type of the machine for one of the language. Raises `NotScalarError`."""
     if isinstance(kind, kinds.Bool) or (isinstance(kind, kinds.Integer) and kind.bits <= 32):
         return I32
-    if isinstance(kind, kinds.Integer | kinds.Time | kinds.Duration):
+    if isinstance(kind, kinds.Integer | kinds.Time | kinds.Duration | kinds.Index):
         return I64
     if isinstance(kind, kinds.Floating):
         return F32 if kind.bits == 32 else F64
     raise NotScalarError(str(kind))
+
+
+def _element(kind: Type) -> tuple[Type, int]:
+    """The type of the elements of a string or vector, and the bytes of each. Raises `NotScalarError`."""
+    if isinstance(kind, kinds.String):
+        return kinds.UINT8, 1
+    code = struct_code(kind.element) if isinstance(kind, kinds.Vector) else None
+    if code is None or not isinstance(kind, kinds.Vector):
+        raise NotScalarError(str(kind))
+    return kind.element, struct_size(code)
 
 
 def _is_signed(kind: Type) -> bool:
@@ -119,6 +135,8 @@ class Writer:
         self.written: list[Written] = []
         self._numbers: dict[tuple[object, ...], Written] = {}
         self._budgets: dict[str, int] = {}
+        self.throttles: dict[tuple[str, int], int] = {}
+        """Where it stands when output at a site of a specification was last due."""
         self._used = FIRST
 
     def take(self, size: int) -> int:
@@ -133,19 +151,26 @@ class Writer:
             self._budgets[context] = self.take(8)
         return self._budgets[context]
 
+    def throttle(self, context: str, site: int) -> int:
+        """Where it stands when output at a site was last due."""
+        if (context, site) not in self.throttles:
+            self.throttles[context, site] = self.take(8)
+        return self.throttles[context, site]
+
     def event(self, name: str) -> Written:
         """The function of an event. Raises `NotScalarError`."""
-        return self.function(self.functions[name], (I32, I32), I32)
+        function = self.functions[name]
+        return self.function(function, {"at": I32, "size": I32}, I32, function.context)
 
     def function(
         self,
         function: form.Function | form.Skipper,
-        parameters: tuple[int, ...],
+        parameters: Mapping[str, int],
         result: int,
-        context: str = "",
+        context: str,
     ) -> Written:
-        """A function, written when it is first asked for; `context` is whose budget a skipper takes from."""
-        key = (function.name, parameters, result, context)
+        """A function, written when it is first asked for; `context` is whose budget it takes from."""
+        key = (function.name, tuple(parameters), result, context)
         if key not in self._numbers:
             written = _Body(self, function, parameters, result, context).written()
             self._numbers[key] = written
@@ -160,24 +185,17 @@ class _Body:
         self,
         writer: Writer,
         function: form.Function | form.Skipper,
-        parameters: tuple[int, ...],
+        parameters: Mapping[str, int],
         result: int,
         context: str,
     ) -> None:
         self._writer = writer
         self._function = function
         self._result = result
-        self._is_event = False
-        names: Sequence[str] = ("at", "size", "p")
-        if isinstance(function, form.Function):
-            self._is_event = function.happens is not None
-            names = ("at", "size") if self._is_event else function.parameters
-            context = function.context
+        self._is_event = isinstance(function, form.Function) and function.happens is not None
         self._context = context
-        self._types = parameters
-        self._locals = {
-            name: (index, kind) for index, (name, kind) in enumerate(zip(names, parameters, strict=True))
-        }
+        self._types = tuple(parameters.values())
+        self._locals = {name: (index, kind) for index, (name, kind) in enumerate(parameters.items())}
         self._depth = 0  # blocks that are open
         self._loops: list[int] = []  # at which depth the block of each loop is
         self._depends = False  # whether messages may have left before
@@ -260,6 +278,9 @@ class _Body:
             return self._assigned_to(value)
         if isinstance(value, form.Literal) and value.value is None:
             return b""
+        if isinstance(value, form.Conditional) and value.type == kinds.VOID:
+            yes, no = ((form.Evaluate(node.site, each),) for each in (value.yes, value.no))
+            return self._either(form.If(node.site, value.test, yes, no))
         return self._value(value) + DROP
 
     def _either(self, node: form.If) -> bytes:
@@ -269,13 +290,28 @@ class _Body:
         return self._if(test, lambda: self._block(node.yes), no)
 
     def _loop(self, node: form.Loop) -> bytes:
+        return self._repeated(b"", node.body)
+
+    def _repeated(self, before: bytes, body: Sequence[form.Statement]) -> bytes:
+        """Again and again; `before` may leave the outer of the two blocks."""
         self._brief = False
         self._depth += 2
         self._loops.append(self._depth)
-        body = self._block(node.body)
+        code = before + self._block(body)
         self._loops.pop()
         self._depth -= 2
-        return b"\x02\x40\x03\x40" + body + b"\x0c\x00" + END + END
+        return b"\x02\x40\x03\x40" + code + b"\x0c\x00" + END + END
+
+    def _for_each(self, node: form.ForEach) -> bytes:
+        kind, size = _element(node.values.type)
+        first, place, count = self._elements(node.values)
+        at, left = (f"{what} {len(self._locals)}" for what in ("element", "left"))
+        over = self._get(left, I64) + b"\x50\x0d\x01"
+        each = self._loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
+        following = self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
+        less = self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
+        code = first + place + self._set(at) + count + self._set(left, I64)
+        return code + self._repeated(over + each + following + less, node.body)
 
     def _break(self, node: form.Break) -> bytes:
         del node
@@ -316,23 +352,49 @@ class _Body:
         left = self._cell(0x37, budget, self._cell(0x29, budget) + instructions + b"\x7d")
         return left + self._if(self._cell(0x29, budget) + constant(I64, 0) + b"\x53", self._elsewhere)
 
+    def _allocate(self, node: form.Allocate) -> bytes:
+        """Nothing is made here, but it costs the same."""
+        if node.size is not None:
+            return self._allocated(constant(I64, node.size))
+        many = self._get("size") + constant(I32, CHARGED) + b"\x4b"
+        return self._if(many, lambda: self._allocated(self._get("size") + b"\xad"))
+
+    def _allocated(self, size: bytes) -> bytes:
+        """So many bytes (i64) would be made; elsewhere if what the specification holds is measured then."""
+        many = size + constant(I64, UNMEASURED) + b"\x56"
+        spent = size + constant(I64, BYTES_PER_INSTRUCTION) + b"\x80"
+        return self._if(many, self._elsewhere) + self._spend(spent)
+
+    def _pending(self, node: form.Pending) -> bytes:
+        """Only `Whole` asks for it."""
+        del node
+        return b""
+
     def _drop(self, node: form.Drop) -> bytes:
         del node
         self._drops = True
         return constant(I32, 1) + self._set("dropped")
 
     def _read_value(self, node: form.ReadValue) -> bytes:
-        """A string is the place of its first byte and where it ends."""
-        if not isinstance(node.type, kinds.String):
+        _, size = _element(node.type)
+        place, count, start = f"place of {node.name}", f"count of {node.name}", node.at
+        if isinstance(node.type, kinds.Vector) and node.type.length is not None:
+            code = self._within(start, node.type.length * size)
+            code += constant(I64, node.type.length) + self._set(count, I64)
+        else:
+            code, start = self._count(form.Count(node.site, count, start, size)), start.plus(4)
+        code += self._get("at") + self._position(start) + b"\xa7\x6a" + self._set(place)
+        return code + self._after_elements(form.AfterElements(node.site, node.end, start, count, size))
+
+    def _elements(self, node: form.Expression) -> tuple[bytes, bytes, bytes]:
+        """What comes first; the address of the first element of a string or vector, and how many there are (i64)."""
+        if isinstance(node, form.Copy):
+            first, place, count = self._elements(node.value)
+            size = count + constant(I64, _element(node.type)[1]) + b"\x7e"
+            return first + self._allocated(size), place, count
+        if not isinstance(node, form.Read) or f"place of {node.name}" not in self._locals:
             raise NotScalarError(str(node.type))
-        begin = f"begin of {node.name}"
-        code = self._within(node.at, 4) + self._position(node.at.plus(4)) + self._set(begin, I64)
-        code += (
-            self._get(begin, I64) + b"".join(self._at(node.at, 0x28)) + b"\xad\x7c" + self._set(node.end, I64)
-        )
-        code += self._get(node.end, I64) + self._set(f"end of {node.name}", I64)
-        beyond = self._get(node.end, I64) + self._get("size") + b"\xad\x56"
-        return code + self._if(beyond, self._elsewhere)
+        return b"", self._get(f"place of {node.name}"), self._get(f"count of {node.name}", I64)
 
     def _require(self, node: form.Require) -> bytes:
         test, leave = self._value(node.test) + b"\x45", form.Leave(node.site, False)
@@ -357,7 +419,8 @@ class _Body:
         if node.skipper is None:
             end = self._after_text(form.AfterText(node.site, place, form.Spot(place, 0)))
         else:
-            skipper = self._writer.function(node.skipper, (I32, I32, I64), I64, self._context)
+            given = {"at": I32, "size": I32, "p": I64}
+            skipper = self._writer.function(node.skipper, given, I64, self._context)
             end = self._get("at") + self._get("size") + self._get(place, I64)
             end += b"\x10" + unsigned(skipper.number) + self._set(place, I64)
         self._depth -= 2
@@ -370,7 +433,9 @@ class _Body:
         end = max(offset + struct_size(struct_code(kind) or "") for _, kind, offset in node.fields)
         code = self._within(node.at, end)
         for name, kind, offset in node.fields:
-            code += self._loaded(node.at.plus(offset), kind) + self._set(name, machine_type(kind))
+            place = self._get("at")
+            place += b"" if node.at.base is None else self._get(node.at.base, I64) + b"\xa7\x6a"
+            code += self._loaded(place, node.at.offset + offset, kind) + self._set(name, machine_type(kind))
         return code
 
     def _position(self, at: form.Spot) -> bytes:
@@ -388,13 +453,15 @@ class _Body:
         base = self._get("at") + (b"" if at.base is None else self._get(at.base, I64) + b"\xa7\x6a")
         return base, bytes((opcode, 0)) + unsigned(at.offset)
 
-    def _loaded(self, at: form.Spot, kind: Type) -> bytes:
+    def _loaded(self, place: bytes, offset: int, kind: Type) -> bytes:
+        """A number or time so many bytes behind a place."""
         codes = struct_code(kind) or ""
         if len(codes) == 2:
             extend = b"\xad" if codes[0] == "I" else b"\xac"
-            seconds, rest = (b"".join(self._at(at.plus(more), 0x28)) + extend for more in (0, 4))
+            seconds, rest = (place + b"\x28\x00" + unsigned(offset + more) + extend for more in (0, 4))
             return seconds + constant(I64, BILLION) + b"\x7e" + rest + b"\x7c"
-        return b"".join(self._at(at, LOAD[codes])) + (b"\x45\x45" if codes == "?" else b"")
+        code = place + bytes((LOAD[codes], 0)) + unsigned(offset)
+        return code + (b"\x45\x45" if codes == "?" else b"")
 
     def _after_text(self, node: form.AfterText) -> bytes:
         length = b"".join(self._at(node.at, 0x28)) + b"\xad"
@@ -490,18 +557,11 @@ class _Body:
         load = {I32: 0x28, I64: 0x29, F32: 0x2A, F64: 0x2B}[machine]
         return self._cell(load, cells.address(node.name, node.type))
 
-    def _text_ends(self, node: form.Expression) -> tuple[bytes, bytes]:
-        """Where a string of the message begins and ends."""
-        if not isinstance(node, form.Read) or f"begin of {node.name}" not in self._locals:
-            raise NotScalarError("std::string")
-        return self._get(f"begin of {node.name}", I64), self._get(f"end of {node.name}", I64)
-
     def _assigned_to(self, node: form.Assign) -> bytes:
-        if isinstance(node.type, kinds.String) and node.name not in self._writer.shared:
-            begin, end = self._text_ends(node.value)
-            return (
-                begin + self._set(f"begin of {node.name}", I64) + end + self._set(f"end of {node.name}", I64)
-            )
+        if isinstance(node.type, kinds.String | kinds.Vector) and node.name not in self._writer.shared:
+            code, place, count = self._elements(node.value)
+            code += place + self._set(f"place of {node.name}")
+            return code + count + self._set(f"count of {node.name}", I64)
         machine, value = machine_type(node.type), self._value(node.value)
         cells = self._writer.shared.get(node.name)
         if cells is None:
@@ -598,7 +658,7 @@ class _Body:
         if node.operator not in ("==", "!=") or not isinstance(known, form.Literal) or not node.short:
             raise NotScalarError("std::string")
         assert isinstance(known.value, bytes)  # noqa: S101  a constant of strings
-        begin, end = self._text_ends(given)
+        first, place, count = self._elements(given)
         if len(known.value) > SHORT:
             raise NotScalarError("std::string")
         same, at = constant(I32, 1), 0
@@ -606,18 +666,11 @@ class _Body:
             size = max(size for size in (1, 2, 4, 8) if size <= len(known.value) - at)
             number = int.from_bytes(known.value[at : at + size], "little")
             machine, load = {1: (I32, 0x2D), 2: (I32, 0x2F), 4: (I32, 0x28), 8: (I64, 0x29)}[size]
-            same += (
-                self._get("at")
-                + begin
-                + b"\xa7\x6a"
-                + bytes((load, 0))
-                + unsigned(at)
-                + constant(machine, number)
-            )
+            same += place + bytes((load, 0)) + unsigned(at) + constant(machine, number)
             same += bytes((COMPARE[machine]["=="],)) + b"\x71"
             at += size
-        as_long = end + begin + b"\x7d" + constant(I64, len(known.value)) + b"\x51"
-        code = as_long + IF + bytes((I32,)) + same + ELSE + constant(I32, 0) + END
+        as_long = count + constant(I64, len(known.value)) + b"\x51"
+        code = first + as_long + IF + bytes((I32,)) + same + ELSE + constant(I32, 0) + END
         return code + (b"\x45" if node.operator == "!=" else b"")
 
     def _logical(self, node: form.Logical) -> bytes:
@@ -649,6 +702,41 @@ class _Body:
     def _now(self, node: form.Now) -> bytes:
         del node
         return self._cell(0x29, NOW)
+
+    def _throttle(self, node: form.Throttle) -> bytes:
+        """Output that is not due yet; Python puts out what is, and notes when."""
+        seconds = self._value(node.seconds) + _to_floating(
+            machine_type(node.seconds.type), F64, signed=_is_signed(node.seconds.type)
+        )
+        last, now = self._cell(0x29, self._writer.throttle(self._context, node.site)), self._cell(0x29, NOW)
+        until = last + b"\xb9" + seconds + constant(F64, 1e9) + b"\xa2\xa0\x9b\xfc\x06"
+        waits = last + now + b"\x57" + now + until + b"\x53\x71"
+        return self._if(waits + b"\x45", self._elsewhere) + constant(I32, 0)
+
+    def _accumulate(self, node: form.Accumulate) -> bytes:
+        kind, size = _element(node.vector.type)
+        code, place, count = self._elements(node.vector)
+        number = len(self._locals)
+        total, each = (f"{what} {number}" for what in ("sum", "summand"))
+        at, left, last = (f"{what} {number}" for what in ("element", "left", "last"))
+        code += self._value(node.start) + self._set(total, machine_type(node.type))
+        code += self._value(node.first) + self._set(left, I64) + self._value(node.last) + self._set(last, I64)
+        outside = self._get(left, I64) + self._get(last, I64) + b"\x56" + self._get(last, I64) + count
+        code += self._if(outside + b"\x56\x72", self._elsewhere)
+        code += place + self._get(left, I64) + b"\xa7" + constant(I32, size) + b"\x6c\x6a" + self._set(at)
+        code += self._get(last, I64) + self._get(left, I64) + b"\x7d" + self._set(left, I64)
+        code += self._spend(self._get(left, I64))
+        one, other = (
+            form.Convert(node.wide, form.Read(*part)) for part in ((node.type, total), (kind, each))
+        )
+        added = form.Convert(node.type, form.Arithmetic(node.wide, "+", one, other, node.site))
+        span = form.Assign(node.type, total, added)
+        over = self._get(left, I64) + b"\x50\x0d\x01"
+        over += self._loaded(self._get(at), 0, kind) + self._set(each, machine_type(kind))
+        over += self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
+        over += self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
+        code += self._repeated(over, (form.Evaluate(node.site, span),))
+        return code + self._get(total, machine_type(node.type))
 
     def _moment(self, node: form.Moment) -> bytes:
         both = self._value(node.left) + self._value(node.right)
@@ -685,17 +773,41 @@ class _Body:
         return code + self._get(name, I64)
 
     def _call(self, node: form.Call) -> bytes:
-        if node.function in ("h_min", "h_max"):
-            return self._least(node)
-        if node.function == "a_part":
-            return self._with_part(node)
-        (argument,) = node.arguments if len(node.arguments) == 1 else (node,)
-        if node.function in _OPCODES and machine_type(argument.type) in (F64, I64):
-            return self._value(argument) + _OPCODES[node.function]
+        special = _SPECIAL.get(node.function)
+        if special is not None:
+            return special(self, node)
+        argument = node.arguments[0]
+        if node.function in _OF_COUNTS:
+            first, _, count = self._elements(argument)
+            return first + count + _OF_COUNTS[node.function]
+        if node.function in _QUESTIONS:
+            return self._question(argument, _QUESTIONS[node.function])
+        opcode = _OPCODES.get((node.function, machine_type(argument.type)))
+        if opcode is not None:
+            return b"".join(map(self._value, node.arguments)) + opcode
         if node.function not in _OF_MOMENTS:
             raise NotScalarError(node.function)
         code = self._value(argument) + _OF_MOMENTS[node.function](self)
         return code + b"\xa7" if machine_type(node.type) == I32 else code
+
+    def _element_at(self, node: form.Call) -> bytes:
+        values, index = node.arguments
+        kind, size = _element(values.type)
+        first, place, count = self._elements(values)
+        code = first + self._value(index) + self._set("index", I64)
+        past = self._get("index", I64) + count + b"\x5a"
+        code += self._if(past, self._elsewhere)
+        at = place + self._get("index", I64) + b"\xa7" + constant(I32, size) + b"\x6c\x6a"
+        return code + at + self._set("element") + self._loaded(self._get("element"), 0, kind)
+
+    def _question(self, argument: form.Expression, operator: str) -> bytes:
+        """Compare the size of a number with infinity."""
+        machine = machine_type(argument.type)
+        if machine not in (F32, F64):
+            raise NotScalarError(str(argument.type))
+        size = self._value(argument) + bytes((ABS[machine],))
+        compared = size + constant(machine, inf) + bytes((COMPARE[machine][operator.strip("!")],))
+        return compared + (b"\x45" if operator.startswith("!") else b"")
 
     def _with_part(self, node: form.Call) -> bytes:
         """A time with other seconds, or other nanoseconds."""
@@ -750,26 +862,38 @@ class _Body:
         return code + result + bytes((NEG[F64],)) + result + negative + SELECT
 
     def _least(self, node: form.Call) -> bytes:
-        """`std::min` and `std::max`: the second if it is less, or greater."""
+        """`std::min` and `std::max`: the second if it is less, or greater; `fmin` and `fmax`: or the first is NaN."""
         machine = machine_type(node.type)
         one, other = (f"{side} {machine} {len(self._locals)}" for side in ("first", "second"))
         code = b"".join(
             self._value(argument) + self._set(name, machine)
             for name, argument in zip((one, other), node.arguments, strict=True)
         )
-        opcode = COMPARE[machine]["<" if node.function == "h_min" else ">"] + (not _is_signed(node.type))
+        opcode = COMPARE[machine]["<" if "min" in node.function else ">"] + (not _is_signed(node.type))
         test = self._get(other, machine) + self._get(one, machine) + bytes((opcode,))
+        if node.function not in ("h_min", "h_max"):
+            none = self._get(one, machine) + self._get(one, machine) + bytes((COMPARE[machine]["!="],))
+            test += none + b"\x72"
         return code + self._get(other, machine) + self._get(one, machine) + test + SELECT
 
     def _invoke(self, node: form.Invoke) -> bytes:
         if node.depth is not None:
             raise NotScalarError("recursion")
         result = I32 if node.type == kinds.VOID else machine_type(node.type)
-        parameters = tuple(machine_type(argument.type) for argument in node.arguments)
-        called = self._writer.function(self._writer.functions[node.function], parameters, result)
+        function = self._writer.functions[node.function]
+        parameters: dict[str, int] = {}
+        code = b""
+        for name, argument in zip(function.parameters, node.arguments, strict=True):
+            if isinstance(argument.type, kinds.String | kinds.Vector):
+                parameters |= {f"place of {name}": I32, f"count of {name}": I64}
+                code += b"".join(self._elements(argument))
+            else:
+                parameters[name] = machine_type(argument.type)
+                code += self._value(argument)
+        called = self._writer.function(function, parameters, result, function.context)
         self._assigned |= called.assigned
         self._brief = self._brief and called.brief
-        return b"".join(map(self._value, node.arguments)) + b"\x10" + unsigned(called.number)
+        return code + b"\x10" + unsigned(called.number)
 
 
 def _to_floating(source: int, target: int, *, signed: bool) -> bytes:
@@ -788,8 +912,25 @@ def _narrowed(target: kinds.Integer) -> bytes:
     return constant(I32, target.most) + b"\x71"
 
 
-_OPCODES = {"h_sqrt": b"\x9f", "h_fabs": b"\x99", "h_floor": b"\x9c", "h_ceil": b"\x9b", "h_trunc": b"\x9d",
-            "m_is_zero": b"\x50", "m_whole": b""}  # fmt: skip
+_EXACT = {"fabs": 0x99, "ceil": 0x9B, "floor": 0x9C, "trunc": 0x9D, "rint": 0x9E, "nearbyint": 0x9E, "sqrt": 0x9F,
+          "copysign": 0xA6}  # fmt: skip
+_OPCODES = {
+    **{(f"h_{name}", F64): bytes((code,)) for name, code in _EXACT.items()},
+    **{(f"h_{name}f", F32): bytes((code - 14,)) for name, code in _EXACT.items()},
+    ("m_is_zero", I64): b"\x50",
+    ("m_whole", I64): b"",
+    ("k_after", I64): b"\x7c",
+    ("k_before", I64): b"\x7d",
+}
+_SPECIAL: Mapping[str, Callable[[_Body, form.Call], bytes]] = MappingProxyType(
+    {
+        **dict.fromkeys(("h_min", "h_max", "h_fmin", "h_fmax", "h_fminf", "h_fmaxf"), _Body._least),
+        "a_part": _Body._with_part,
+        "l_element": _Body._element_at,
+    }
+)
+_OF_COUNTS = {"l_len": b"", "l_empty": b"\x50", "l_last": constant(I64, 1) + b"\x7d"}
+_QUESTIONS = {"h_isinf": "==", "h_isfinite": "<", "h_isnan": "!<="}
 _OF_MOMENTS: Mapping[str, Callable[[_Body], bytes]] = MappingProxyType(
     {"m_nsec": _Body._nanoseconds, "m_sec": _Body._seconds, "m_seconds": _Body._in_seconds}
 )
@@ -804,7 +945,10 @@ _STATEMENTS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = MappingProxyTyp
         form.Select: _Body._select,
         form.Return: _Body._return,
         form.Leave: _Body._leave,
+        form.ForEach: _Body._for_each,
         form.Charge: _Body._charge,
+        form.Allocate: _Body._allocate,
+        form.Pending: _Body._pending,
         form.Drop: _Body._drop,
         form.Require: _Body._require,
         form.NotPast: _Body._not_past,
@@ -836,6 +980,8 @@ _EXPRESSIONS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = MappingProxyTy
         form.Not: _Body._not,
         form.Conditional: _Body._conditional,
         form.Sequence: _Body._sequence,
+        form.Accumulate: _Body._accumulate,
+        form.Throttle: _Body._throttle,
         form.Call: _Body._call,
         form.Invoke: _Body._invoke,
     }

@@ -22,6 +22,11 @@ class Void(Type):
 
 
 @dataclass(frozen=True, slots=True)
+class Index(Type):
+    """A place in a vector, which no variable holds."""
+
+
+@dataclass(frozen=True, slots=True)
 class Bool(Type):
     """`bool`."""
 

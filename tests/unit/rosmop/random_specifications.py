@@ -18,9 +18,9 @@ OWN = Definitions.from_files(
 )
 TOPICS = {"/plain": "own/Plain", "/stamped": "own/Stamped"}
 _PLAIN = {"kind": "int", "count": "int", "x": "double", "y": "float", "on": "bool", "when": "ros::Time",
-          "three[1]": "long", "x ": "int"}  # fmt: skip
+          "three[1]": "long", "x ": "int", "three": "std::vector<long>", "rest": "uint8_t[]"}  # fmt: skip
 _STAMPED = {"frame": "std::string", "x": "double", "count": "int", "values[1]": "double", "kind": "int",
-            "when.sec": "unsigned int"}  # fmt: skip
+            "when.sec": "unsigned int", "values": "std::vector<double>"}  # fmt: skip
 _LOGICS = (
     "fsm: here [ e0 -> there, default here ] there [ e0 -> here, default there ]{here}{there}{fail}",
     "fsm: one [ e0 -> two, default one ] two [ e0 -> three ] three [ default three ]{three}{fail}",
@@ -82,6 +82,8 @@ class Specifications:
         topic = random.choice(("/plain", "/plain", "/stamped"))
         fields = _PLAIN if topic == "/plain" else _STAMPED
         chosen = random.sample(sorted(fields), random.randint(0, 3))
+        arrays = {one for one in chosen if f"{one}[1]" in chosen}
+        chosen = [one for one in chosen if one not in arrays]
         names = {}
         for place, field in enumerate(dict.fromkeys(one.strip() for one in chosen)):
             kind = next(fields[one] for one in chosen if one.strip() == field)
@@ -90,7 +92,9 @@ class Specifications:
         pattern = [f"{field}:{name}" for name, (field, _) in names.items()]
         if random.random() < 0.3 and not any(field == "kind" for field, _ in names.values()):
             pattern.append("kind:1")
-        numbers = [name for name, (_, kind) in names.items() if kind not in ("std::string", "ros::Time")]
+        numbers = [
+            name for name, (_, kind) in names.items() if not kind.startswith(("std::", "ros::", "uint8_t["))
+        ]
         readable = [*numbers, "total", "level", "seen"]
         when = f"when ({self._condition(readable)})" if random.random() < 0.3 else ""
         body = " ".join(self._statement(names, readable, 2) for _ in range(random.randint(0, 4)))
@@ -142,6 +146,11 @@ class Specifications:
             *(f"{name} = {value};" for name in assigned),
             *(f'if ({name} == "abc") {{ last = {name}; }}' for name in texts),
         ]  # fmt: skip
+        for name in (name for name, (_, kind) in names.items() if kind.endswith((">", "]"))):
+            choices += [f"for (double each : {name}) {{ level += each; }}", f"total += {name}.size();",
+                        f"if (!{name}.empty()) {{ level = {name}[0]; }}", f"level = {name}[total];",
+                        f"level = std::accumulate({name}.begin(), {name}.end(), level);",
+                        f"if (seen) {{ {name}[1] = 7; }}"]  # fmt: skip
         if depth:
             inner = self._statement(names, readable, depth - 1)
             other = self._statement(names, readable, depth - 1)

@@ -152,7 +152,8 @@ EXPRESSIONS = (
     "(uint8_t) y", "(unsigned long) y", "(float) x", "(long) y * x", "x ? y : 1", "x == y", "x && y", "!x || y < 0",
     "std::max(x, 7)", "std::min(y, 0.5)", "(x += 2) + x++", "(unsigned int) x < 5u", "x / (x - x)", "y / 0", "x ^ 5L",
     "1000 / (100 / (x | 1))", "std::min(x, std::max(3, std::min(x, 9)))", "sqrt(y)", "floor(y) - ceil(y)", "trunc(y)",
-    "fabs(y)", "sin(y)",
+    "fabs(y)", "sin(y)", "isnan(y)", "std::isinf(y)", "isfinite((float) y)", "rint(y)", "nearbyint(y)", "fmin(x, y)",
+    "fmax(y, x)", "copysign(x, y)", "fminf(x, y)", "sqrtf(y)", "floorf(y)", "rintf((float) y)", "isnan(0 / y)",
 )  # fmt: skip
 
 
@@ -186,6 +187,24 @@ ACTIONS = {
     ' int f(int a, int b) { if (a > 3) { ROS_INFO("x"); } n += a; return b / a; }'
     " E(int count)'{count:count}' { n = f(count, 7); count = n; }",
     "an index past the end": "int n = 0; E(int r)'{rest[3]:r}' { n = r; }",
+    "elements of an array": "double n = 0; E(std::vector<long> three, int count)'{three:three, count:count}' {"
+    " n = three[count] + three.size() + three.back() + three.empty(); }",
+    "a loop over an array": "long n = 0; E(uint8_t[] rest, int count)'{rest:rest, count:count}' {"
+    " for (int one : rest) { if (one == 5) { continue; } n += one; if (n > 9) { break; } }"
+    " for (int i = 0; i < rest.size(); i++) { n = n * 3 + rest[i]; } }",
+    "a sum of an array": "double n = 0; E(std::vector<long> three, int count)'{three:three, count:count}' {"
+    " n = std::accumulate(three.begin(), three.end(), 0.5)"
+    " + std::accumulate(three.begin() + count, three.end() - 1, (uint8_t) 200); }",
+    "arrays for helpers": "long n = 0; long most(const std::vector<long>& v) {"
+    " long m = v[0]; for (long e : v) { m = std::max(m, e); } return m; }"
+    " long other(std::vector<long> v, int at) { std::vector<long> w = v; return w.at(at) + most(v); }"
+    " E(std::vector<long> three, int count)'{three:three, count:count}' { n = most(three) - other(three, count); }",
+    "an array that is changed": "long n = 0; E(std::vector<long> three, int count)'{three:three, count:count}' {"
+    " n = three[1]; if (count == 5) { three[2] = n; } }",
+    "output that is not due": "int n = 0; E(int count)'{count:count}' {"
+    ' n++; if (count) { ROS_INFO_THROTTLE(10.0, "%d", n); ROS_INFO_THROTTLE(1, "%d", count); } }',
+    "a whole message now and then": "own::Plain last; int n = 0; E(int count)'{count:count}' {"
+    " n++; if (count == 5) { last = MESSAGE; } count = n; }",
     "a byte that is no bool": "bool was = false; E(bool on)'{on:on}' { was = on; on = on; }",
 }
 
@@ -193,12 +212,45 @@ ACTIONS = {
 @pytest.mark.parametrize("name", ACTIONS)
 def test_actions_of_every_kind(name: str) -> None:
     """On messages of all kinds, many of them together."""
-    fed = Fed("s() { " + ACTIONS[name].replace("E(", "event e(").replace(")'", ") /plain own/Plain '") + " }")
+    fed = Fed(
+        "s() { " + ACTIONS[name].replace("E(", "event e(", 1).replace(")'", ") /plain own/Plain '") + " }"
+    )
     for seed in range(6):
         messages = Messages(seed)
         for traffic in (messages.traffic() for _ in range(8)):
             if traffic.topic == "/plain":
                 fed.check(list(traffic.bodies()), time=1_700_000_000_123_456_789 + seed)
+    assert fed.came["together"]
+
+
+def test_output_comes_when_it_is_due_whoever_took_the_messages_before() -> None:
+    """The module knows when a line was last put out, and leaves the message at which the next one is."""
+    fed = Fed(event('n++; ROS_INFO_THROTTLE(2, "%d", n);'))
+    second = 1_000_000_000
+    for time in (
+        0,
+        1,
+        second,
+        2 * second - 1,
+        2 * second,
+        3 * second,
+        5 * second,
+        4 * second,
+        4 * second + 1,
+    ):
+        fed.check([plain()] * 2, time=1_700_000_000 * second + time)
+    assert fed.came["together"] == 9
+
+
+def test_arrays_that_lie_and_arrays_that_end_with_the_message() -> None:
+    """Cut after each byte, and with lengths that are too large: as the interpreter; nobody else's bytes are read."""
+    fed = Fed("""s() { double d = 0; int n = 0; event e(double[] v, std::string f) /stamped own/Stamped
+        '{frame:f, values:v}' { n += v.size() + f.size();
+        for (double each : v) { d += each; } for (char c : f) { n += c; } } }""")
+    for end in range(len(STAMPED) + 1):
+        fed.check([STAMPED, STAMPED[:end], STAMPED], "/stamped")
+    for length in (1, 3, 2**29, 2**31, 2**32 - 1):
+        fed.check([STAMPED[:25] + struct.pack("<I", length) + STAMPED[29:], STAMPED], "/stamped")
     assert fed.came["together"]
 
 
