@@ -123,6 +123,18 @@ METRICS = (
         (),
         "records that retention removed before they were forwarded",
     ),
+    Metric(
+        "rosrv_clock_synchronised",
+        "gauge",
+        (),
+        "1 while a time service keeps the machine's clock, 0 while none does, -1 not known",
+    ),
+    Metric(
+        "rosrv_clock_behind_seconds",
+        "gauge",
+        (),
+        "the clock was set back: it stands so long before the last record",
+    ),
     Metric("rosrv_policy_revision", "gauge", (), "revision of the policy in force"),
     Metric("rosrv_policy_differs_from_file", "gauge", (), "1 while the policy in force is not the file's"),
     Metric("rosrv_process_restarts_total", "counter", ("role",), "times a process was started again"),

@@ -96,7 +96,7 @@ def _buckets(bounds: Sequence[float], counts: Sequence[float]) -> list[tuple[str
 
 def _samples(body: Measures) -> dict[str, _Samples]:
     status = body.status
-    policy, audit, monitors = status.policy, status.audit, status.monitors
+    policy, audit, monitors, clock = status.policy, status.audit, status.monitors, status.clock
     relayed = body.relayed
     return {
         "rosrv_info": [((status.version,), 1)],
@@ -135,6 +135,8 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         "rosrv_audit_failed": [((), audit.failed is not None)],
         "rosrv_audit_degraded": [((), audit.degraded is not None)],
         **_forwarding(audit.forwarding),
+        "rosrv_clock_synchronised": [((), -1 if clock.synchronised is None else clock.synchronised)],
+        "rosrv_clock_behind_seconds": [((), clock.behind_seconds)],
         "rosrv_policy_revision": [((), policy.revision)],
         "rosrv_policy_differs_from_file": [((), policy.differs_from_file)],
         "rosrv_process_restarts_total": [

@@ -87,5 +87,8 @@ EVENTS: dict[str, str] = {
     "forwarding gap": "Retention removed records before they could be forwarded; `detail` has how many.",
     "disk nearly full": "Only the reserve of the log's disk is left (`audit.reserve_bytes`): `reason` says what to do.",
     "disk has room": "There is more than the reserve on the log's disk again.",
+    "clock not synchronised": "No time service keeps the machine's clock: the times of records may be wrong.",
+    "clock synchronised": "A time service keeps the machine's clock again.",
+    "clock set back": "The machine's clock stands before the last record; `detail` has by how many seconds.",
     "log failed": "The log could not be written for a time, and can be again; `reason` says why.",
 }

@@ -31,6 +31,11 @@ class IdSource:
             self._last = now if now > self._last else self._last + 1
             return f"{self._last:016x}{self._suffix}"
 
+    @property
+    def ahead(self) -> float:
+        """By how many seconds the last id is later than the clock, which was set back then; else 0."""
+        return max(0.0, (self._last - self._clock()) / 1e9)
+
     def raise_floor(self, after: str) -> None:
         """Make only ids greater than `after` from now on."""
         if after:

@@ -162,6 +162,9 @@ KINDS: dict[str, Kind] = {
     "forwarding gap": Kind(LOG, _OTHER),
     "disk nearly full": Kind(FINDING, _FOUND, _DETECTED, "the audit log's disk is nearly full"),
     "disk has room": Kind(FINDING, _CLOSED, about="the audit log's disk is nearly full"),
+    "clock not synchronised": Kind(FINDING, _FOUND, _DETECTED, "the clock is not synchronised"),
+    "clock synchronised": Kind(FINDING, _CLOSED, about="the clock is not synchronised"),
+    "clock set back": Kind(FINDING, _FOUND, _DETECTED),
     "log failed": Kind(LOG, _LOG_RESTART),
 }
 

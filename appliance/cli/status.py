@@ -16,7 +16,7 @@ from appliance.channel.answers.status import FirewallState, IpsecState, Status
 from appliance.channel.serving import no_relay, probe_failed
 from appliance.cli.output import counted, say_json
 from appliance.cli.running import Appliance, speaks
-from appliance.cli.status_view import age, lacking_walls, processes_table, shortened
+from appliance.cli.status_view import age, doubted_clock, lacking_walls, processes_table, shortened
 
 _PORT_STATES = ("closed", "open", "unknown")
 _MOST_NAMED = 8
@@ -94,6 +94,9 @@ def _show(body: Status, troubles: list[str]) -> None:
     lacking = lacking_walls(body.processes)
     if lacking is not None:
         grid.add_row("walls", Text(lacking, style=_YELLOW))
+    doubted = doubted_clock(body.clock)
+    if doubted is not None:
+        grid.add_row("clock", Text(doubted, style=_YELLOW))
     for name, text in _others_rules(body.firewall):
         grid.add_row(name, text)
     differs = ""

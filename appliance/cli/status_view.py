@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rich.table import Table
 from rich.text import Text
 
-from appliance.channel.answers.status import ProcessInfo
+from appliance.channel.answers.status import ClockState, ProcessInfo
 from appliance.channel.serving import process_names
 
 _YELLOW = "yellow"
@@ -42,6 +42,15 @@ def lacking_walls(rows: Sequence[ProcessInfo]) -> str | None:
     if not lacking:
         return None
     return lacking[0] + (f" and {len(lacking) - 1} more (rosrv status --json)" if len(lacking) > 1 else "")
+
+
+def doubted_clock(clock: ClockState) -> str | None:
+    """Why the times of records cannot be believed; None: they can."""
+    if clock.behind_seconds:
+        return f"set back: it stands {clock.behind_seconds:.0f} s before the last record"
+    if clock.synchronised is None:
+        return "unknown whether it is synchronised: the kernel does not tell"
+    return None if clock.synchronised else "not synchronised: run chrony or systemd-timesyncd"
 
 
 def age(since: float, now: float | None = None) -> str:

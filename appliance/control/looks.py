@@ -13,7 +13,7 @@ from appliance.channel import admin
 from appliance.channel.answers.graph import Graph, Registration, Registrations, TopicMessage, TopicMessages
 from appliance.channel.answers.inventory import InUse, Inventory
 from appliance.channel.answers.measures import Measures
-from appliance.channel.answers.status import AuditState, PolicyState, Status
+from appliance.channel.answers.status import AuditState, ClockState, PolicyState, Status
 from appliance.control.assembly import Parts
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.measures import measures_of
@@ -40,7 +40,7 @@ _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 class Looks:
     """Each method answers the request that it takes.
 
-    `audit()` is how the audit log stands, `live()` what a change of the policy may end.
+    `audit()` is how the audit log stands, `clock()` the machine's clock, `live()` what a change of the policy may end.
     """
 
     parts: Parts
@@ -48,6 +48,7 @@ class Looks:
     hosts: Hosts
     surroundings: Surroundings
     audit: Callable[[], AuditState]
+    clock: Callable[[], ClockState]
     queued_deliveries: Callable[[], int]
     live: Callable[[], list[Live]]
     started: float = field(default_factory=time.time)
@@ -160,6 +161,7 @@ class Looks:
             messages=relay.carried.total.messages,
             dropped=relay.carried.total.dropped,
             audit=self.audit(),
+            clock=self.clock(),
         )
 
     def _policy(self) -> PolicyState:

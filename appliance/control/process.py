@@ -28,6 +28,7 @@ from appliance.config import Settings, load_resolved
 from appliance.control.admin import AdminServer
 from appliance.control.administration import Administration
 from appliance.control.assembly import INNER, RVMASTER, Foundation, Parts
+from appliance.control.clock import Clock
 from appliance.control.doors import Doors
 from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.forwarder import Forwarded
@@ -224,6 +225,7 @@ class _Control:
         self._tokens = Tokens(base.store, base.trail, lambda: self._rest.state_tokens())  # noqa: PLW0108 - made below
         if self._lifeline.announced:
             self._tokens.told()
+        self._clock = Clock(base.trail, lambda: self._audit.ids.ahead)
         self._forwarded = Forwarded(self._settings.audit.syslog, base.trail)
         self._recordings = RecordingOrders(
             self._settings.recorder,
@@ -236,6 +238,7 @@ class _Control:
             self._hosts,
             self._lifeline.surroundings,
             audit=self._audit_state,
+            clock=self._clock.state,
             queued_deliveries=lambda: parts.delivery.waiting,
             live=parts.revocation.live,
         )
@@ -276,6 +279,7 @@ class _Control:
             parts.liveness.run(),
             base.doors.visitors.sweep(),
             SpareMemory().watch(),
+            self._clock.watch(),
             self._save_parameters(),
             self._tunnels.run(self._certification.each_hour),
             parts.publisher.run(parts.reconciler.ready),
@@ -338,6 +342,8 @@ class _Control:
                 self._reload_on_signal()
             case messages.Announced():
                 self._tokens.told()
+            case messages.ClockRead(synchronised):
+                self._clock.told(synchronised)
             case messages.ProbeFailed(reason):
                 self._base.doors.probed(reason)
             case messages.ProbePassed():

@@ -29,6 +29,7 @@ import structlog
 from appliance.channel import messages
 from appliance.ipsec.charon import PROGRAM as CHARON
 from appliance.supervisor import health, signals
+from appliance.supervisor.clock import clock_is_synchronised
 from appliance.supervisor.enclosure import Enclosure
 from appliance.supervisor.ending import end_all
 from appliance.supervisor.errors import StartError
@@ -120,6 +121,7 @@ class Supervisor:
         self._asking: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._unanswered = 0
+        self._clock = messages.ClockRead(clock_is_synchronised())
         self._since = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
     async def run(self) -> None:
@@ -241,7 +243,7 @@ class Supervisor:
         for name, descriptor in self._kept:
             life.send(messages.SocketRestored(name), (descriptor,))
         life.send(messages.SocketsRestored(len(self._kept), self._is_ready))
-        for message in self._guard.news():
+        for message in (*self._guard.news(), self._clock):
             life.send(message)
 
     def _link(self, post: Post) -> None:
@@ -424,6 +426,10 @@ class Supervisor:
             for post in self._posts:
                 if post.life is not None:
                     self._look_at(post, post.life, slept)
+            clock = messages.ClockRead(clock_is_synchronised())
+            if clock != self._clock:
+                self._clock = clock
+                self._tell_control(clock)
 
     def _look_at(self, post: Post, life: Life, slept: float) -> None:
         if slept > 1.0:

@@ -113,6 +113,18 @@ class ForwardingState(msgspec.Struct, frozen=True):
     send: str
 
 
+class ClockState(msgspec.Struct, frozen=True):
+    """Whether the times of records can be believed."""
+
+    synchronised: Annotated[
+        bool | None,
+        told("whether a time service keeps the machine's clock; null: its kernel does not tell us"),
+    ]
+    behind_seconds: Annotated[
+        float, told("how long the clock stands before the last record: it was set back; 0: it does not")
+    ]
+
+
 class AuditState(msgspec.Struct, frozen=True):
     """How far the audit log is behind, why it cannot be written, and what becomes of requests then."""
 
@@ -151,3 +163,4 @@ class Status(msgspec.Struct, frozen=True):
     messages: int
     dropped: int
     audit: AuditState
+    clock: ClockState

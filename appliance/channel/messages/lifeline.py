@@ -105,6 +105,12 @@ class ProcessesChanged(Message):
     processes: list[ProcessInfo]
 
 
+class ClockRead(Message):
+    """Supervisor tells control whether a time service keeps the machine's clock: at start, and when it changes."""
+
+    synchronised: bool | None
+
+
 class FirewallReported(Message):
     """Supervisor tells control the state of isolation and firewall for `rosrv status`."""
 
@@ -164,7 +170,7 @@ class ApplianceStopRequested(Message):
 
 Lifeline = (
     Ping | Pong | Stop | Walled | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
-    | SocketsRestored | Announced | ProcessesChanged | FirewallReported | ProbeFailed | ProbePassed
+    | SocketsRestored | Announced | ProcessesChanged | ClockRead | FirewallReported | ProbeFailed | ProbePassed
     | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
     | TunnelsWanted | TunnelsEnclosed
     | RingGiven | RouteFound | LogHeld | ApplianceStopRequested | SignatureWanted | SignatureMade

@@ -2,6 +2,8 @@
 
 import itertools
 
+import pytest
+
 from appliance.audit.ids import ID_LENGTH, IdSource
 
 
@@ -32,3 +34,18 @@ def test_sources_in_the_same_nanosecond_differ() -> None:
     """Two processes with the same clock do not make the same id (in 65535 of 65536 cases)."""
     ids = {IdSource(clock=lambda: 7).next() for _ in range(20)}
     assert len(ids) >= 18
+
+
+def test_how_far_the_clock_was_set_back() -> None:
+    """The ids say it, also over a restart, until the clock has caught up."""
+    now = 10_000_000_000
+    before = IdSource(clock=lambda: now)
+    last = before.next()
+    assert before.ahead == 0.0
+    now -= 4_000_000_000
+    assert before.ahead == pytest.approx(4.0)
+    after = IdSource(clock=lambda: now)
+    after.raise_floor(last)
+    assert after.ahead == pytest.approx(4.0)
+    now += 5_000_000_000
+    assert after.ahead == 0.0

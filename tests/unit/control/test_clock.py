@@ -1,0 +1,55 @@
+"""Tests of what control says of the machine's clock: once, and it blocks nothing."""
+
+from typing import Any, cast
+
+import pytest
+
+from appliance.audit_trail import AuditTrail
+from appliance.channel.answers.status import ClockState
+from appliance.control.clock import Clock
+
+
+class Trail:
+    """What is recorded."""
+
+    def __init__(self) -> None:
+        self.events: list[str] = []
+
+    def happened(self, event: str, _text: str, **_more: Any) -> None:
+        """As the trail takes it."""
+        self.events.append(event)
+
+
+@pytest.fixture
+def trail() -> Trail:
+    """A log."""
+    return Trail()
+
+
+def test_a_clock_that_nobody_keeps_is_recorded_once(trail: Trail) -> None:
+    """It is said when it is so, and when it is over; what is not known is no news."""
+    clock = Clock(cast(AuditTrail, trail), lambda: 0.0)
+    for synchronised in (None, False, False, True, True, None, False):
+        clock.told(synchronised)
+        assert clock.state() == ClockState(synchronised, 0.0)
+    assert trail.events == ["clock not synchronised", "clock synchronised", "clock not synchronised"]
+
+
+def test_a_clock_that_is_right_is_not_recorded(trail: Trail) -> None:
+    """At a start where all is well nothing is said."""
+    clock = Clock(cast(AuditTrail, trail), lambda: 0.0)
+    clock.told(True)
+    clock.look()
+    assert trail.events == []
+
+
+def test_a_clock_that_was_set_back_is_recorded_once(trail: Trail) -> None:
+    """Each time it is set back there is one record, however often it is looked at; a second is no step."""
+    behind = [1.5]
+    clock = Clock(cast(AuditTrail, trail), lambda: behind[0])
+    clock.look()
+    assert (trail.events, clock.state().behind_seconds) == ([], 0.0)
+    for behind[0] in (3600.0, 3590.0, 0.5, 90.0):
+        clock.look()
+    assert trail.events == ["clock set back"] * 2
+    assert clock.state().behind_seconds == 90.0

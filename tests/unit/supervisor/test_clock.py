@@ -1,0 +1,44 @@
+"""Tests of what the kernel says of the machine's clock."""
+
+import ctypes
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from appliance.supervisor import clock
+from appliance.supervisor.clock import clock_is_synchronised
+
+
+@pytest.mark.parametrize(
+    ("status", "answer", "expected"),
+    [(0x0041, 5, False), (0x2001, 0, True), (0, 5, True), (0, -1, None), (0x0040, -1, None)],
+)
+def test_what_the_kernel_says(
+    monkeypatch: pytest.MonkeyPatch, status: int, answer: int, expected: bool | None
+) -> None:
+    """Its flag counts, not other trouble it tells; where the call is forbidden, nothing is known. Nothing is set."""
+    asked = []
+
+    def adjtimex(given: Any) -> int:
+        asked.append(given.contents.modes)
+        given.contents.status = status
+        return answer
+
+    monkeypatch.setattr(clock, "_libc", SimpleNamespace(adjtimex=adjtimex))
+    assert clock_is_synchronised() is expected
+    assert asked == [0]
+
+
+def test_the_structure_is_the_kernels() -> None:
+    """The flags stand where the 64-bit kernel has them (adjtimex(2)), and it has room for all it writes."""
+    assert clock.Timex.status.offset == 40
+    assert ctypes.sizeof(clock.Timex) >= 208
+
+
+def test_this_kernel_is_asked() -> None:
+    """The real call writes what it should: maximum errors are positive where it answers."""
+    timex = clock.Timex()
+    answer = ctypes.CDLL(None).adjtimex(ctypes.pointer(timex))
+    assert answer == -1 or timex.maxerror > 0
+    assert clock_is_synchronised() is (None if answer == -1 else not timex.status & 0x0040)
