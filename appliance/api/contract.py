@@ -24,6 +24,7 @@ _WITH_TOKEN = {
 _NOT_HTTP = (
     "What came is not HTTP, or its first line or headers are too long (64 KiB); the server's own words."
 )
+_HASH = {"description": "of this body; If-None-Match takes it", "schema": {"type": "string"}}
 _REFERENCE = CONTRACT.reference(Problem)
 
 
@@ -48,8 +49,10 @@ def _made(app: FastAPI) -> dict[str, Any]:
     components |= _plain(CONTRACT.components())
     components["AuditRecord"] = RECORD
     for path in document["paths"].values():
-        for operation in path.values():
+        for method, operation in path.items():
             _complete(operation)
+            if method == "get":
+                _tagged(operation["responses"])
     return document
 
 
@@ -60,6 +63,17 @@ def _plain(schema: Any) -> Any:
     if not isinstance(schema, dict):
         return schema
     return {name: _plain(part) for name, part in schema.items() if not (name == "items" and part is False)}
+
+
+def _tagged(responses: dict[str, Any]) -> None:
+    """What `Unchanged` does."""
+    good = responses["200"]
+    if "application/json" in good.get("content", {}) and "ETag" not in good.get("headers", {}):
+        good.setdefault("headers", {})["ETag"] = _HASH
+        responses["304"] = {
+            "description": "The body is the one whose ETag is in If-None-Match.",
+            "headers": {"ETag": _HASH},
+        }
 
 
 def _complete(operation: dict[str, Any]) -> None:

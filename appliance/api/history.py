@@ -15,7 +15,7 @@ import msgspec
 
 from appliance.api.control import ControlAwayError, ControlLink
 from appliance.channel.admin import MetricsWanted
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import Moment, told
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import Status
 
@@ -31,7 +31,7 @@ _AWAY = "RVMaster does not answer"
 class Sample(msgspec.Struct, frozen=True, kw_only=True):
     """Counters at one moment, since RVMaster started; after its restart they begin anew."""
 
-    time: Annotated[float, told("seconds since the epoch")]
+    time: Moment
     allowed: Annotated[int, told("decisions of the policy")]
     denied: Annotated[int, told("decisions of the policy, `would deny` included")]
     messages: Annotated[int, told("relayed")]

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import Moment, told
 from appliance.channel.answers.hosts import PortsState
 
 HOST_NAME = r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?$"
@@ -23,7 +23,7 @@ Endpoint = Annotated[str, msgspec.Meta(pattern=ENDPOINT + _WHOLE)]
 Service = Annotated[str, msgspec.Meta(pattern=SERVICE + _WHOLE)]
 Address = Annotated[str, msgspec.Meta(max_length=64)]
 Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
-Moment = Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)]
+GivenMoment = Annotated[float, told("seconds since the epoch", ge=0, le=4_000_000_000)]
 Days = Annotated[float, told("until the certificate ends", gt=0, le=LONGEST_DAYS)]
 TokenSeconds = Annotated[float, msgspec.Meta(ge=60, le=LONGEST_TOKEN_SECONDS)]
 SigningRequest = Annotated[str, told("PKCS #10, in PEM", min_length=1, max_length=LONGEST_REQUEST)]
@@ -94,7 +94,7 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
     appliance: Annotated[str, told("the appliance's address in the tunnel")]
     master: Annotated[str, told("ROS_MASTER_URI through the tunnel")]
     serial: str
-    expires: float
+    expires: Moment
     certificate: str
     authority: str
     warning: str | None
@@ -113,4 +113,4 @@ class PortsTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     state: PortsState
     open: Annotated[list[Port], msgspec.Meta(max_length=100)] = []
-    checked: Annotated[Moment | None, told("null: now")] = None
+    checked: Annotated[GivenMoment | None, told("null: now")] = None

@@ -6,7 +6,7 @@ import msgspec
 
 from appliance.api.policy_models import Signature
 from appliance.api.problems import Finding
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import Moment, told
 from appliance.channel.answers.monitors import MonitorState, Tag
 
 _WHOLE = r"(?!\n)"  # after `$`, which Python finds before a last newline, too
@@ -39,7 +39,7 @@ class EventShown(msgspec.Struct, frozen=True, kw_only=True):
     topic: str | None
     type: str | None
     part: Annotated[str | None, told("of a service: request or response")]
-    every: float | None
+    every: Annotated[float | None, told("so many seconds; null: not this way")]
 
 
 class PropertyShown(msgspec.Struct, frozen=True, kw_only=True):
@@ -56,7 +56,7 @@ class Happened(msgspec.Struct, frozen=True, kw_only=True):
     """Something a monitor did, as it is in the audit log under this sequence; `count`: more of the same."""
 
     sequence: int
-    time: str
+    time: Annotated[str, told("RFC 3339, UTC, nanoseconds")]
     event: str
     resource: str | None
     reason: str
@@ -128,9 +128,7 @@ class Replaced(msgspec.Struct, frozen=True, kw_only=True):
     kept: Annotated[
         list[str], told("files that a reload left in force although the folder does not have them")
     ] = []
-    confirm_by: Annotated[
-        float | None, told("when it goes back by itself unless confirmed, seconds since the epoch")
-    ] = None
+    confirm_by: Annotated[Moment | None, told("when it goes back by itself unless confirmed")] = None
 
 
 class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from appliance.api.problems import Finding
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import Moment, told
 from appliance.policy.model import Category
 
 LONGEST_REVISION = 10**15
@@ -54,7 +54,7 @@ class Report(msgspec.Struct, frozen=True, kw_only=True):
     revision: Annotated[int, told("in force now")]
     replaced: int | None = None
     revoked: Annotated[int | None, told("registrations and connections that were taken back")] = None
-    confirm_by: float | None = None
+    confirm_by: Moment | None = None
     warnings: list[Finding]
     changes: list[Change]
     ends: Annotated[list[Ended], told("what is live and ends by it")]

@@ -25,6 +25,7 @@ from appliance.api.history import History, measures_of
 from appliance.api.journal import FOLD_SECONDS, Journal
 from appliance.api.listener import Listener
 from appliance.api.services import Services
+from appliance.api.unchanged import Unchanged
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.config import Settings, load_resolved
@@ -65,7 +66,7 @@ class _Api:
         )
         app = build_app(services)
         gate = Gate(
-            app,
+            Unchanged(app),
             limits=self._settings.api_limits,
             doorkeeper=self._doorkeeper,
             journal=self._journal,

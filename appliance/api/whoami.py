@@ -8,7 +8,7 @@ from appliance.api.roles import Viewer, ask
 from appliance.api.routing import Routes
 from appliance.api.services import Services
 from appliance.channel.admin import ChallengeWanted
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import Moment, told
 from appliance.channel.answers.tokens import Challenge, TokenRole
 
 
@@ -17,7 +17,7 @@ class Holder(msgspec.Struct, frozen=True):
 
     name: str
     role: Annotated[TokenRole, told("each may do all that those before it may")]
-    expires: float
+    expires: Moment
 
 
 def routes(services: Services) -> Routes:

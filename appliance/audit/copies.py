@@ -14,6 +14,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 
@@ -43,7 +44,7 @@ class SignedCheckpoint(msgspec.Struct, frozen=True, omit_defaults=True):
     number: int
     sequence: int
     hash: str
-    time: int
+    time: Annotated[int, msgspec.Meta(description="nanoseconds since the epoch")]
     previous: str
     signature: str
     key: str

@@ -1,6 +1,7 @@
 """What a verification finds, as data that the CLI, REST and the console show alike."""
 
 import enum
+from typing import Annotated
 
 import msgspec
 
@@ -45,7 +46,7 @@ class Elsewhere(msgspec.Struct, frozen=True, kw_only=True):
 
     checkpoints: int
     through: int
-    time: int
+    time: Annotated[int, msgspec.Meta(description="nanoseconds since the epoch")]
     other_logs: list[str]
 
 

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import Moment, told
 
 PortsState = Literal["closed", "open", "unknown"]
 State = Literal["up", "down", "expired", "revoked", "not wanted", "awaited", "not enrolled"]
@@ -14,7 +14,7 @@ class PortsSeen(msgspec.Struct, frozen=True):
     """Whether a machine's ROS ports are closed to all but the appliance, as somebody saw who tried from outside."""
 
     state: PortsState
-    checked: Annotated[float | None, told("seconds since the epoch; null: never")]
+    checked: Annotated[Moment | None, told("null: never")]
     open: Annotated[list[int], told("TCP ports that accepted a connection, the first hundred")]
     who: Annotated[str, told("the token by which it was told, or `operator`; empty: never tried")]
 
@@ -33,17 +33,17 @@ class Host(msgspec.Struct, frozen=True):
     wanted: Annotated[bool, told("hosts.yaml wants its tunnel, or does not know it")]
     divergence: Annotated[str | None, told("what is different from hosts.yaml, in a sentence")]
     serial: Annotated[str | None, told("of its certificate, in hexadecimal")]
-    enrolled: float | None
-    expires: Annotated[float | None, told("the end of its certificate")]
+    enrolled: Moment | None
+    expires: Annotated[Moment | None, told("the end of its certificate")]
     expires_soon: Annotated[bool, told("within 14 days, or a third of its life if that is shorter")]
     renewing: Annotated[bool, told("it has a newer certificate that it has not put in place yet")]
-    revoked: float | None
+    revoked: Moment | None
     remote: Annotated[str | None, told("where it really is; null: no tunnel")]
     seconds: Annotated[int | None, told("age of the SA")]
     bytes_in: int | None
     bytes_out: int | None
-    last_seen: Annotated[float | None, told("when something last came through its tunnel")]
-    token_expires: Annotated[float | None, told("until when its one-time token can be used; null: none")]
+    last_seen: Annotated[Moment | None, told("when something last came through its tunnel")]
+    token_expires: Annotated[Moment | None, told("until when its one-time token can be used; null: none")]
     ports: PortsSeen
 
 
@@ -87,7 +87,7 @@ class KitParts(msgspec.Struct, frozen=True, kw_only=True):
     pin: str
     warning: str | None
     serial: str
-    expires: float
+    expires: Moment
     certificate: str
     authority: str
     kept: dict[str, str] = {}
@@ -100,7 +100,7 @@ class EnrolmentToken(msgspec.Struct, frozen=True, kw_only=True):
     name: str
     address: Annotated[str, told("the virtual address that is kept for it")]
     token: str
-    expires: float
+    expires: Moment
     endpoint: Annotated[str, told("address or name at which the host reaches the appliance")]
     endpoint_reason: Annotated[str, told("why this one, where none was given; else empty")]
     url: Annotated[str, told("where the host brings it: POST /v1/enrol there")]
@@ -122,7 +122,7 @@ class NewCertificate(msgspec.Struct, frozen=True):
 
     name: str
     serial: str
-    expires: float
+    expires: Moment
     certificate: str
     authority: str
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import Moment, told
 
 Tag = Annotated[
     str,
@@ -43,10 +43,8 @@ class Monitors(msgspec.Struct, frozen=True):
     tag: Tag
     who: str
     note: str
-    loaded: float
-    confirm_by: Annotated[
-        float | None, told("when it goes back by itself unless confirmed, seconds since the epoch")
-    ]
+    loaded: Moment
+    confirm_by: Annotated[Moment | None, told("when it goes back by itself unless confirmed")]
     folder: Annotated[str | None, told("what `reload` reads; null: no folder was given at start")]
     differs_from_folder: bool
     warnings: list[str]
@@ -74,7 +72,7 @@ class Replaced(msgspec.Struct, frozen=True):
     moved: list[str]
     began: list[str]
     kept: list[str]
-    confirm_by: float | None
+    confirm_by: Moment | None
 
 
 class MonitorsConfirmed(msgspec.Struct, frozen=True):
@@ -89,7 +87,7 @@ class MonitorRevision(msgspec.Struct, frozen=True):
     """Specifications that came into force; `loaded` is seconds since the epoch."""
 
     revision: int
-    loaded: float
+    loaded: Moment
     who: str
     note: str
     in_force: bool

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import Moment, told
 
 
 class PolicyRevision(msgspec.Struct, frozen=True):
@@ -12,7 +12,7 @@ class PolicyRevision(msgspec.Struct, frozen=True):
 
     revision: int
     file: str
-    loaded: float
+    loaded: Moment
     who: str
     note: str
     in_force: bool
@@ -37,7 +37,7 @@ class PolicyInForce(RevisionText, frozen=True):
     policy_file: Annotated[str, told("what `reload` reads")]
     differs_from_file: bool
     warnings: list[str]
-    confirm_by: float | None
+    confirm_by: Moment | None
     site_keys: Annotated[list[str], told("with any, one of them must have signed what is loaded")]
 
 
@@ -62,9 +62,7 @@ class Loaded(msgspec.Struct, frozen=True):
     replaced: int
     warnings: list[str]
     revoked: Annotated[int, told("registrations and connections that were taken back")]
-    confirm_by: Annotated[
-        float | None, told("when it goes back by itself unless confirmed, seconds since the epoch")
-    ]
+    confirm_by: Annotated[Moment | None, told("when it goes back by itself unless confirmed")]
 
 
 class PolicyConfirmed(msgspec.Struct, frozen=True):

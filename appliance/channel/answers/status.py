@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import Moment, told
 from appliance.channel.answers.hosts import PortsSeen
 
 
@@ -13,7 +13,7 @@ class ProcessInfo(msgspec.Struct, frozen=True):
 
     role: str
     pid: int
-    since: str
+    since: Annotated[str, told("RFC 3339, UTC, milliseconds")]
     restarts: int
     walls: Annotated[
         str,
@@ -61,7 +61,7 @@ class PolicyState(msgspec.Struct, frozen=True):
     who: str
     differs_from_file: bool
     warnings: int
-    confirm_by: float | None
+    confirm_by: Moment | None
 
 
 class IpsecState(msgspec.Struct, frozen=True):
@@ -93,7 +93,7 @@ class MonitorsState(msgspec.Struct, frozen=True):
     refused: Annotated[list[str], told("why the relay does not take them: everything is blocked then")]
     who: str
     differs_from_folder: bool
-    confirm_by: float | None
+    confirm_by: Moment | None
 
 
 class ForwardingState(msgspec.Struct, frozen=True):
@@ -140,7 +140,7 @@ class Status(msgspec.Struct, frozen=True):
     """The running appliance, as `rosrv status --json` shows it; `since` is seconds since the epoch."""
 
     version: str
-    since: float
+    since: Moment
     master: Annotated[str, told("where nodes find their master")]
     processes: list[ProcessInfo]
     isolation: str

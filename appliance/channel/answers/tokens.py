@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import Moment, told
 
 TokenRole = Literal["viewer", "operator", "admin"]
 
@@ -15,9 +15,9 @@ class Token(msgspec.Struct, frozen=True):
     name: str
     id: str
     role: TokenRole
-    created: float
-    expires: float
-    revoked: float | None
+    created: Moment
+    expires: Moment
+    revoked: Moment | None
 
 
 class Tokens(msgspec.Struct, frozen=True):

@@ -32,6 +32,7 @@ from appliance.rosmop.types.messages import Messages, nearest, shown
 
 _T = TypeVar("_T")
 
+_TAKEN = "revisions"
 MODIFIERS = frozenset({"hold"})
 IGNORED_MODIFIERS = frozenset({"unsynchronized", "decentralized", "perthread", "suffix", "creation"})
 """Modifiers of MOP that say how a monitor is generated, and mean nothing here."""
@@ -223,6 +224,9 @@ def _check_head(shared: Shared, specification: tree.Specification) -> None:
         elif word not in MODIFIERS:
             text = f"{shown(word)} is no modifier of a specification{nearest(word, MODIFIERS)}"
             shared.findings.append(Finding(modifier.position, "error", text))
+    if specification.name == _TAKEN:
+        text = f"no specification can be called {shown(_TAKEN)}: over REST /v1/monitors/{_TAKEN} is their history"
+        shared.findings.append(Finding(specification.position, "error", text))
     if specification.parameters:
         text = "specifications take no parameters; write them as variables"
         shared.findings.append(Finding(specification.parameters[0].position, "error", text))

@@ -251,3 +251,16 @@ def test_slow_clients_are_cut_off_and_others_served(rest: Rest) -> None:
         other.close()
         eventually(lambda: ended() == len(idle), "those that are left end, too")
         assert rest.with_token(None).get("/healthz").status == 200
+
+
+def test_who_polls_is_not_sent_again_what_he_has(rest: Rest) -> None:
+    """The hash of what came is all that is sent the second time; a revision's ETag stays for changes alone."""
+    for path in ("/v1/inventory", "/v1/policy/revisions", "/v1/tokens", "/v1/openapi.json"):
+        first = rest.get(path)
+        again = rest.get(path, If_None_Match=first.etag)
+        assert (again.status, again.body, again.etag) == (304, b"", first.etag), path
+        assert rest.get(path, If_None_Match='"other"').body == first.body
+    for path in ("/v1/policy", "/v1/monitors", "/v1/hosts"):
+        first = rest.get(path)
+        assert rest.get(path, If_None_Match=first.etag).json.keys() == first.json.keys(), path
+    assert rest.with_token(None).get("/v1/inventory", If_None_Match="*").status == 401

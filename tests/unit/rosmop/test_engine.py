@@ -676,6 +676,10 @@ BAD_NAMES = [
         "the function `f` is declared twice",
     ),
     ("a() { init() { } init() { }" + on("/t") + "}", "`init` occurs twice"),
+    (
+        "revisions() {" + on("/t") + "}",
+        "no specification can be called `revisions`: over REST /v1/monitors/revisions is their history",
+    ),
     ("hodl a() {" + on("/t") + "}", "`hodl` is no modifier of a specification; did you mean `hold`?"),
     ("a(int x) {" + on("/t") + "}", "specifications take no parameters; write them as variables"),
     ("a() { int n; }", "the specification `a` has no event"),

@@ -1,0 +1,75 @@
+"""What the contract says of itself: units of moments and durations, and of what is not sent again."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from appliance.api.access import Doorkeeper
+from appliance.api.app import build_app
+from appliance.api.control import ControlLink
+from appliance.api.history import History
+from appliance.api.journal import Journal
+from appliance.api.services import Services
+from appliance.channel.answers.measures import Measures
+from appliance.config import Settings
+from tests.support.answers import example
+
+_OF_CHANGES = {"/v1/policy", "/v1/hosts", "/v1/hosts/{name}", "/v1/monitors", "/v1/monitors/{name}"}
+_UNITS = ("seconds", "days")
+_IN_NAME = (*_UNITS, "_us", "_per_second", "_seconds")
+_IN_WORDS = (*_UNITS, "microseconds", "milliseconds", "nanoseconds", "RFC 3339", "until the certificate ends")
+
+
+@pytest.fixture(scope="module")
+def contract() -> dict[str, Any]:
+    """The document."""
+
+    async def nothing() -> Measures:
+        return example(Measures)
+
+    control, journal = ControlLink(lambda _tokens: None, lambda: None), Journal(lambda _call: None)
+    app = build_app(Services(Settings(), control, Doorkeeper(1), journal, asyncio.Event(), History(nothing)))
+    return app.openapi()
+
+
+def _kinds(schema: dict[str, Any]) -> set[str]:
+    """The types that a property can have."""
+    kind = schema.get("type", [])
+    kinds = {kind} if isinstance(kind, str) else set(kind)
+    return kinds.union(*map(_kinds, schema.get("anyOf", ())))
+
+
+def _words(schema: dict[str, Any]) -> str:
+    """All that is said of a property."""
+    return " ".join([schema.get("description", ""), *map(_words, schema.get("anyOf", ()))])
+
+
+def test_times_have_units(contract: dict[str, Any]) -> None:
+    """What is no whole number, and what is called a time, has its unit in its name or in its description."""
+    without, seen = [], 0
+    for kind, schema in contract["components"]["schemas"].items():
+        for name, of in schema.get("properties", {}).items():
+            is_time = "number" in _kinds(of) or name in ("time", "since", "until") or name.endswith("_time")
+            if not is_time or _kinds(of) <= {"object", "array", "boolean"}:
+                continue
+            seen += 1
+            if not name.endswith(_IN_NAME) and not any(word in _words(of) for word in _IN_WORDS):
+                without.append(f"{kind}.{name}")
+    assert without == []
+    assert seen > 30
+
+
+def test_what_can_be_asked_for_when_it_changed(contract: dict[str, Any]) -> None:
+    """Each GET that answers with JSON has an ETag; one whose ETag is for changes is sent whole each time."""
+    for path, operations in contract["paths"].items():
+        if "get" not in operations:
+            continue
+        responses = operations["get"]["responses"]
+        good = responses["200"]
+        if "application/json" not in good.get("content", {}):
+            assert "304" not in responses, path
+            continue
+        said = good["headers"]["ETag"]["description"]
+        assert ("If-None-Match" in said) == ("304" in responses), path
+        assert ("If-Match" in said) == (path in _OF_CHANGES), path
