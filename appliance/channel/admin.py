@@ -384,13 +384,15 @@ class LogSealed(AdminRequest[evidence.Sealed], frozen=True, tag="audit seal"):
 class EvidenceExported(AdminRequest[evidence.Sealed], frozen=True, tag="evidence exported"):
     """Record that a bundle was made whose manifest has this hash, and have that sealed.
 
-    It has so many `records`, from `since` until before `until` (nanoseconds since the epoch).
+    It has so many `records`, from `since` until before `until` (nanoseconds since the epoch), and the `recording` of
+    this id.
     """
 
     manifest: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
     since: int
     until: int
     records: int
+    recording: str = ""
 
 
 class ChallengeWanted(AdminRequest[tokens.Challenge], frozen=True, tag="challenge"):

@@ -6,19 +6,21 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import quote
 
 import typer
 
 from appliance.audit.moment import parse_moment
 from appliance.audit.output import rfc3339
+from appliance.cli import completion
 from appliance.cli.admin_socket import AdminSocket
 from appliance.cli.audit.errors import Errors, fail
-from appliance.cli.output import Json, say, say_json
+from appliance.cli.output import Json, say, say_json, usage_error
 from appliance.cli.rest.session import ProblemError
 from appliance.cli.rest.way import RestWay
 from appliance.cli.running import Appliance, speaks
 from appliance.evidence import verify as verifier_module
-from appliance.evidence.bundle import VERIFIER, BundleError, Span, export
+from appliance.evidence.bundle import VERIFIER, BundleError, Kept, Span, export
 from appliance.fingerprints import fingerprint
 
 _SILENCE_SECONDS = 3600.0  # it is made twice before the first byte comes
@@ -27,27 +29,39 @@ _SILENCE_SECONDS = 3600.0  # it is made twice before the first byte comes
 @speaks
 def export_evidence(
     appliance: Appliance,
+    recording: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[RECORDING]",
+            help="The messages of this recording, and its time",
+            autocompletion=completion.recordings,
+        ),
+    ] = None,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help="File (ZIP), must not exist")],
-    since: Annotated[str, typer.Option("--since", help="From this moment: 1h (ago), a date, or RFC 3339")],
-    until: Annotated[str, typer.Option("--until", help="Before this moment")] = "0s",
+    since: Annotated[
+        str | None, typer.Option("--since", help="From this moment: 1h (ago), a date, or RFC 3339")
+    ] = None,
+    until: Annotated[str | None, typer.Option("--until", help="Before this moment")] = None,
     as_json: Json = False,
 ) -> None:
     """Write what the log has of a time, and what was in force, as a bundle that proves itself anywhere.
 
-    It is on record who did. In the bundle are the audit records, the policies and specifications in force, signed
-    checkpoints, a page for people and the verifier.
+    It is on record who did. In the bundle are the recording, if it is of one, the audit records, the policies and
+    specifications in force, signed checkpoints, a page for people and the verifier.
 
     Example: rosrv evidence export --since 2026-03-01T10:00Z --until 2026-03-01T11:00Z -o incident.zip
     """
     with Errors():
+        if (recording is None) is (since is None) or (recording is not None and until is not None):
+            raise usage_error("give a recording, or --since (and --until)")
         now = time.time_ns()
-        span = Span(parse_moment(since, now), parse_moment(until, now))
+        span = Span(parse_moment(since or "0s", now), parse_moment(until or "0s", now))
         size = 0
         descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             with os.fdopen(descriptor, "wb") as file:
-                for piece in _bundle(appliance, span):
+                for piece in _bundle(appliance, recording or span):
                     size += file.write(piece)
         except BaseException as error:
             output.unlink()
@@ -60,13 +74,18 @@ def export_evidence(
         say(f"{output}: {size} bytes; prove it: python3 verify.py {output.name} --key audit.pub")
 
 
-def _bundle(appliance: Appliance, span: Span) -> Iterator[bytes]:
+def _bundle(appliance: Appliance, wanted: str | Span) -> Iterator[bytes]:
     match appliance.way:
         case AdminSocket(state=state):
-            yield from export(state / "control" / "audit.db", span, appliance.ask)
+            asked = Kept(wanted, state / "recordings") if isinstance(wanted, str) else wanted
+            yield from export(state / "control" / "audit.db", asked, appliance.ask)
         case RestWay(client=client):
-            params = {"since": rfc3339(span.since), "until": rfc3339(span.until)}
-            with client.streamed("GET", "/v1/evidence", params=params, seconds=_SILENCE_SECONDS) as answer:
+            path, params = "/v1/evidence", {}
+            if isinstance(wanted, str):
+                path = f"/v1/recordings/{quote(wanted, safe='')}/evidence"
+            else:
+                params = {"since": rfc3339(wanted.since), "until": rfc3339(wanted.until)}
+            with client.streamed("GET", path, params=params, seconds=_SILENCE_SECONDS) as answer:
                 yield from answer.iter_bytes()
 
 

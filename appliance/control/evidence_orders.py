@@ -38,6 +38,7 @@ class EvidenceOrders:
             since=request.since,
             until=request.until,
             records=request.records,
+            recording=request.recording,
         )
         await self._seal()
         return Sealed(record)

@@ -36,8 +36,10 @@ from appliance.channel.admin import (
     LogSealed,
     MonitorRevisionWanted,
     PolicyWanted,
+    RecordingFetch,
     Trouble,
 )
+from appliance.channel.answers.recordings import Recording
 from appliance.evidence.page import Page
 from appliance.fingerprints import file_name
 
@@ -53,6 +55,7 @@ _POLICY, _SPECIFICATIONS = "policy loaded", "specifications loaded"
 _LOAD = "SELECT event, revision, detail FROM record WHERE sequence = ?"
 _LOADS = "SELECT sequence FROM record INDEXED BY record_event WHERE sequence BETWEEN ? AND ? AND event = ?"
 _REVISIONS = "SELECT DISTINCT revision FROM record WHERE sequence BETWEEN ? AND ? AND revision > 0"
+_CLOSED = "SELECT sequence, detail FROM record WHERE event = 'recording closed' AND sequence <= ?"
 _LAST_LOAD = "SELECT max(sequence) FROM record INDEXED BY record_event WHERE event = ? AND sequence < ?"
 
 
@@ -71,17 +74,31 @@ class Span(NamedTuple):
     until: int
 
 
-def export(log: Path, span: Span, ask: Ask) -> Iterator[bytes]:
+class Kept(NamedTuple):
+    """The recording of this id, in the folder of all recordings."""
+
+    id: str
+    folder: Path
+
+
+def export(log: Path, wanted: Span | Kept, ask: Ask) -> Iterator[bytes]:
     """The bytes of a bundle; when this returns it is sealed and recorded. `ask` asks the running appliance.
 
+    Of a recording it has the messages, and everything of its time.
     Raises `BundleError` and `LogUnreadableError`, both also while it is given out.
     """
+    recording: Recording | None = None
+    bag = Path()
+    if isinstance(wanted, Kept):
+        recording = _given(ask(RecordingFetch(wanted.id)))
+        bag = wanted.folder / wanted.id / "recording.bag"
+        wanted = Span(recording.began, recording.ended + 1)
     _given(ask(LogSealed()))
-    span = Span(span.since, min(span.until, time.time_ns()))
-    bundle = _Bundle(log, span, ask)
+    span = Span(wanted.since, min(wanted.until, time.time_ns()))
+    bundle = _Bundle(log, span, ask, recording, bag)
     manifest = bundle.manifest()
     text = json.dumps(manifest, indent=1).encode() + b"\n"
-    order = EvidenceExported(hashlib.sha256(text).hexdigest(), *span, bundle.count)
+    order = EvidenceExported(hashlib.sha256(text).hexdigest(), *span, bundle.count, manifest["recording"])
     proof = _proof(log, _given(ask(order)).record)
     return _zipped(
         itertools.chain(bundle.checked(manifest), [("manifest.json", [text]), ("proof.json", [proof])])
@@ -91,8 +108,8 @@ def export(log: Path, span: Span, ask: Ask) -> Iterator[bytes]:
 class _Bundle:
     """The members of a bundle."""
 
-    def __init__(self, log: Path, span: Span, ask: Ask) -> None:
-        self._log, self._span, self._ask = log, span, ask
+    def __init__(self, log: Path, span: Span, ask: Ask, recording: Recording | None, bag: Path) -> None:
+        self._log, self._span, self._ask, self._recording, self._bag = log, span, ask, recording, bag
         with reading(log) as connection:
             connection.execute("BEGIN")
             self._find(connection.execute)
@@ -130,6 +147,12 @@ class _Bundle:
                 self._policies.add(revision)
             else:
                 self._specifications.add(json.loads(detail)["revision_of_specifications"])
+        if self._recording is not None:
+            loads |= {
+                sequence
+                for sequence, detail in execute(_CLOSED, (sealed,))
+                if json.loads(detail).get("recording") == self._recording.id
+            }
         edges = {edge for first, last in self._runs for edge in (first - 1, last + 1) if edge <= sealed}
         there = {edge for edge in edges if execute(_LOAD, (edge,)).fetchone()}
         self._alone = sorted(loads | there)
@@ -137,8 +160,9 @@ class _Bundle:
     def manifest(self) -> dict[str, Any]:
         """The hashes of all members, made by making them, and what there should be and is not."""
         manifest: dict[str, Any] = {
-            "format": FORMAT, "log": self._id, "since": self._span.since, "until": self._span.until, "recording": "",
-            "runs": self._runs, "missing": [], "members": {},
+            "format": FORMAT, "log": self._id, "since": self._span.since, "until": self._span.until,
+            "recording": self._recording.id if self._recording else "", "runs": self._runs, "missing": [],
+            "members": {},
         }  # fmt: skip
         for name, pieces in self.members(manifest):
             digest, size = hashlib.sha256(), 0
@@ -181,7 +205,11 @@ class _Bundle:
                         for name, signature in sorted(texts.signatures.items())
                     }
                 )
-        page = Page()
+        if self._recording is not None:
+            about = msgspec.json.format(msgspec.json.encode(self._recording), indent=1) + b"\n"
+            yield "recording/recording.json", [about]
+            yield "recording/recording.bag", _file(self._bag)
+        page = Page(self._recording)
         within = itertools.chain.from_iterable(range(first, last + 1) for first, last in self._runs)
         yield "records.ndjson", _noted(_records(self._log, heapq.merge(self._alone, within)), page.add)
         yield "index.html", (page.html(manifest) for _once in "1")
@@ -209,6 +237,15 @@ def _runs(sequences: list[int]) -> list[tuple[int, int]]:
         else:
             runs.append((sequence, sequence))
     return runs
+
+
+def _file(path: Path) -> Iterator[bytes]:
+    try:
+        with path.open("rb") as file:
+            while piece := file.read(1 << 20):
+                yield piece
+    except OSError as error:
+        raise BundleError(f"{path}: {error.strerror}", "failed") from error
 
 
 def _signatures(signatures: dict[str, str]) -> Iterator[Member]:

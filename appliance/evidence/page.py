@@ -3,9 +3,11 @@
 import html
 import json
 from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 from appliance.audit.output import printable, rfc3339
+from appliance.channel.answers.recordings import Recording
 
 _MOST_ROWS = 2000
 _SEVERE = ("notice", "warning", "alarm")
@@ -42,7 +44,8 @@ bundle can change those in it. It names what was changed or is missing.</p>
 class Page:
     """Collects what the page shows while the records go by."""
 
-    def __init__(self) -> None:
+    def __init__(self, recording: Recording | None) -> None:
+        self._recording = recording
         self._events: Counter[str] = Counter()
         self._rows: list[str] = []
         self._left_out = 0
@@ -73,11 +76,10 @@ class Page:
             "span": f"{rfc3339(manifest['since'])} to {rfc3339(manifest['until'])}",
             "log": manifest["log"],
             "records": runs,
-            "recording": manifest["recording"],
         }
         parts = [_HEAD, "<table>\n"]
         parts += [f"<tr><th>{name}<td>{_text(value)}\n" for name, value in facts.items() if value]
-        parts += ["</table>\n", _PROOF, "<h2>What happened</h2>\n<table>\n"]
+        parts += ["</table>\n", *_recorded(self._recording), _PROOF, "<h2>What happened</h2>\n<table>\n"]
         parts += [
             "<tr><th>time<th>record<th>event<th>decision<th>who<th>what<th>reason\n",
             *self._rows,
@@ -98,6 +100,25 @@ class Page:
             f"<tr><td>{_text(place)}<td>the appliance does not have it\n" for place in manifest["missing"]
         ]
         return "".join([*parts, "</table>\n"]).encode()
+
+
+def _recorded(recording: Recording | None) -> Iterator[str]:
+    """What was said: the recording's topics, and why it was made."""
+    if recording is None:
+        return
+    yield f'<h2>What was said</h2>\n<p>Recording {recording.id}, <a href="recording/recording.bag">a bag</a>\n'
+    yield "for rosbag, rqt_bag, Foxglove or PlotJuggler, has the messages as they were sent, before monitors\n"
+    yield "changed or dropped them.</p>\n"
+    if not recording.complete:
+        yield f'<p class="alarm">Not complete: {_text(recording.why_not)}</p>\n'
+    yield "<table>\n<tr><th>time<th>because of<th>record<th>what\n"
+    for trigger in recording.triggers:
+        cells = (trigger.what, trigger.record, trigger.text)
+        yield f'<tr><td class="time">{rfc3339(trigger.time)}{"".join(f"<td>{_text(cell)}" for cell in cells)}\n'
+    yield "</table>\n<table>\n<tr><th>topic<th>type<th>messages<th>missed\n"
+    for topic in recording.topics:
+        yield f"<tr><td>{_text(topic.topic)}<td>{_text(topic.type)}<td>{topic.messages}<td>{topic.missed}\n"
+    yield "</table>\n"
 
 
 def _who(detail: str) -> str:

@@ -95,6 +95,7 @@ class Verifier:
         self.manifest: dict[str, Any] = {}
         self.sums: dict[str, str] = {}  # of the members
         self.loads: dict[str, Any] = {}  # what came into force, and the hash that the log has of it
+        self.revisions: set[int | None] = set()  # of the policies that decided
         self.checkpoints = self.agreeing = 0
 
     def run(self) -> None:
@@ -147,36 +148,35 @@ class Verifier:
             self.findings.append("manifest.json: is not the one that the log has the hash of")
 
     def look_at_records(self) -> None:
-        """Rule 3, and of rule 4 what the records say."""
+        """Rule 3."""
         runs, since, until = (self.manifest[name] for name in ("runs", "since", "until"))
         beside = {edge: False for first, last in runs for edge in (first - 1, last + 1)}
-        count, revisions = 0, set()
+        missing = sum(last - first + 1 for first, last in runs)
         for record in self.records("records.ndjson"):
-            sequence, event, detail = record["sequence"], record["event"], record["detail"]
+            sequence = record["sequence"]
             if any(first <= sequence <= last for first, last in runs):
-                count += 1
-                revisions.add(record["revision"])
+                missing -= 1
+                self.revisions.add(record["revision"])
             elif sequence in beside:
                 beside[sequence] = True
                 if since <= record["time"] < until:
                     self.findings.append(f"record {sequence}: is of this time, and its run ends before it")
-            if event == "policy loaded":
-                self.loads[f"policies/{record['revision']}.ini"] = json.loads(detail).get("sha256")
-            elif event == "specifications loaded":
-                about = json.loads(detail)
-                self.loads[f"specifications/{about['revision_of_specifications']}/"] = about.get("sha256")
-        missing = sum(last - first + 1 for first, last in runs) - count
+            self.note_hash(record["event"], record["revision"], json.loads(record["detail"]))
         if missing:
             self.findings.append(f"records.ndjson: {missing} records of its runs are not there")
         if not beside[runs[0][0] - 1] and runs[0][0] > 1:
             self.notes.append(f"what was before record {runs[0][0]}: retention has removed it")
         if not beside[runs[-1][1] + 1]:
             self.notes.append(f"that record {runs[-1][1]} was the last of this time: the log ended there")
-        for place in sorted(f"policies/{revision}.ini" for revision in revisions if revision):
-            if place not in self.loads:
-                self.notes.append(f"{place}: the log has no record of its load")
-        if not any(place.startswith("specifications/") for place in self.loads):
-            self.notes.append("which specifications were in force: the log has no record of a load")
+
+    def note_hash(self, event: str, revision: int, detail: dict[str, Any]) -> None:
+        """What a record has the hash of."""
+        if event == "policy loaded":
+            self.loads[f"policies/{revision}.ini"] = detail.get("sha256")
+        elif event == "specifications loaded":
+            self.loads[f"specifications/{detail['revision_of_specifications']}/"] = detail.get("sha256")
+        elif event == "recording closed" and detail.get("recording") == self.manifest["recording"]:
+            self.loads["recording/recording.bag"] = detail["sha256"]
 
     def look_at_texts(self) -> None:
         """Rule 4."""
@@ -190,6 +190,11 @@ class Verifier:
                 self.notes.append(f"{place}: it was loaded by a version that recorded no hash")
             elif found != wanted:
                 self.findings.append(f"{place}: is not what the log has the hash of")
+        used = {f"policies/{revision}.ini" for revision in self.revisions if revision}
+        used |= {"recording/recording.bag"} if self.manifest["recording"] else set()
+        self.notes += [f"{place}: the log has no record of it" for place in sorted(used - self.loads.keys())]
+        if not any(place.startswith("specifications/") for place in self.loads):
+            self.notes.append("which specifications were in force: the log has no record of a load")
 
     def records(self, name: str) -> Iterator[dict[str, Any]]:
         """The records of a member, each after it was held against the chain."""

@@ -13,6 +13,12 @@ import pytest
 from tests.support.appliance import OPEN_POLICY, Appliance
 
 CLOSED = OPEN_POLICY.replace("[Publishers]\n", "[Publishers]\n/cmd_vel = 10.9.9.9\n")
+CONFIGURATION = """
+audit: {checkpoint_seconds: 3600, reserve_bytes: 1MiB}
+api: 127.0.0.1:0
+api_tls: off
+recorder: {enabled: true, memory: 16MiB, disk: 512MiB, triggers: []}
+"""
 MONITOR = "a() { event said() /chatter std_msgs/String '{}' { } }"
 
 
@@ -20,7 +26,7 @@ MONITOR = "a() { event said() /chatter std_msgs/String '{}' { } }"
 def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
     """An appliance with REST that was worked with; checkpoints are an hour apart."""
     config = tmp_path_factory.mktemp("config") / "appliance.yaml"
-    config.write_text("audit: {checkpoint_seconds: 3600}\napi: 127.0.0.1:0\napi_tls: off\n")
+    config.write_text(CONFIGURATION)
     specification = config.with_name("a.rv")
     specification.write_text(MONITOR)
     with Appliance(options=("--config", str(config))) as running:
@@ -105,6 +111,27 @@ def test_over_rest_it_is_for_operators(appliance: Appliance, tmp_path: Path) -> 
     assert manifests[0] == manifests[1]
     by = [record["detail"]["who"] for record in appliance.recorded("--event", "evidence exported", count=2)]
     assert by[:2] == ["operator", "first"]
+
+
+def test_of_a_recording(appliance: Appliance, tmp_path: Path) -> None:
+    """Its messages are in the bundle, proven by the log; who took them is on record; another id is refused in words."""
+    order = appliance.rosrv(
+        "record", "now", "--before", "2s", "--after", "1s", "--note", "the arm hit the door", "--json"
+    )
+    recording = json.loads(order.stdout)["id"]
+    appliance.recorded("--event", "recording closed")
+    bundle = tmp_path / "recording.zip"
+    appliance.rosrv("evidence", "export", recording, "-o", str(bundle))
+    assert "unproven  recording" not in proved(bundle, appliance.state / "control/audit.pub")
+    with zipfile.ZipFile(bundle) as archive:
+        assert archive.read("recording/recording.bag").startswith(b"#ROSBAG V2.0")
+        assert json.loads(archive.read("recording/recording.json"))["id"] == recording
+        assert "the arm hit the door" in archive.read("index.html").decode()
+    assert appliance.recorded("--event", "recording fetched")[0]["detail"]["who"] == "operator"
+    refused = appliance.rosrv("evidence", "export", "../x", "-o", str(tmp_path / "x.zip"), check=False)
+    assert (refused.returncode, refused.stderr) == (1, "rosrv: there is no recording ../x\n")
+    both = ("evidence", "export", recording, "--since", "1h", "-o", str(tmp_path / "x.zip"))
+    assert appliance.rosrv(*both, check=False).returncode == 2
 
 
 def test_a_time_of_which_there_is_nothing(appliance: Appliance, tmp_path: Path) -> None:

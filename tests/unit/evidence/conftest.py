@@ -1,6 +1,7 @@
 """What tests of evidence share: a signed log with loads, denials and strange texts, and the appliance that is asked."""
 
 import asyncio
+import hashlib
 import time
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,9 @@ from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer, AdminRequest
 from appliance.channel.answers.monitors import RevisionTexts
 from appliance.channel.answers.policy import PolicyKnown
+from appliance.channel.answers.recordings import Recording
 from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
-from appliance.evidence.bundle import Span, export
+from appliance.evidence.bundle import Kept, Span, export
 from appliance.fingerprints import fingerprint, fingerprint_of_all
 from tests.support.answers import example
 from tests.support.audit import decision, settle
@@ -63,6 +65,7 @@ class Control:
         self.specifications: dict[int, dict[str, str]] = {}
         self.begun = time.time_ns()
         self.worked = 0
+        self.recordings: dict[str, Recording] = {}
 
     def load_policy(self, revision: int, text: str, **changes: Any) -> None:
         """A policy comes into force."""
@@ -89,29 +92,47 @@ class Control:
             )  # fmt: skip
         assert settle(self.log) is None
 
+    def record(self, folder: Path, bag: bytes, **about: Any) -> Kept:
+        """The recorder has closed a recording of the time up to now; it is in a folder of its own there."""
+        digest = hashlib.sha256(bag).hexdigest()
+        recording = example(
+            Recording, id="ab" * 10, began=self.begun, ended=time.time_ns(), sha256=digest, **about
+        )
+        self.trail.happened("recording closed", "complete", recording=recording.id, sha256=digest)
+        (folder / recording.id).mkdir()
+        (folder / recording.id / "recording.bag").write_bytes(bag)
+        self.recordings[recording.id] = recording
+        return Kept(recording.id, folder)
+
     def ask(self, request: AdminRequest[Any]) -> AdminAnswer[Any]:
         """Answer as control does."""
         try:
-            match request:
-                case admin.LogSealed():
-                    return AdminAnswer(True, asyncio.run(self.orders.seal(request)))
-                case admin.EvidenceExported():
-                    return AdminAnswer(True, asyncio.run(self.orders.exported(request, "operator")))
-                case admin.PolicyWanted(revision=int(revision)) if revision in self.policies:
-                    text = self.policies[revision]
-                    return AdminAnswer(
-                        True, example(PolicyKnown, text=text, signature=f"signature of {revision}")
-                    )
-                case admin.MonitorRevisionWanted(revision) if revision in self.specifications:
-                    named = self.specifications[revision]
-                    files = {name: text for name, text in named.items() if not name.startswith("msg/")}
-                    definitions = {name[4:]: text for name, text in named.items() if name.startswith("msg/")}
-                    signatures = dict.fromkeys([*files, *definitions], "signature")
-                    texts = {"files": files, "definitions": definitions, "signatures": signatures}
-                    return AdminAnswer(True, example(RevisionTexts, **texts))
+            body = self._answer(request)
         except NotSealedError as error:
             return AdminAnswer(False, error=str(error), trouble="failed")
-        return AdminAnswer(False, error="there is no such revision", trouble="unknown")
+        if body is None:
+            return AdminAnswer(False, error="there is no such thing", trouble="unknown")
+        return AdminAnswer(True, body)
+
+    def _answer(self, request: AdminRequest[Any]) -> Any:
+        match request:
+            case admin.LogSealed():
+                return asyncio.run(self.orders.seal(request))
+            case admin.EvidenceExported():
+                return asyncio.run(self.orders.exported(request, "operator"))
+            case admin.RecordingFetch(recording):
+                return self.recordings.get(recording)
+            case admin.PolicyWanted(revision=int(revision)) if revision in self.policies:
+                return example(
+                    PolicyKnown, text=self.policies[revision], signature=f"signature of {revision}"
+                )
+            case admin.MonitorRevisionWanted(revision) if revision in self.specifications:
+                named = self.specifications[revision]
+                files = {name: text for name, text in named.items() if not name.startswith("msg/")}
+                definitions = {name[4:]: text for name, text in named.items() if name.startswith("msg/")}
+                signatures = dict.fromkeys([*files, *definitions], "signature")
+                return example(RevisionTexts, files=files, definitions=definitions, signatures=signatures)
+        return None
 
     def exported(self, place: Path, since: int | None = None, until: int | None = None) -> Path:
         """A bundle in a file."""

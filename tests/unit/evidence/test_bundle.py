@@ -20,10 +20,14 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from appliance.audit.copies import signed_checkpoints
 from appliance.audit.log import AuditLog
+from appliance.audit.query import Filter
 from appliance.audit.retention import Retention
+from appliance.audit.search import search
+from appliance.channel.answers.recordings import RecordedTopic, Trigger
 from appliance.evidence import bundle as bundles
 from appliance.evidence import verify
 from appliance.evidence.bundle import VERIFIER, BundleError, Span, export
+from tests.support.answers import example
 from tests.support.audit import decision, settle
 from tests.support.control_parts import OPEN
 from tests.unit.audit.conftest import MakeLog, Notary
@@ -309,6 +313,31 @@ def test_copies_of_checkpoints_show_a_history_written_anew(
     assert "is another one than was kept elsewhere, which is not signed with the key" in reviewer.said
 
 
+def test_of_a_recording_it_has_the_messages(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
+    """The bag that the log has the hash of, the recording's time, and why it was made; another bag is named."""
+    bag = random.Random(7).randbytes(3 << 20)  # noqa: S311  the same each time
+    trigger = Trigger(control.begun, "drop", "r", "<b>\x1b")
+    kept = control.record(tmp_path, bag, triggers=[trigger], topics=[example(RecordedTopic, topic="/scan")])
+    control.work(2)
+    place = tmp_path / "incident.zip"
+    place.write_bytes(b"".join(export(control.log.path, kept, control.ask)))
+    members = members_of(place)
+    assert members["recording/recording.bag"] == bag
+    assert "&lt;b&gt;\\x1b" in members["index.html"].decode()
+    assert "/scan" in members["index.html"].decode()
+    assert reviewer.status(place) == 0, reviewer.said
+    forged = resealed({**members, "recording/recording.bag": bag[:-1]})
+    assert reviewer.status(written(forged, tmp_path / "x.zip")) == 1
+    assert "recording/recording.bag: is not what the log has the hash of" in reviewer.said
+    (record,) = search(control.log.path, Filter(event="evidence exported")).entries
+    assert record.record.detail["recording"] == kept.id
+    (tmp_path / kept.id / "recording.bag").unlink()
+    with pytest.raises(BundleError, match=r"recording\.bag: No such file"):
+        export(control.log.path, kept, control.ask)
+    with pytest.raises(BundleError, match="no such"):
+        export(control.log.path, kept._replace(id="../audit"), control.ask)
+
+
 def test_what_is_not_proven_is_said(control: Control, tmp_path: Path, reviewer: Reviewer) -> None:
     """A load without a hash, a text that the appliance lost, a time before the first load."""
     control.load_policy(8, "[Nodes]\n", sha256=None)
@@ -335,7 +364,7 @@ def test_what_retention_removed_is_said(
     running.begun = 0
     running.work()
     assert reviewer.status(running.exported(tmp_path / "a.zip")) == 0
-    assert "unproven  policies/3.ini: the log has no record of its load" in reviewer.said
+    assert "unproven  policies/3.ini: the log has no record of it" in reviewer.said
     assert "unproven  which specifications were in force" in reviewer.said
     assert re.search(r"unproven  what was before record \d+: retention has removed it", reviewer.said)
 
