@@ -105,8 +105,7 @@ VERBS: dict[str, Verb | Group] = {
             ),
             "confirm": Verb(
                 "appliance.cli.monitor.revisions:confirm",
-                "Keep specifications that were loaded with --confirm-within; exit status 1 when there is nothing to"
-                " confirm.",
+                "Keep what was loaded with --confirm-within; exit status 1 when there is nothing to confirm.",
             ),
             "resume": Verb(
                 "appliance.cli.monitor.running:resume",

@@ -1,14 +1,20 @@
 """What `rosrv policy` and `rosrv monitor` say of revisions, and of changes that go back unless they are confirmed."""
 
 import datetime
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, TypeVar
 
 import typer
 
+from appliance.channel.admin import AdminRequest
 from appliance.channel.answers import monitors, policy
-from appliance.cli.output import say, say_json
+from appliance.cli.output import Json, say, say_json
+from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
+
+_Listed = TypeVar("_Listed", policy.PolicyRevisionList, monitors.MonitorRevisionList)
+_Confirmed = TypeVar("_Confirmed", policy.PolicyConfirmed, monitors.MonitorsConfirmed)
+_Done = TypeVar("_Done")
 
 ConfirmWithin = Annotated[
     str | None,
@@ -29,27 +35,66 @@ def say_deadline(confirm_by: float | None, noun: str) -> None:
         say(f"it goes back by itself at {_time(confirm_by)} unless you say: rosrv {noun} confirm", "yellow")
 
 
-def say_confirmed(body: policy.PolicyConfirmed | monitors.MonitorsConfirmed, *, as_json: bool) -> None:
-    """Whether there was something to confirm. Ends the program: with 1 when there was not."""
-    if as_json:
-        say_json(body)
-    else:
-        kept = f"revision {body.revision} stays in force"
-        say(kept if body.confirmed else f"nothing waits to be confirmed: {kept}")
-    raise typer.Exit(0 if body.confirmed else 1)
+def verbs_of(
+    noun: str,
+    what: str,
+    *,
+    listed: AdminRequest[_Listed],
+    confirmation: AdminRequest[_Confirmed],
+    back: Callable[[int | None], AdminRequest[_Done]],
+    say_done: Callable[[_Done], None],
+    and_then: str = "",
+) -> tuple[Callable[..., None], Callable[..., None], Callable[..., None]]:
+    """The verbs `revisions`, `rollback` and `confirm` of `rosrv noun`, for `what` it changes.
 
+    `listed`, `confirmation` and `back(revision)` are what each asks; `say_done` says what a rollback did, and
+    `and_then` is what the help adds to it.
+    """
 
-def say_revisions(
-    rows: Sequence[policy.PolicyRevision] | Sequence[monitors.MonitorRevision], *, as_json: bool
-) -> None:
-    """The kept revisions, a line each."""
-    for row in rows:
+    def revisions(appliance: Appliance, as_json: Json = False) -> None:
+        for row in appliance.ask_or_exit(listed, as_json=as_json).revisions:
+            _say_revision(row, as_json=as_json)
+
+    def rollback(
+        appliance: Appliance,
+        revision: Annotated[
+            int | None, typer.Argument(help="A kept revision; without it, the one before")
+        ] = None,
+        as_json: Json = False,
+    ) -> None:
+        say_done(appliance.answer_or_exit(back(revision), as_json=as_json))
+
+    def confirm(appliance: Appliance, as_json: Json = False) -> None:
+        body = appliance.ask_or_exit(confirmation, as_json=as_json)
         if as_json:
-            say_json(row)
-            continue
-        files = row.file if isinstance(row, policy.PolicyRevision) else " ".join(row.names)
-        mark = "in force" if row.in_force else ""
-        say(f"{row.revision:>5}  {_time(row.loaded)}  {row.who}: {row.note}  {files}  {mark}".rstrip())
+            say_json(body)
+        else:
+            kept = f"revision {body.revision} stays in force"
+            say(kept if body.confirmed else f"nothing waits to be confirmed: {kept}")
+        raise typer.Exit(0 if body.confirmed else 1)
+
+    revisions.__doc__ = f"""List the kept revisions of the {what}, the newest first.
+
+    Example: rosrv {noun} revisions
+    """
+    rollback.__doc__ = f"""Bring a kept revision of the {what} into force again{and_then}.
+
+    Example: rosrv {noun} rollback 7
+    """
+    confirm.__doc__ = f"""Keep what was loaded with --confirm-within; exit status 1 when there is nothing to confirm.
+
+    Example: rosrv {noun} confirm
+    """
+    return speaks(revisions), speaks(rollback), speaks(confirm)
+
+
+def _say_revision(row: policy.PolicyRevision | monitors.MonitorRevision, *, as_json: bool) -> None:
+    if as_json:
+        say_json(row)
+        return
+    files = row.file if isinstance(row, policy.PolicyRevision) else " ".join(row.names)
+    mark = "in force" if row.in_force else ""
+    say(f"{row.revision:>5}  {_time(row.loaded)}  {row.who}: {row.note}  {files}  {mark}".rstrip())
 
 
 def _time(seconds: float) -> str:

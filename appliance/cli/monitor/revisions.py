@@ -10,19 +10,20 @@ from appliance.channel.answers.monitors import RevisionTexts
 from appliance.cli.monitor.running import say_replaced
 from appliance.cli.output import Json, say, say_json, usage_error
 from appliance.cli.running import Appliance, speaks
-from appliance.cli.trials import say_confirmed, say_revisions
+from appliance.cli.trials import verbs_of
 
 _Revision = Annotated[int | None, typer.Argument(help="A kept revision; without it, the one in force")]
 
 
-@speaks
-def revisions(appliance: Appliance, as_json: Json = False) -> None:
-    """List the kept revisions of the specifications, the newest first.
-
-    Example: rosrv monitor revisions
-    """
-    body = appliance.ask_or_exit(MonitorRevisions(), as_json=as_json)
-    say_revisions(body.revisions, as_json=as_json)
+revisions, rollback, confirm = verbs_of(
+    "monitor",
+    "specifications",
+    listed=MonitorRevisions(),
+    confirmation=MonitorConfirm(),
+    back=MonitorRollback,
+    say_done=say_replaced,
+    and_then="; what comes back is switched as it was",
+)
 
 
 @speaks
@@ -70,30 +71,6 @@ def diff(
     for line in lines:
         say(line, {"+": "green", "-": "red"}.get(line[0], ""))
     raise typer.Exit(1 if lines else 0)
-
-
-@speaks
-def rollback(
-    appliance: Appliance,
-    revision: Annotated[
-        int | None, typer.Argument(help="A kept revision; without it, the one before")
-    ] = None,
-    as_json: Json = False,
-) -> None:
-    """Bring a kept revision of the specifications into force again; what comes back is switched as it was.
-
-    Example: rosrv monitor rollback 7
-    """
-    say_replaced(appliance.answer_or_exit(MonitorRollback(revision), as_json=as_json))
-
-
-@speaks
-def confirm(appliance: Appliance, as_json: Json = False) -> None:
-    """Keep specifications that were loaded with --confirm-within; exit status 1 when there is nothing to confirm.
-
-    Example: rosrv monitor confirm
-    """
-    say_confirmed(appliance.ask_or_exit(MonitorConfirm(), as_json=as_json), as_json=as_json)
 
 
 def _texts(appliance: Appliance, revision: int | None, *, as_json: bool) -> RevisionTexts:
