@@ -15,13 +15,13 @@ from appliance import __version__
 from distribution import image
 from distribution.checkout import ROOT, time_of_commit
 
-_BESIDE = ("compose.yaml", "compose.host.yaml", "LICENSE", "docs", "ipsec", "monitors", "policies")
+BESIDE = ("compose.yaml", "compose.host.yaml", "LICENSE", "docs", "ipsec", "monitors", "policies")
 
 
 def pack(parts: tuple[Path, ...], *, moment: int) -> Path:
     """Put these files of dist/ and what stands beside them into one archive; its path."""
     files = {part.name: part for part in parts}
-    for name in _BESIDE:
+    for name in BESIDE:
         found = [path for path in (ROOT / name).rglob("*") if path.is_file()] or [ROOT / name]
         files |= {str(path.relative_to(ROOT)): path for path in found}
     site = parts[0].with_name(parts[0].name.replace("rosrv-image", "rosrv-site"))

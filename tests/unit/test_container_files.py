@@ -10,6 +10,7 @@ from appliance.hosts.rest_place import rest_place
 from appliance.supervisor.privileges import SUPERVISORS
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.users import NUMERIC_IDS
+from distribution.site import BESIDE
 
 ROOT = Path(__file__).parents[2]
 TRUE = Path("/bin/true")
@@ -24,6 +25,17 @@ def test_the_image_has_every_user() -> None:
     """Each process's user is made in the image, with its number."""
     made = re.findall(r"\b(ros[a-z-]+):(610\d\d)\b", (ROOT / "Dockerfile").read_text())
     assert {name: int(number) for name, number in made} == NUMERIC_IDS
+
+
+def test_the_archive_of_a_site_has_what_its_compose_files_mount() -> None:
+    """What compose.yaml and compose.host.yaml take from beside them is carried along, they themselves too."""
+    for name in ("compose.yaml", "compose.host.yaml"):
+        assert name in BESIDE
+        services = yaml.safe_load((ROOT / name).read_text())["services"].values()
+        mounts = [mount.split(":")[0] for one in services for mount in one.get("volumes", [])]
+        beside = {mount.removeprefix("./") for mount in mounts if mount.startswith(".")}
+        assert beside <= set(BESIDE), name
+        assert not any("env_file" in one or "secrets" in one for one in services), name
 
 
 def test_every_process_is_in_the_table_of_rights() -> None:

@@ -167,8 +167,9 @@ fi
 swanctl --load-all --noprompt >/dev/null || die "strongSwan did not take the tunnel: $why"
 
 say "waiting for the tunnel to @endpoint@"
-swanctl --initiate --child @child@ --ike @connection@ --timeout 20 >/dev/null 2>&1 || true
+said=$(swanctl --initiate --child @child@ --ike @connection@ --timeout 20 2>&1) || true
 if ! swanctl --list-sas --ike @connection@ | grep -q INSTALLED; then
+    printf '%s\n' "$said" >&2
     die "no tunnel. $why says why here; on the appliance: rosrv audit search --event 'tunnel refused'"
 fi
 if [ -d /run/systemd/system ]; then

@@ -78,3 +78,28 @@ def test_any_other_certificate_is_replaced(tmp_path: Path, openssl: str, name: s
     machine.put("kit", "laptop", 10)
     machine.put("etc", name, days)
     assert not machine.keeps_what_is_in_place()
+
+
+@pytest.mark.parametrize(("sas", "status"), [("ros{1}: INSTALLED", 0), ("", 1)])
+def test_what_charon_says_is_shown_where_it_fails(tmp_path: Path, sas: str, status: int) -> None:
+    """Nothing of the two dozen lines of a tunnel that comes up; of one that does not, all, and where to look."""
+    text = filled("join.sh", defaultdict(str, name="laptop", endpoint="10.0.0.2"))
+    begin, end = text.index('say "waiting for'), text.index("\nfi\n", text.index("INSTALLED")) + 4
+    functions = "".join(line for line in text.splitlines(True) if line.startswith(("die()", "say()")))
+    swanctl = tmp_path / "swanctl"
+    swanctl.write_text(
+        "#!/bin/sh\ncase $1 in\n--initiate) echo '[IKE] received AUTHENTICATION_FAILED'; exit 1;;\n"
+        f"*) echo '{sas}';;\nesac\n"
+    )
+    swanctl.chmod(0o755)
+    done = subprocess.run(
+        ["sh", "-eu", "-c", f"why=charon.log\n{functions}{text[begin:end]}"],
+        env={"PATH": f"{tmp_path}:{os.environ['PATH']}"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == status
+    assert done.stdout == "join.sh: waiting for the tunnel to 10.0.0.2\n"
+    assert ("AUTHENTICATION_FAILED" in done.stderr) == ("charon.log says why" in done.stderr) == bool(status)
