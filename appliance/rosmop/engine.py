@@ -310,6 +310,16 @@ class MonitorSet:
         """What is to be done with a message: the bytes of its fields, received at this time on this topic."""
         return self._process(self._steps.get(topic, ()), buffer, time_ns)
 
+    def judge(self, topic: str, buffer: Buffer, time_ns: int) -> Outcome:
+        """What `process` says, by the walk where that takes the message: as in the relay."""
+        walker = self.walker(topic)
+        events = walker.take(buffer, time_ns) if walker is not None and self.walks(walker, time_ns) else None
+        if events is None:
+            return self.process(topic, buffer, time_ns)
+        outcome = Outcome(buffer, time_ns)
+        outcome.events = events
+        return outcome
+
     def process_service(self, service: str, part: str, buffer: Buffer, time_ns: int) -> Outcome:
         """The same for the `request` or `response` (the `part`) of a service."""
         return self._process(self._requests.get((service, part), ()), buffer, time_ns)

@@ -24,6 +24,7 @@ from appliance.rosmop.ir.values import struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
 from appliance.rosmop.runtime.context import Context
+from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
@@ -209,6 +210,22 @@ class Walker:
                 if answer >= LEFT:
                     break
         return Walked(position, run, self._dropped() if run != begun else (), changed)
+
+    def take(self, message: Buffer, time_ns: int) -> Sequence[str] | None:
+        """Take a message of which nothing is to be told but which events happened: they. None if it is left.
+
+        Only as `walk`, and where nobody asks what has `happened`.
+        """
+        end = self._frames + 4 + len(message)
+        if end > self._frames + AREA:
+            return None
+        frame = self._memory[self._frames : end]
+        _LENGTH.pack_into(frame, 0, len(message))
+        frame[4:] = message
+        prepared = self.prepare(loud=True, told=[True] * len(self.events))
+        if not self.walk(frame, 0, 0, [], time_ns, prepared).position:
+            return None
+        return tuple(name for (name,), count in zip(self.events, self.happened(), strict=True) if count)
 
     def _walk_elsewhere(  # noqa: PLR0917  as `walk`
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared

@@ -198,7 +198,7 @@ def _outcome(
     monitors: MonitorSet, connection: Connection, time_ns: int, data: bytes, refusal: str | None
 ) -> Outcome:
     if refusal is None:
-        return monitors.process(connection.topic, data, time_ns)
+        return monitors.judge(connection.topic, data, time_ns)
     outcome = Outcome(data, time_ns)
     outcome.result, outcome.reason, outcome.before = "dropped", refusal, monitors.advance(time_ns)
     return outcome

@@ -94,6 +94,7 @@ def run(
             for finding in error.findings:
                 typer.echo(printable(str(finding)), err=True)
             raise typer.Exit(1) from None
+        monitors.write_module()
         for text in refusals(monitors, reader):
             typer.echo(f"rosrv monitor: {printable(text)}; its messages are dropped", err=True)
         if output is None:

@@ -12,9 +12,11 @@ from appliance.rosmop import walking
 from appliance.rosmop.engine import MonitorSet, OnFault
 from appliance.rosmop.ir.feed import AREA, MAX_EFFECTS
 from appliance.rosmop.logics.interface import FiniteRun
+from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walking import BEGINNING, Walker
-from tests.unit.rosmop.interpreted import beside
+from tests.unit.rosmop.interpreted import beside, check_same
 from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
 
 FEW = settings(max_examples=25, suppress_health_check=list(HealthCheck))
@@ -37,9 +39,9 @@ class Fed:
     def __init__(self, *texts: str, on_fault: OnFault = "drop") -> None:
         sources = {f"{place}.rv": text for place, text in enumerate(texts)}
         self.monitors = MonitorSet.load(sources, definitions(), on_fault)
-        self._other = beside(self.monitors)
+        self.interpreter = beside(self.monitors)
         self.monitors.write_module()
-        for one in (self.monitors, self._other):
+        for one in (self.monitors, self.interpreter):
             one.start(0)
             for monitor in one.monitors:
                 monitor.seen = True
@@ -57,13 +59,13 @@ class Fed:
         """Fail if messages that come together make a difference; what goes on."""
         expected = []
         for body in bodies:
-            outcome = self._other.process(topic, bytearray(body), time)
+            outcome = self.interpreter.process(topic, bytearray(body), time)
             self.came[outcome.result if not outcome.faults else "fault"] += 1
             if outcome.result != "dropped":
                 expected.append(bytes(outcome.buffer))
         self._inside = not self._inside
         assert self._fed(frames(bodies), topic, time) == frames(expected)
-        assert self.state() == _state(self._other)
+        assert self.state() == _state(self.interpreter)
         return expected
 
     def state(self) -> list[str]:
@@ -145,6 +147,47 @@ def test_most_of_that_is_taken_together_and_everything_comes_up() -> None:
             fed.check(list(traffic.bodies()), traffic.topic)
         came += fed.came
     assert min(came[what] for what in ("fault", "dropped", "changed", "passed", "together")) > 3
+
+
+@FEW
+@given(seed=st.integers(0, 1 << 30), wild=st.lists(st.binary(max_size=80), max_size=4))
+def test_one_by_one_they_are_told_as_the_interpreter_tells_them(seed: int, wild: list[bytes]) -> None:
+    """What a recording's messages come to, whichever of the two takes them."""
+    try:
+        fed = Fed(*Specifications(seed).texts(), on_fault=("drop", "pass")[seed % 2])
+    except SpecificationError:
+        return  # a draw that means nothing
+    messages = Messages(seed)
+    for time in range(1, 4):
+        traffic = messages.traffic()
+        for body in (*traffic.bodies(), *wild):
+            outcome = fed.monitors.judge(traffic.topic, body, time * 900_000)
+            check_same(outcome, fed.interpreter.process(traffic.topic, body, time * 900_000))
+    assert fed.state() == _state(fed.interpreter)
+
+
+def test_a_message_that_needs_no_record_is_not_for_the_engine() -> None:
+    """`judge` asks the engine for a change and a fault, and for what the module has no room for."""
+    fed = Fed("""s() { int n = 0; int m = 0;
+        event a(int c) /plain own/Plain '{count:c}' { n++; if (c == 3) { c = 4; } }
+        event b(int kind, int x) /plain own/Plain '{kind:kind, three[0]:x}' when (kind == 1) { m = 10 / (n - 5); } }""")
+    asked = []
+    process = fed.monitors.process
+
+    def counted(topic: str, buffer: Buffer, time_ns: int) -> Outcome:
+        asked.append(bytes(buffer))
+        return process(topic, buffer, time_ns)
+
+    fed.monitors.process = counted  # type: ignore[method-assign]
+    told, engine = (
+        [plain(1), plain(4), plain(6, kind=1)],
+        [plain(3), plain(5, kind=1), plain(rest=bytes(AREA))],
+    )
+    outcomes = [fed.monitors.judge("/plain", body, 7) for body in (*told, *engine)]
+    assert asked == engine
+    assert [outcome.events for outcome in outcomes] == [
+        ("s.a",), ("s.a",), ("s.a", "s.b"), ("s.a",), ("s.a", "s.b"), ("s.a",)
+    ]  # fmt: skip
 
 
 EXPRESSIONS = (
@@ -441,7 +484,7 @@ def test_walks_wait_while_something_is_due() -> None:
 def test_a_disabled_monitor_has_no_part_in_a_walk() -> None:
     """Its topic has none; where there are others, they alone."""
     fed = Fed(event("n = count;"), event("n++;").replace("s()", "t()"))
-    for one in (fed.monitors, fed._other):
+    for one in (fed.monitors, fed.interpreter):
         one.set_enabled("s", False, 5)
     fed.check([plain(7)] * 3)
     assert fed.state() == ["n 0", "n 3"]
