@@ -3,7 +3,8 @@
 One publisher, one subscriber, one topic, loopback; the load is `relay_load.cpp` (compiled on first use with g++).
 *window*: 64 messages on their way; *flat*: as fast as it goes, with the loss; *paced*: 1,000 messages a second, with
 the delay. Systems take turns; cells are medians of the rounds and ratios are to `topic_tools`, of one round each.
-The relay's control is played here: it places one publication and grants it. Needs rosmaster and topic_tools.
+*recorded* is the relay with a flight recorder's memory of 64 MiB. The relay's control is played here: it places one
+publication and grants it. Needs rosmaster and topic_tools.
 """
 
 import argparse
@@ -30,6 +31,8 @@ from appliance.channel.messages import (
     UpstreamFound,
     UpstreamWanted,
 )
+from appliance.config import RecorderRules
+from appliance.supervisor.rings import Rings
 from tests.support.relay_driver import LOOPBACK, ChannelPeer, RelayProcess, call, free_port
 from tests.support.waiting import eventually
 
@@ -123,10 +126,15 @@ class Direct:
 class Relay:
     """This project's relay process, with a control that only knows one topic a run."""
 
-    def __init__(self, name: str = "relay") -> None:
+    def __init__(self, name: str = "relay", *, recorded: bool = False) -> None:
         self.name = name
         self._publishers: dict[str, int] = {}
         self._relay = RelayProcess()
+        if recorded:
+            rings = Rings(RecorderRules(), 1)
+            [(given, memory)] = rings.given_to("relay", 0)
+            self._relay.lifeline.send(given, (memory,))
+            rings.close()
         self._link: ChannelPeer = self._relay.open_link(self._answer)
         self.pid: int | None = self._relay.process.pid
 
@@ -280,7 +288,7 @@ def main() -> None:
     parser.add_argument("--modes", type=lambda text: text.split(","), default=list(MODES))
     options = parser.parse_args()
     results: dict[tuple[str, int, str], list[Result]] = {}
-    systems: list[System] = [Direct(), Relay(), RosRelay()]
+    systems: list[System] = [Direct(), Relay(), Relay("recorded", recorded=True), RosRelay()]
     try:
         for _round in range(options.rounds):
             for mode in options.modes:
