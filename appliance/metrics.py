@@ -135,6 +135,11 @@ METRICS = (
         (),
         "the clock was set back: it stands so long before the last record",
     ),
+    Metric(
+        "rosrv_recorder_up", "gauge", (), "1 while the flight recorder runs; absent when nothing is recorded"
+    ),
+    Metric("rosrv_recordings", "gauge", (), "recordings that are kept"),
+    Metric("rosrv_recordings_bytes", "gauge", (), "bytes of them"),
     Metric("rosrv_policy_revision", "gauge", (), "revision of the policy in force"),
     Metric("rosrv_policy_differs_from_file", "gauge", (), "1 while the policy in force is not the file's"),
     Metric("rosrv_process_restarts_total", "counter", ("role",), "times a process was started again"),

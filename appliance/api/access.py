@@ -32,11 +32,12 @@ _MOST_KNOWN = 1024
 
 
 class Role(enum.IntEnum):
-    """What a token may do; each role may do all that those before it may."""
+    """What a token may do; each role may do all that those before it may, but what is for investigators."""
 
     VIEWER = 1  # look
-    OPERATOR = 2  # take the file's policy, or one that was in force before
-    ADMIN = 3  # bring new rules into force
+    INVESTIGATOR = 2  # also fetch the messages of recordings, which nobody else may
+    OPERATOR = 3  # take the file's policy, or one that was in force before
+    ADMIN = 4  # bring new rules into force
 
 
 @dataclass(frozen=True, slots=True)

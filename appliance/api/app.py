@@ -21,6 +21,7 @@ from appliance.api import (
     monitors,
     policy,
     policy_changes,
+    recordings,
     tokens,
     whoami,
 )
@@ -63,6 +64,7 @@ def build_app(services: Services) -> FastAPI:
         enrol,
         monitors,
         monitor_changes,
+        recordings,
         tokens,
         audit,
         evidence,

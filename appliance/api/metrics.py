@@ -97,7 +97,7 @@ def _buckets(bounds: Sequence[float], counts: Sequence[float]) -> list[tuple[str
 def _samples(body: Measures) -> dict[str, _Samples]:
     status = body.status
     policy, audit, monitors, clock = status.policy, status.audit, status.monitors, status.clock
-    relayed = body.relayed
+    relayed, recorder = body.relayed, status.recorder
     return {
         "rosrv_info": [((status.version,), 1)],
         "rosrv_start_time_seconds": [((), status.since)],
@@ -137,6 +137,9 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         **_forwarding(audit.forwarding),
         "rosrv_clock_synchronised": [((), -1 if clock.synchronised is None else clock.synchronised)],
         "rosrv_clock_behind_seconds": [((), clock.behind_seconds)],
+        "rosrv_recorder_up": [((), recorder.running)] if recorder else [],
+        "rosrv_recordings": [((), recorder.recordings)] if recorder else [],
+        "rosrv_recordings_bytes": [((), recorder.bytes)] if recorder else [],
         "rosrv_policy_revision": [((), policy.revision)],
         "rosrv_policy_differs_from_file": [((), policy.differs_from_file)],
         "rosrv_process_restarts_total": [

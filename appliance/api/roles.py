@@ -1,6 +1,6 @@
 """What a route asks of who calls it: a role, and what every other route asks the same way."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 from fastapi import Depends, Request, Security
 from fastapi.security import HTTPBearer
@@ -10,6 +10,7 @@ from appliance.api.control import ControlLink
 from appliance.api.gate import BEARER
 from appliance.api.problems import ProblemError
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble
+from appliance.channel.answers.tokens import TokenRole, may
 
 _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token add`")
 
@@ -19,10 +20,11 @@ class _Requires:
 
     def __init__(self, role: Role) -> None:
         self._role = role
+        self._least = cast(TokenRole, role.name.lower())
 
     def __call__(self, request: Request, _token: Annotated[Any, Security(_SCHEME)]) -> Bearer:
         bearer: Bearer = request.scope[BEARER]
-        if bearer.role < self._role:
+        if not may(bearer.role.name.lower(), self._least):
             raise ProblemError(
                 403,
                 "not-for-this-role",
@@ -36,6 +38,7 @@ VIEWER = Depends(_Requires(Role.VIEWER))
 
 OPERATOR = Depends(_Requires(Role.OPERATOR))
 Viewer = Annotated[Bearer, VIEWER]
+Investigator = Annotated[Bearer, Depends(_Requires(Role.INVESTIGATOR))]
 Operator = Annotated[Bearer, OPERATOR]
 Admin = Annotated[Bearer, Depends(_Requires(Role.ADMIN))]
 

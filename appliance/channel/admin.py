@@ -408,10 +408,10 @@ _Common = (
     | PolicyRevisions
     | RegistrationsWanted | GraphWanted | TopicLook | MetricsWanted | MonitorsWanted | MonitorRevisions
     | MonitorRevisionWanted | MonitorChange | TokenList | TokenRevoke | LogSealed | EvidenceExported
-    | HostRequest
+    | RecorderRequest | HostRequest
 )  # fmt: skip
 RestRequest = _Common | ChallengeWanted
-AnyRequest = _Common | RecorderRequest | TokenAdd
+AnyRequest = _Common | TokenAdd
 
 
 Trouble = Literal["", "request", "refused", "conflict", "unknown", "forbidden", "busy", "failed"]

@@ -12,7 +12,7 @@ import typer
 from appliance.channel import admin
 from appliance.channel.answers.recordings import Recording
 from appliance.cli import completion
-from appliance.cli.admin_socket import AdminSocket
+from appliance.cli.admin_socket import AdminSocket, NotRunningError
 from appliance.cli.output import Json, counted, say, say_json, usage_error
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
@@ -89,13 +89,9 @@ def fetch(
     target = out or Path(f"rosrv-{recording}.bag")
     if target.exists():
         raise usage_error(f"{target} is there already")
-    way = appliance.way
-    if not isinstance(way, AdminSocket):
-        raise usage_error("a recording is fetched on the appliance's machine, with --state")
-    body = appliance.ask_or_exit(admin.RecordingFetch(recording), as_json=as_json)
     part = target.with_name(f"{target.name}.part")
     try:
-        shutil.copyfile(way.state / "recordings" / body.id / "recording.bag", part)
+        body = _fetched(appliance, recording, part, as_json=as_json)
         with part.open("rb") as file:
             whole = hashlib.file_digest(file, "sha256").hexdigest() == body.sha256
         if whole:
@@ -123,6 +119,25 @@ def remove(appliance: Appliance, recording: _Id, as_json: Json = False) -> None:
     """
     body = appliance.answer_or_exit(admin.RecordingRemove(recording), as_json=as_json)
     say(f"recording {body.id} is removed")
+
+
+def _fetched(appliance: Appliance, recording: str, part: Path, *, as_json: bool) -> Recording:
+    """The bag in a file, and what it must be. Raises `OSError`."""
+    way = appliance.way
+    if isinstance(way, AdminSocket):
+        body = appliance.ask_or_exit(admin.RecordingFetch(recording), as_json=as_json)
+        shutil.copyfile(way.state / "recordings" / body.id / "recording.bag", part)
+        return body
+    from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
+
+    body = appliance.ask_or_exit(admin.RecordingWanted(recording), as_json=as_json)
+    try:
+        with way.client.streamed("GET", f"/v1/recordings/{body.id}/bag") as answer, part.open("wb") as file:
+            for piece in answer.iter_bytes():
+                file.write(piece)
+    except (ProblemError, NotRunningError) as error:
+        raise usage_error(str(error)) from None
+    return body
 
 
 def _seconds(option: str, given: str | None) -> float | None:

@@ -57,6 +57,8 @@ def troubles_of(body: Status) -> list[str]:
             f"the audit log is not forwarded to {forwarding.to}, {counted(forwarding.behind, 'record')} wait:"
             f" {forwarding.trouble}"
         )
+    if body.recorder is not None and not body.recorder.running:
+        found.append("the flight recorder does not run: nothing is recorded at the moment")
     if probe_failed(body):
         found.append(f"the ROS Master is not hidden: {body.probe}")
     monitors = body.monitors
@@ -128,6 +130,9 @@ def _show(body: Status, troubles: list[str]) -> None:
     forwarding = audit.forwarding
     forwarded = "" if forwarding is None else f", {forwarding.behind} to be forwarded to {forwarding.to}"
     grid.add_row("audit log", f"{counted(audit.lag_records, 'record')} waiting to be written{forwarded}")
+    if body.recorder is not None:
+        kept = body.recorder
+        grid.add_row("recorder", f"{counted(kept.recordings, 'recording')}, {kept.bytes / 1e6:.1f} MB")
     console.print(grid)
     table = processes_table(body.processes, console.width)
     console.print(table)

@@ -24,7 +24,10 @@ def add(
     ],
     role: Annotated[
         TokenRole,
-        typer.Option(help="viewer: look; operator: also reload and roll back; admin: also load new policies"),
+        typer.Option(
+            help="viewer: look; operator: also reload and roll back; admin: also load new policies; investigator: look,"
+            " and fetch the messages of recordings"
+        ),
     ] = "viewer",
     expires: Annotated[str, typer.Option(help="After this time it ends: 12h, 90d, 52w")] = "90d",
     as_json: Json = False,

@@ -13,7 +13,7 @@ from appliance.channel import admin
 from appliance.channel.answers.graph import Graph, Registration, Registrations, TopicMessage, TopicMessages
 from appliance.channel.answers.inventory import InUse, Inventory
 from appliance.channel.answers.measures import Measures
-from appliance.channel.answers.status import AuditState, ClockState, PolicyState, Status
+from appliance.channel.answers.status import AuditState, ClockState, PolicyState, RecorderState, Status
 from appliance.control.assembly import Parts
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.measures import measures_of
@@ -40,7 +40,8 @@ _TOPIC = (Kind.PUBLICATION, Kind.SUBSCRIPTION)
 class Looks:
     """Each method answers the request that it takes.
 
-    `audit()` is how the audit log stands, `clock()` the machine's clock, `live()` what a change of the policy may end.
+    `audit()` is how the audit log stands, `clock()` the machine's clock, `recorder()` the flight recorder, `live()`
+    what a change of the policy may end.
     """
 
     parts: Parts
@@ -49,6 +50,7 @@ class Looks:
     surroundings: Surroundings
     audit: Callable[[], AuditState]
     clock: Callable[[], ClockState]
+    recorder: Callable[[], RecorderState | None]
     queued_deliveries: Callable[[], int]
     live: Callable[[], list[Live]]
     started: float = field(default_factory=time.time)
@@ -162,6 +164,7 @@ class Looks:
             dropped=relay.carried.total.dropped,
             audit=self.audit(),
             clock=self.clock(),
+            recorder=self.recorder(),
         )
 
     def _policy(self) -> PolicyState:

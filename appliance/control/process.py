@@ -239,6 +239,7 @@ class _Control:
             self._lifeline.surroundings,
             audit=self._audit_state,
             clock=self._clock.state,
+            recorder=self._recordings.state,
             queued_deliveries=lambda: parts.delivery.waiting,
             live=parts.revocation.live,
         )

@@ -9,6 +9,7 @@ from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import admin, messages
 from appliance.channel.answers.recordings import Recording, RecordingBegun, Recordings, Trigger
+from appliance.channel.answers.status import RecorderState
 from appliance.channel.channel import Channel
 from appliance.config import RecorderRules
 from appliance.control.errors import SenselessError, UnknownThingError
@@ -53,9 +54,19 @@ class RecordingOrders:
             if self._channel is channel:
                 self._channel = None
                 for waiting in self._asked.values():
-                    waiting.cancel()
+                    if not waiting.done():
+                        waiting.set_exception(
+                            RecorderAwayError("the flight recorder ended before it answered")
+                        )
 
         channel.attach(asyncio.get_running_loop(), received, lost, lost)
+
+    def state(self) -> RecorderState | None:
+        """For `rosrv status` and the metrics; None when nothing is recorded."""
+        if not self._rules.enabled:
+            return None
+        sizes = [recording.size for recording in self._kept.values()]
+        return RecorderState(self._channel is not None, len(sizes), sum(sizes))
 
     # --- what operators ask -------------------------------------------------------------------------------
 
@@ -104,6 +115,9 @@ class RecordingOrders:
             sha256=recording.sha256,
             who=who,
         )
+        failure = await self._trail.durable()
+        if failure is not None:
+            raise RecorderAwayError(f"nobody can fetch anything while that is not on record: {failure}")
         return recording
 
     async def remove(self, request: admin.RecordingRemove, who: str) -> Recording:
@@ -115,7 +129,7 @@ class RecordingOrders:
 
     def _require(self) -> None:
         if not self._rules.enabled:
-            raise RecorderAwayError(
+            raise UnknownThingError(
                 "the flight recorder is off: `recorder: {enabled: true}` in appliance.yaml turns it on"
             )
         if self._channel is None:
@@ -135,7 +149,7 @@ class RecordingOrders:
             if self._channel is not None:
                 self._channel.send(order(number))
             answer = await asyncio.wait_for(future, _PATIENCE_SECONDS)
-        except (TimeoutError, asyncio.CancelledError):
+        except TimeoutError:
             raise RecorderAwayError("the flight recorder did not answer") from None
         finally:
             del self._asked[number]

@@ -31,6 +31,7 @@ from appliance.channel.admin import (
     HostRenewItself,
     HostToken,
     LogSealed,
+    RecorderRequest,
     TopicLook,
     encode,
     verb_of,
@@ -49,7 +50,8 @@ _ORDERS = ("POST", "PUT", "PATCH", "DELETE")  # refused in whatever way, nothing
 _CHANGES = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
 _SLOW = (
     HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself | TopicLook | LogSealed | EvidenceExported
-)
+    | RecorderRequest
+)  # fmt: skip
 _MOST_SLOW = 16
 
 
@@ -126,7 +128,7 @@ class RestLink:
             await asyncio.sleep(0)
 
     def _begin(self, channel: Channel, made: messages.RequestMade) -> None:
-        """Serve beside the others what waits for charon, the signer or a topic's messages."""
+        """Serve beside the others what waits for charon, the signer, the recorder or a topic's messages."""
         if len(self._slow) >= _MOST_SLOW:
             text = "too many requests that take a while are under way: try again"
             self._send_answer(made.number, AdminAnswer(False, error=text, trouble="busy"))

@@ -18,7 +18,7 @@ import time
 
 from appliance.audit.record import Severity
 from appliance.channel import admin
-from appliance.channel.answers.tokens import Challenge
+from appliance.channel.answers.tokens import Challenge, TokenRole, may
 from appliance.channel.messages import Asked, RequestMade
 from appliance.channel.operations import CHANGES, operation_of
 from appliance.control.challenges import SECONDS, ChallengeRefusedError, Challenges
@@ -37,7 +37,6 @@ from appliance.order_proof import (
 from appliance.store.tokens import TokenRow, is_secret, parse_token
 
 _ITSELF = "the host itself"
-_RANKS = {"viewer": 1, "operator": 2, "admin": 3}
 
 
 class UnprovenError(Exception):
@@ -70,7 +69,7 @@ class Askers:
         if role is None:
             return _ITSELF if isinstance(made.request, admin.HostRequest) else ""
         row = await self._holder(made.shown)
-        if _RANKS[row.role] < _RANKS[role]:
+        if not may(row.role, role):
             raise UnprovenError(f"this is for {role}s; the token {row.name} is a {row.role}'s", row.name)
         if type(made.request) in CHANGES:
             self._require_order(made, row)
@@ -141,7 +140,7 @@ class Askers:
             raise UnprovenError(str(error), row.name) from None
 
 
-def _role_for(request: admin.RestRequest) -> str | None:
+def _role_for(request: admin.RestRequest) -> TokenRole | None:
     """The least role of a token that may ask this; None where no token is needed."""
     if isinstance(request, admin.MonitorReload) and request.prune:
         return "admin"  # removes what an admin loaded

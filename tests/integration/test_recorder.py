@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import stat
+import subprocess
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.appliance import Appliance
+from tests.support.appliance import ROSRV, Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
 from tests.support.waiting import eventually
@@ -46,7 +47,7 @@ def appliance() -> Iterator[Appliance]:
         (folder / "monitors" / "censor.rv").write_text(MONITOR)
         (folder / "appliance.yaml").write_text(CONFIGURATION)
         options = (
-            "--config", str(folder / "appliance.yaml"), "--monitors", str(folder / "monitors"), "--api", "off"
+            "--config", str(folder / "appliance.yaml"), "--monitors", str(folder / "monitors"), "--api", "127.0.0.1:0"
         )  # fmt: skip
         with Appliance(options=options) as appliance:
             yield appliance
@@ -164,3 +165,56 @@ def test_a_killed_recorder_goes_on(appliance: Appliance, ros: RosSession, tmp_pa
     chatter = said(ros, fetched(appliance, row["id"], tmp_path), "/chatter")
     assert set(heard) <= set(chatter)
     assert len(chatter) == len(set(chatter))
+
+
+def test_over_rest_messages_are_for_investigators(
+    appliance: Appliance, ros: RosSession, tmp_path: Path
+) -> None:
+    """Operators order, viewers look, admins remove; the bag is whole, and who fetched it is on record."""
+
+    def token(role: str) -> str:
+        made = appliance.rosrv("token", "add", f"the-{role}", "--role", role, "--json").stdout
+        return str(json.loads(made)["token"])
+
+    admin = appliance.rest()
+    viewer, operator = admin.with_token(token("viewer")), admin.with_token(token("operator"))
+    secret = token("investigator")
+    investigator = admin.with_token(secret)
+    listener = ros.listener("roscpp", "/chatter", name="ear")
+    ros.talker("roscpp", "/chatter", name="voice")
+    heard = [event["data"] for event in listener.wait_for_count(5, event="received")]
+    order = {"after": 0.5, "note": "over REST"}
+    for other in (viewer, investigator):
+        assert other.post("/v1/recordings", order).status == 403
+    made = operator.post("/v1/recordings", order)
+    assert made.status == 201, made.body
+    path = f"/v1/recordings/{made.json['id']}"
+    eventually(lambda: viewer.get(path).status == 200, appliance.story)
+    [row] = viewer.get("/v1/recordings").json["recordings"]
+    assert row == viewer.get(path).json
+    assert row["triggers"][0]["text"] == "the-operator: over REST"
+    for other in (viewer, operator, admin):
+        assert other.get(f"{path}/bag").status == 403
+    bag = investigator.get(f"{path}/bag")
+    assert hashlib.sha256(bag.body).hexdigest() == row["sha256"]
+    taken = tmp_path / "taken.bag"
+    done = subprocess.run(
+        [
+            *(ROSRV, "record", "fetch", row["id"], "--out", str(taken), "--api", str(appliance.ready["api"])),
+            *("--api-ca", str(appliance.state / "api" / "certificate.pem")),
+        ],
+        env=os.environ | {"ROSRV_TOKEN": secret},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert taken.read_bytes() == bag.body
+    assert set(heard) <= set(said(ros, taken, "/chatter"))
+    fetches = appliance.recorded(event="recording fetched", count=2)
+    assert {record["detail"]["who"] for record in fetches} == {"the-investigator"}
+    assert operator.request("DELETE", path).status == 403
+    assert admin.request("DELETE", path).status == 200
+    assert viewer.get(path).status == 404
+    assert investigator.get(f"{path}/bag").status == 404
+    assert appliance.status()["recorder"] == {"running": True, "recordings": 0, "bytes": 0}

@@ -10,9 +10,9 @@ TriggerKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "
 
 
 class Trigger(msgspec.Struct, frozen=True):
-    """Why messages were recorded; `time` is nanoseconds since the epoch."""
+    """Why messages were recorded."""
 
-    time: int
+    time: Annotated[int, told("nanoseconds since the epoch")]
     what: TriggerKind
     record: Annotated[str, told("id of the audit record that says it")]
     text: str
@@ -30,11 +30,11 @@ class RecordedTopic(msgspec.Struct, frozen=True):
 
 
 class Recording(msgspec.Struct, frozen=True):
-    """One recording; it is also `recording.json` beside its bag. Times are nanoseconds since the epoch."""
+    """One recording; it is also `recording.json` beside its bag."""
 
     id: str
-    began: int
-    ended: int
+    began: Annotated[int, told("nanoseconds since the epoch")]
+    ended: Annotated[int, told("nanoseconds since the epoch")]
     triggers: list[Trigger]
     topics: list[RecordedTopic]
     policy: Annotated[int, told("revision of the policy in force at the end")]

@@ -136,6 +136,14 @@ class AuditState(msgspec.Struct, frozen=True):
     forwarding: Annotated[ForwardingState | None, told("null: it is not to be forwarded")]
 
 
+class RecorderState(msgspec.Struct, frozen=True):
+    """The flight recorder: how many recordings are kept, and their bytes."""
+
+    running: bool
+    recordings: int
+    bytes: int
+
+
 class Status(msgspec.Struct, frozen=True):
     """The running appliance, as `rosrv status --json` shows it; `since` is seconds since the epoch."""
 
@@ -164,3 +172,4 @@ class Status(msgspec.Struct, frozen=True):
     dropped: int
     audit: AuditState
     clock: ClockState
+    recorder: Annotated[RecorderState | None, told("null: nothing is recorded")] = None

@@ -6,7 +6,13 @@ import msgspec
 
 from appliance.channel.answers.field_docs import Moment, told
 
-TokenRole = Literal["viewer", "operator", "admin"]
+TokenRole = Literal["viewer", "investigator", "operator", "admin"]
+_RANKS: dict[str, int] = {"viewer": 1, "investigator": 1, "operator": 2, "admin": 3}
+
+
+def may(held: str, least: TokenRole) -> bool:
+    """Whether a token of one role may do what is for another. What is for investigators nobody else may."""
+    return held == least if least == "investigator" else _RANKS[held] >= _RANKS[least]
 
 
 class Token(msgspec.Struct, frozen=True):

@@ -19,6 +19,7 @@ WRITES = ("/v1/policy", "/v1/policy/rollback", "/v1/policy/reload", "/v1/policy/
 READS = (
     "/v1/status", "/v1/inventory", "/v1/policy", "/v1/policy/revisions", "/v1/graph", "/v1/audit", "/v1/audit/1",
     "/v1/audit/export", "/v1/audit/stream", "/v1/monitors", "/v1/monitors/any", "/v1/tokens", "/v1/hosts", "/v1/whoami",
+    "/v1/recordings", f"/v1/recordings/{'a' * 20}/bag",
     "/metrics", "/v1/metrics", "/v1/nothing/here",
 )  # fmt: skip
 

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from prometheus_client.parser import text_string_to_metric_families
 
 from appliance.api.metrics import rendered
 from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.status import RecorderState
 from appliance.metrics import BOUNDS, METRICS, Meter, markdown
 from tests.support.answers import example
 
@@ -125,6 +127,30 @@ def test_tunnels_are_measured() -> None:
     assert samples["rosrv_host_ports_open", a] == 0
     assert samples["rosrv_hosts", (("state", "revoked"),)] == 1
     assert ("rosrv_tunnel_up", (("host", "b"),)) not in samples
+
+
+def test_recordings_are_counted_while_there_is_a_recorder() -> None:
+    """With it, whether it runs and what it has; without it nothing is said."""
+
+    def samples(recorder: RecorderState | None) -> dict[str, float]:
+        given = body()
+        given = msgspec.structs.replace(
+            given, status=msgspec.structs.replace(given.status, recorder=recorder)
+        )
+        families = text_string_to_metric_families(rendered(given, CALLS).decode())
+        return {
+            one.name: one.value
+            for family in families
+            for one in family.samples
+            if "recordings" in one.name or "recorder" in one.name
+        }
+
+    assert samples(None) == {}
+    assert samples(RecorderState(running=True, recordings=2, bytes=300)) == {
+        "rosrv_recorder_up": 1,
+        "rosrv_recordings": 2,
+        "rosrv_recordings_bytes": 300,
+    }
 
 
 def test_nothing_is_said_of_a_forwarding_that_nobody_wants() -> None:

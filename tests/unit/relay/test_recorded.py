@@ -62,3 +62,25 @@ def test_what_is_never_to_be_recorded_is_not(memory: int, never: tuple[str, ...]
     assert given(memory, never=never).open("/chatter", "10.0.0.1", header) is None
     assert given(memory).open("/other", "10.0.0.1", header) is None
     assert given(memory).open("/chatter", "10.0.0.1", header) is not None
+
+
+@pytest.mark.parametrize("size", [10, 100_000])
+def test_what_passes_is_recorded_once(memory: int, size: int) -> None:
+    """Whatever its length, and what monitors publish on their own topic after it."""
+    story = Story(recorded=given(memory))
+    member = story.join()
+    story.topic.upstream_opened(HEADER)
+    story.receive(batch(bytes(size), b"2"))
+    story.topic.published(batch(b"3"))
+    assert len(member.received) == size + 4 + 2 * 5
+    assert kept(memory) == [("/chatter", bytes(size)), ("/chatter", b"2"), ("/chatter", b"3")]
+
+
+def test_a_connection_that_ends_amid_a_message_is_recorded_no_more(memory: int) -> None:
+    """Delivering it may end the topic: what is left belongs to no connection."""
+    story = Story(recorded=given(memory))
+    story.join()
+    story.topic.upstream_opened(HEADER)
+    story.topic.look(lambda _batch: story.topic.upstream_closed(), latched=False)
+    story.receive(batch(bytes(100_000)))
+    assert kept(memory) == []

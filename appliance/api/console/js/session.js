@@ -13,14 +13,14 @@ import { createStore } from "./store.js";
 
 const KEY = "rosrv.token";
 const LAST_USE = "rosrv.used"; // beside it: a browser may put a tab away and load it anew hours later
-const RANK = { viewer: 1, operator: 2, admin: 3 };
+const RANK = { viewer: 1, investigator: 1, operator: 2, admin: 3 };
 const USES = ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"];
 const LONGEST = 2 ** 31 - 1; // what a browser's timer can wait, in milliseconds
 /** After how long without use the page is locked, in milliseconds. */
 export const UNUSED = Number(stated("lock-seconds")) * 1000;
 
 /**
- * @typedef {{token: string, name: string, role: "viewer" | "operator" | "admin", expires: number}} Session
+ * @typedef {{token: string, name: string, role: "viewer" | "investigator" | "operator" | "admin", expires: number}} Session
  * `current` is null while nobody is signed in; `ended` says why the last one ended. While the page is locked `locked` is
  * who was there. `number` counts those who came, and who only opened the lock again is not another.
  */

@@ -1,0 +1,111 @@
+"""`/v1/recordings`: what the flight recorder has; its messages are for investigators, and each fetch is on record.
+
+No change here needs `If-Match`: a recording never changes, it only ends.
+"""
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path as FilePath
+from typing import Annotated
+
+import msgspec
+from fastapi import Path, Request, Response
+from fastapi.responses import StreamingResponse
+
+from appliance.api.access import Bearer
+from appliance.api.problems import ProblemError
+from appliance.api.roles import Admin, Investigator, Operator, Viewer, answered, ask
+from appliance.api.routing import Responses, Routes, answer, body, content
+from appliance.api.services import Services
+from appliance.api.streams import Held, Streams, peer_of
+from appliance.channel import admin
+from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.recordings import Recording, RecordingBegun, Recordings
+from appliance.shares.table import REST_EXPORTS
+
+_PIECE = 1 << 20
+_SLOW_SECONDS = 15.0  # longer than control waits for the recorder
+_UNKNOWN: Responses = {404: {"description": "There is no such recording, or the flight recorder is off."}}
+_BAG: Responses = {
+    200: {
+        "description": "The bag (rosbag, format 2.0)",
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+_BEGUN: Responses = {201: {"description": "It is being made.", "content": content(RecordingBegun)}}
+OneId = Annotated[str, Path(pattern="^[0-9a-f]{20}$", description="of a recording")]
+
+
+class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is to be recorded: seconds before and after now (null: as configured), and why."""
+
+    before: Annotated[Annotated[float, msgspec.Meta(ge=0)] | None, told("seconds")] = None
+    after: Annotated[Annotated[float, msgspec.Meta(gt=0)] | None, told("seconds")] = None
+    note: Annotated[str, msgspec.Meta(max_length=300)] = ""
+
+
+def routes(services: Services) -> Routes:
+    """The routes."""
+    router = Routes(prefix="/v1/recordings", tags=["recordings"])
+    control = services.control
+    fetches = Streams(REST_EXPORTS, REST_EXPORTS, REST_EXPORTS.bounds.whole)
+
+    @router.get("", operation_id="recordings", responses=_UNKNOWN)
+    async def recordings(bearer: Viewer) -> Recordings:
+        """All recordings that are kept, the oldest first."""
+        return await ask(control, admin.RecordingsWanted(), bearer)
+
+    @router.post(
+        "", operation_id="record_now", responses=_BEGUN | _UNKNOWN, response_class=Response, status_code=201
+    )
+    async def record_now(new: Annotated[NewRecording, body(NewRecording)], bearer: Operator) -> Response:
+        """Record the last seconds, and the next ones, of what the robot says."""
+        order = admin.RecordNow(new.before, new.after, new.note)
+        return answer(answered(await control.ask(order, bearer, _SLOW_SECONDS)), 201)
+
+    @router.get("/{recording_id}", operation_id="recording", responses=_UNKNOWN)
+    async def recording(recording_id: OneId, bearer: Viewer) -> Recording:
+        """Why a recording was made, and what it has."""
+        return await ask(control, admin.RecordingWanted(recording_id), bearer)
+
+    @router.get(
+        "/{recording_id}/bag",
+        operation_id="recording_bag",
+        responses=_BAG | _UNKNOWN,
+        response_class=Response,
+    )
+    async def bag(recording_id: OneId, request: Request, bearer: Investigator) -> Response:
+        """The messages of a recording, for investigators; it is recorded who fetched them."""
+        give_back = fetches.take(bearer, peer_of(request), "fetches")
+        try:
+            return Held(await _bag(services, recording_id, bearer), give_back)
+        except BaseException:
+            give_back()
+            raise
+
+    @router.delete("/{recording_id}", operation_id="remove_recording", responses=_UNKNOWN)
+    async def remove(recording_id: OneId, bearer: Admin) -> Recording:
+        """Remove a recording; it is recorded who removed it. For admins."""
+        order = admin.RecordingRemove(recording_id)
+        return answered(await control.ask(order, bearer, _SLOW_SECONDS))
+
+    return router
+
+
+async def _bag(services: Services, recording_id: str, bearer: Bearer) -> Response:
+    """The file, once it is on record who fetches it."""
+    found = answered(await services.control.ask(admin.RecordingFetch(recording_id), bearer, _SLOW_SECONDS))
+    path = services.settings.state / "recordings" / found.id / "recording.bag"
+    if not await asyncio.to_thread(path.is_file):
+        raise ProblemError(503, "not-available", f"the bag of {found.id} is not there any more")
+    headers = {
+        "Content-Length": str(found.size),
+        "Content-Disposition": f'attachment; filename="rosrv-{found.id}.bag"',
+    }
+    return StreamingResponse(_pieces(path), media_type="application/octet-stream", headers=headers)
+
+
+async def _pieces(path: FilePath) -> AsyncIterator[bytes]:
+    with await asyncio.to_thread(path.open, "rb") as file:
+        while piece := await asyncio.to_thread(file.read, _PIECE):
+            yield piece

@@ -1,0 +1,183 @@
+"""What operators ask of the flight recorder, with a recorder that a test plays."""
+
+import asyncio
+import socket
+from collections.abc import Awaitable, Callable
+from typing import Any, cast
+
+import pytest
+
+from appliance.audit_trail import AuditTrail
+from appliance.channel import admin, messages
+from appliance.channel.answers.recordings import Recording, Trigger
+from appliance.channel.channel import Channel
+from appliance.config import RecorderRules
+from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.recording_orders import RecorderAwayError, RecordingOrders
+
+KEPT = Recording(
+    "a" * 20, 1, 2, [Trigger(1, "drop", "r", "t")], [], 1, 1, 300, "5a", complete=True, why_not=""
+)
+
+
+class Trail:
+    """The audit trail: what happened, and whether that can be written."""
+
+    def __init__(self) -> None:
+        self.events: list[tuple[str, dict[str, Any]]] = []
+        self.failure: str | None = None
+
+    def happened(self, event: str, _reason: str, **detail: Any) -> str:
+        """As `AuditTrail`."""
+        self.events.append((event, detail))
+        return "record"
+
+    async def durable(self) -> str | None:
+        """As `AuditTrail`."""
+        return self.failure
+
+
+class Scene:
+    """Control's end, and the recorder's."""
+
+    def __init__(self, **rules: Any) -> None:
+        self.trail = Trail()
+        self.orders = RecordingOrders(
+            RecorderRules(**{"enabled": True} | rules),
+            cast(AuditTrail, self.trail),
+            lambda: messages.RevisionsStated(4, 2),
+        )
+
+    def attach(self, answer: Callable[[Any], list[messages.Message]]) -> Channel:
+        """A recorder that answers so."""
+        ours, theirs = socket.socketpair()
+        self.orders.attach(Channel(ours, messages.RecorderLink))
+        recorder = Channel(theirs, messages.RecorderLink)
+
+        def received(message: Any, _descriptors: tuple[int, ...]) -> None:
+            for said in answer(message):
+                recorder.send(said)
+
+        recorder.attach(asyncio.get_running_loop(), received, lambda: None)
+        return recorder
+
+
+async def told(scene: Scene, done: Callable[[], bool]) -> None:
+    """Wait until control has heard it."""
+    async with asyncio.timeout(10):
+        while not done():
+            await asyncio.sleep(0)
+
+
+def played(story: Callable[[], Awaitable[None]]) -> None:
+    """Run it."""
+    asyncio.run(cast(Any, story()))
+
+
+def test_a_recorder_that_is_off_or_away_is_said() -> None:
+    """In words that say what to do; the status knows."""
+
+    async def story() -> None:
+        off = Scene(enabled=False)
+        assert off.orders.state() is None
+        with pytest.raises(UnknownThingError, match="enabled: true"):
+            await off.orders.recordings(admin.RecordingsWanted())
+        away = Scene()
+        state = away.orders.state()
+        assert state is not None
+        assert not state.running
+        with pytest.raises(RecorderAwayError, match="does not run"):
+            await away.orders.now(admin.RecordNow(), "eve")
+
+    played(story)
+
+
+def test_what_is_closed_is_recorded_noted_and_listed() -> None:
+    """And what is removed, by whomever, goes; a look at one that is not there is refused."""
+    heard: list[Any] = []
+
+    async def story() -> None:
+        scene = Scene()
+        recorder = scene.attach(lambda message: heard.append(message) or [])  # type: ignore[func-returns-value]
+        recorder.send(messages.RevisionsWanted())
+        recorder.send(messages.RecordingClosed(KEPT))
+        await told(scene, lambda: len(heard) == 2)
+        assert heard == [messages.RevisionsStated(4, 2), messages.RecordingNoted(KEPT.id)]
+        assert (await scene.orders.recordings(admin.RecordingsWanted())).recordings == [KEPT]
+        assert await scene.orders.recording(admin.RecordingWanted(KEPT.id)) == KEPT
+        [(event, detail)] = scene.trail.events
+        assert (event, detail["recording"], detail["sha256"]) == ("recording closed", KEPT.id, "5a")
+        assert detail["triggers"] == ["drop r"]
+        recorder.send(messages.RecordingRemoved(0, KEPT, "", "recorder.disk is used up"))
+        await told(scene, lambda: len(scene.trail.events) == 2)
+        assert scene.trail.events[1][1]["who"] == "recorder"
+        with pytest.raises(UnknownThingError, match="no recording"):
+            await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve")
+        recorder.close()
+
+    played(story)
+
+
+def test_orders_are_carried_out_in_somebodys_name() -> None:
+    """The trigger has the record that says who; what makes no sense is refused before it is recorded."""
+
+    def answer(message: Any) -> list[messages.Message]:
+        match message:
+            case messages.RecordingWanted(number, trigger, before, after):
+                assert (trigger.record, trigger.text, before, after) == ("record", "eve: why", 60, 5)
+                return [messages.RecordingBegun(number, KEPT.id, 9)]
+            case messages.RecordingRemovalWanted(number, recording_id, who):
+                if recording_id != KEPT.id:
+                    return [messages.RecordingRefused(number, "there is none", unknown=True)]
+                return [messages.RecordingRemoved(number, KEPT, who, "")]
+        return []
+
+    async def story() -> None:
+        scene = Scene()
+        recorder = scene.attach(answer)
+        for senseless in (admin.RecordNow(before=601.0), admin.RecordNow(after=0.0)):
+            with pytest.raises(SenselessError):
+                await scene.orders.now(senseless, "eve")
+        assert not scene.trail.events
+        begun = await scene.orders.now(admin.RecordNow(after=5, note="why"), "eve")
+        assert (begun.id, begun.ends) == (KEPT.id, 9)
+        assert scene.trail.events[0][1]["who"] == "eve"
+        assert await scene.orders.remove(admin.RecordingRemove(KEPT.id), "eve") == KEPT
+        assert scene.trail.events[1][1]["who"] == "eve"
+        with pytest.raises(UnknownThingError):
+            await scene.orders.remove(admin.RecordingRemove("b" * 20), "eve")
+        recorder.close()
+
+    played(story)
+
+
+def test_nobody_fetches_what_is_not_on_record() -> None:
+    """While the audit log cannot be written a fetch is refused."""
+
+    async def story() -> None:
+        scene = Scene()
+        recorder = scene.attach(lambda _message: [])
+        recorder.send(messages.RecordingsStated([KEPT]))
+        await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))
+        assert await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve") == KEPT
+        scene.trail.failure = "the disk is full"
+        with pytest.raises(RecorderAwayError, match="not on record"):
+            await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve")
+        recorder.close()
+
+    played(story)
+
+
+def test_who_waits_for_a_recorder_that_dies_is_told() -> None:
+    """At once."""
+
+    async def story() -> None:
+        scene = Scene()
+        recorder = scene.attach(lambda _message: [])
+        asked = asyncio.ensure_future(scene.orders.now(admin.RecordNow(), "eve"))
+        await told(scene, lambda: bool(scene.trail.events))
+        recorder.close()
+        with pytest.raises(RecorderAwayError, match="before it answered"):
+            await asyncio.wait_for(asked, 5)
+
+    played(story)
