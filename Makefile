@@ -8,7 +8,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := appliance tests examples benchmarks distribution
 
-.PHONY: help setup demo check test test-system test-package wheel package image site release bench clean
+.PHONY: help setup demo check test test-system test-package prove wheel package image site release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -28,11 +28,11 @@ check: setup ## format, lint, types, dependency directions, unit tests
 	$(PYTEST) tests/unit -n auto --quiet
 
 test: check ## check, and the tests with real ROS nodes (root: they make network namespaces)
-	$(PYTEST) tests/integration -n auto --dist loadfile --quiet --durations=10
+	$(PYTEST) tests/integration tests/proofs/test_insertion.py -n auto --dist loadfile --quiet --durations=10
 
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
-	$(PYTEST) tests/system --quiet --durations=15
+	$(PYTEST) tests/system tests/proofs/test_insertion_at_large.py --quiet --durations=15
 
 test-package: ## what is installed: the package's life in a virtual machine, image and archive built, the wheel
 	@scripts/setup --system
@@ -59,6 +59,9 @@ release: ## everything anew, with provenance and checksums that KEY=FILE signs
 
 bench: setup ## measure: every program in benchmarks/
 	@for program in benchmarks/*.py; do echo "== $$program"; $(BIN)/python -m "benchmarks.$$(basename "$$program" .py)"; done
+
+prove: setup ## check what is proved of the appliance: the model of the insertion and its mutants (docs/assurance.md)
+	$(PYTEST) tests/proofs -n auto --quiet --durations=5
 
 clean: ## remove what was built, .venv included
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,12 +1,13 @@
 """What operators ask about the policy.
 
 Changes are made one at a time, and one that names the revision it is meant for is refused when another is in force by
-then.
+then. A change is answered when it is on the disk and the relays have carried it out: who was told that something is
+taken back can rely on it that nothing of it goes through any more.
 """
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import asdict
 from typing import Any
 
@@ -19,11 +20,17 @@ from appliance.store.state import RevisionRow, StateStore
 
 
 class PolicyOrders:
-    """Each method answers the request that it takes. They raise `PolicyRefusedError`, `RevisionChangedError`."""
+    """Each method answers the request that it takes. They raise `PolicyRefusedError`, `RevisionChangedError`.
 
-    def __init__(self, policies: Policies, store: StateStore) -> None:
+    `carried_out()` waits until the relays have carried out what they were told.
+    """
+
+    def __init__(
+        self, policies: Policies, store: StateStore, carried_out: Callable[[], Awaitable[None]]
+    ) -> None:
         self._policies = policies
         self._store = store
+        self._carried_out = carried_out
         self._lock = asyncio.Lock()
 
     async def reload(self, request: admin.PolicyReload, who: str) -> answers.Loaded:
@@ -67,12 +74,13 @@ class PolicyOrders:
 
     @contextlib.asynccontextmanager
     async def _changing(self, expected: int | None) -> AsyncIterator[None]:
-        """Around a change; it is on the disk afterwards."""
+        """Around a change; it is on the disk and carried out afterwards."""
         async with self._lock:
             if expected not in (None, self._policies.revision):
                 raise RevisionChangedError(expected, self._policies.revision)
             yield
             await self._store.settled()
+            await self._carried_out()
 
     def _known(self, revision: int | None, known: Known) -> answers.PolicyKnown:
         policies = self._policies

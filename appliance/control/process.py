@@ -245,7 +245,7 @@ class _Control:
         )
         administration = Administration(
             looks,
-            PolicyOrders(base.policies, base.store),
+            PolicyOrders(base.policies, base.store, parts.relay.carried_out),
             MonitorOrders(parts),
             HostOrders(self._hosts),
             TokenOrders(self._tokens),

@@ -123,6 +123,8 @@ class Engine:
             self._state_header(message)
         elif isinstance(message, messages.OwnPublished):
             self._publish(message.topic, message.data)
+        elif isinstance(message, messages.OrdersAsked):
+            self._reporter.send(messages.OrdersCarriedOut())
         else:
             self._table.withdraw(message)
             self._withdrawn(message)

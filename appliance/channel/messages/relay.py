@@ -22,6 +22,14 @@ class StateEnded(Message):
     epoch: int
 
 
+class OrdersAsked(Message):
+    """Control asks to be told (`OrdersCarriedOut`) when all that it said before this is carried out."""
+
+
+class OrdersCarriedOut(Message):
+    """The relay's answer to `OrdersAsked`: they are answered in order."""
+
+
 class NodePlaced(Message):
     """An incarnation and the listening socket that stands for its TCPROS port.
 
@@ -430,5 +438,5 @@ RelayLink = (
     | MessagesLimited | ConnectionClosed | ConnectionRefused | TrafficReported | SpecificationsStated
     | MonitorSwitched | MonitorResumed | OwnHeaderStated | OwnPublished | SpecificationsTaken
     | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
-    | MessageSeen
+    | MessageSeen | OrdersAsked | OrdersCarriedOut
 )  # fmt: skip

@@ -7,6 +7,7 @@ stated to the relay that carries it (`allocation`), a node to every relay that c
 
 import asyncio
 import ipaddress
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -37,6 +38,7 @@ class RelayPost:
         self.placed: set[str] = set()  # incarnations whose port this relay has
         self._channel: Channel | None = None
         self._epoch = 0
+        self._asked: deque[asyncio.Future[None]] = deque()
 
     @property
     def there(self) -> bool:
@@ -54,10 +56,12 @@ class RelayPost:
         if before is not None:
             before.close()
         self.placed.clear()
+        self._forget_orders()
 
         def closed() -> None:
             if self._channel is channel:
                 self._channel = None
+                self._forget_orders()
                 lost()
 
         channel.attach(asyncio.get_running_loop(), received, closed)
@@ -71,6 +75,22 @@ class RelayPost:
         except ChannelClosedError:
             return False  # its end is reported by the loop
         return True
+
+    def orders(self) -> list[asyncio.Future[None]]:
+        """What is done when the relay has carried out all that it was told, or ends; nothing when nobody is there."""
+        if not self.send(messages.OrdersAsked()):
+            return []
+        self._asked.append(asyncio.get_running_loop().create_future())
+        return [self._asked[-1]]
+
+    def carried_out(self) -> None:
+        """The relay has carried out what it was told before it was asked first."""
+        if not (done := self._asked.popleft()).done():
+            done.set_result(None)
+
+    def _forget_orders(self) -> None:
+        while self._asked:
+            self.carried_out()
 
     @contextmanager
     def restating(self) -> Iterator[None]:
@@ -173,6 +193,11 @@ class RelayControl:
     def publish(self, message: messages.OwnPublished) -> None:
         """Publish as the appliance's own publisher, to whoever subscribes now."""
         self._post(TOPIC, message.topic).send(message)
+
+    async def carried_out(self) -> None:
+        """Wait until every relay has carried out what it was told; one that ends or comes meanwhile begins with it."""
+        if waiting := [one for post in self._posts for one in post.orders()]:
+            await asyncio.wait(waiting)
 
     async def look(
         self, topic: str, count: int, seconds: float, *, latched: bool
@@ -333,6 +358,8 @@ class RelayControl:
                 self.carried.closed(post.index, message)
             case messages.ConnectionRefused():
                 self.carried.refused(message)
+            case messages.OrdersCarriedOut():
+                post.carried_out()
             case messages.MessageSeen():
                 self._looks.seen(message)
             case messages.PublicationRefused():

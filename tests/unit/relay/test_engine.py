@@ -27,6 +27,8 @@ from appliance.channel.messages import (
     MessagesLimited,
     NodePlaced,
     NodeWithdrawn,
+    OrdersAsked,
+    OrdersCarriedOut,
     PublicationPlaced,
     PublicationWithdrawn,
     ServicePlaced,
@@ -69,6 +71,18 @@ def test_a_subscriber_gets_the_publishers_header_and_messages(world: World) -> N
     ]
     subscriber.sock.close()
     world.hears(ConnectionClosed, number=opened.number, reason="")
+
+
+def test_control_is_told_when_its_orders_are_carried_out(world: World) -> None:
+    """When it hears so, the connection whose grant it took is closed, and what came for it goes nowhere."""
+    publisher, subscriber = world.subscribed()
+    publisher.send(encode_frame(b"one"))
+    world.gets(subscriber, encode_frame(b"one"))
+    world.control.send(GrantRevoked("k", "/chatter", LOOPBACK, "/listener"))
+    world.control.send(OrdersAsked())
+    world.hears(OrdersCarriedOut)
+    publisher.send(encode_frame(b"two"))
+    assert subscriber.sock.recv(100) == b""
 
 
 def test_messages_that_come_with_the_publishers_header_are_not_lost(world: World) -> None:

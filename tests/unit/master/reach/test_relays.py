@@ -1,5 +1,6 @@
 """Each relay is told what it carries, with its own port of each node; what moves takes its grants along."""
 
+import asyncio
 import ipaddress
 import socket
 from collections.abc import Callable
@@ -174,6 +175,31 @@ class World:
         """Close the sockets."""
         for one in self.ports.sockets.values():
             one.close()
+
+
+async def test_orders_are_carried_out_when_every_relay_says_so() -> None:
+    """Or is gone, or another has come, which begins with what is wanted; nobody waits for one that is away."""
+    world = World()
+    relay, (first, second) = world.relay, world.links
+
+    async def waiting() -> asyncio.Task[None]:
+        task = asyncio.ensure_future(relay.carried_out())
+        await asyncio.sleep(0)
+        return task
+
+    one, other = await waiting(), await waiting()
+    assert [link.heard()[-1] for link in world.links] == [messages.OrdersAsked()] * 2
+    first.say(messages.OrdersCarriedOut(), ())
+    second.say(messages.OrdersCarriedOut(), ())
+    await one
+    assert not other.done()
+    relay.attach(0, cast(Channel, Link()), cast(Any, world))
+    second.end()
+    await other
+    relay.attach(0, cast(Channel, again := Link()), cast(Any, world))
+    again.end()
+    await relay.carried_out()
+    world.close()
 
 
 async def test_each_relay_is_told_what_it_carries() -> None:

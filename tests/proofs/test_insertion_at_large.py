@@ -1,0 +1,26 @@
+"""The model of the insertion, within bounds that take minutes."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.spin import Bounds, search
+
+BOUNDS = [
+    Bounds(loads=1, policies=1, crashes=1),
+    Bounds(loads=2, policies=1),
+    Bounds(loads=1, policies=1, crashes=1, sending=False),
+    Bounds(subscribers=2, loads=1),
+    Bounds(subscribers=2, policies=1),
+    Bounds(subscribers=2, crashes=1),
+    Bounds(publishers=2, policies=1),
+    Bounds(publishers=2, crashes=1),
+]
+
+
+@pytest.mark.parametrize("bounds", BOUNDS, ids=str)
+def test_every_order_keeps_what_is_promised(tmp_path: Path, bounds: Bounds) -> None:
+    """No state that the model can reach breaks a property, and there are many."""
+    found = search(tmp_path, bounds)
+    assert found.broken == ""
+    assert found.states > 50_000

@@ -1,0 +1,45 @@
+"""The models in `proofs/` name what they model, and that is there."""
+
+import ast
+import re
+
+import pytest
+
+from tests.proofs.test_insertion import MUTANTS
+from tests.support.spin import MODEL
+
+ROOT = MODEL.parents[1]
+TEXT = MODEL.read_text()
+NAMED = sorted(
+    set(re.findall(r"^(?:/\*|  +/\*|) *= (appliance/\S+\.py) (\w+(?:\.\w+)?)", TEXT, re.MULTILINE))
+)
+
+
+@pytest.mark.parametrize(("path", "name"), NAMED)
+def test_what_the_model_names_is_there(path: str, name: str) -> None:
+    """A reader finds what a step models, under the name that the step gives."""
+    inside: list[ast.stmt] = ast.parse((ROOT / path).read_text()).body
+    for part in name.split("."):
+        found = [
+            one
+            for one in inside
+            if isinstance(one, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and one.name == part
+        ]
+        assert found, f"{path} has no {name}"
+        inside = found[0].body
+
+
+def test_every_process_names_what_it_models() -> None:
+    """All but the observer at rest, before it or in it; and no name is written in a way that is not looked at."""
+    parts = re.split(r"^proctype (\w+)", TEXT, flags=re.MULTILINE)
+    heads = [part.rpartition("\n}\n")[2] for part in parts[0:-1:2]]
+    bodies = [part.partition("\n}\n")[0] for part in parts[2::2]]
+    processes = dict(zip(parts[1::2], zip(heads, bodies, strict=True), strict=True))
+    without = {name for name, texts in processes.items() if "= appliance/" not in "".join(texts)}
+    assert without == {"Rest"}
+    assert len(NAMED) == len(set(re.findall(r"= (appliance/\S+ \S+)", TEXT)))
+
+
+def test_every_mutant_is_tried() -> None:
+    """Those of the model are those of the table."""
+    assert set(re.findall(r"MUTANT_(\w+)", TEXT)) == set(MUTANTS)
