@@ -16,13 +16,20 @@ Theory of operation:
    far as these need nothing that is recorded or explained. Whoever uses it must not see a difference but in time.
 5. `replaced` makes the set that follows: one swap between two messages. Specifications whose text is the same
    keep their variables and runs.
+6. Specifications on trial are sets of their own (`trials`), one for those that share variables: nothing that one does
+   or uses up is seen by others. Where the first of such a set would stand among the others, a copy of the message as
+   it is there is left in `tapped`; who has passed the message on has it given (`Tapped.give`), and what comes of it is
+   what would have been done. The copies for one set are given in their order.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from appliance.ros.definitions import Definitions
+from appliance.rosmop.compile.events import EventCode
+from appliance.rosmop.compile.program import connected
 from appliance.rosmop.compile.specification import Compiled, compile_files, findings_of
 from appliance.rosmop.faults import explain, happened
 from appliance.rosmop.logics.interface import Categories, RunFaultError
@@ -30,7 +37,7 @@ from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step, Ti
 from appliance.rosmop.outcomes import Fault, Outcome, Verdict
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.reach import reached, redefined
-from appliance.rosmop.runtime.context import BUDGET, FOLDED_NS, Context, LogLine
+from appliance.rosmop.runtime.context import FOLDED_NS, Context, LogLine
 from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -39,6 +46,9 @@ from appliance.rosmop.walking import Walker, Walks, walks_of
 
 OnFault = Literal["drop", "pass"]
 Patience = Callable[[], Callable[[], bool]]
+
+TRIAL_BUDGET = 100_000
+"""Instructions that a specification on trial may spend on one message: what waits meanwhile waits some milliseconds."""
 
 MAX_TICKS = 100_000
 """Ticks of one timer between two messages; a clock that jumps further leaves the rest out, and says so."""
@@ -54,20 +64,52 @@ def _come_home(monitor: Monitor) -> None:
         monitor.home.leave()
 
 
+class _Tap(Step):
+    """Where specifications on trial would stand: it copies the message, and never happens."""
+
+    __slots__ = ()
+
+
+class Tapped(NamedTuple):
+    """A copy of a message for specifications on trial: where it came, as which part of a service, and when."""
+
+    trial: "MonitorSet"
+    resource: str
+    part: str | None
+    data: bytes
+    time: int
+
+    def give(self) -> Outcome:
+        """What they would have done with it."""
+        if self.part is None:
+            return self.trial.process(self.resource, self.data, self.time)
+        return self.trial.process_service(self.resource, self.part, self.data, self.time)
+
+
 class MonitorSet:
     """Specifications in force together."""
 
     def __init__(
-        self, compiled: Compiled, files: Sequence[tree.File], on_fault: OnFault, patience: Patience
+        self,
+        compiled: Compiled,
+        files: Sequence[tree.File],
+        on_fault: OnFault,
+        patience: Patience,
+        trials: Sequence["MonitorSet"] = (),
     ) -> None:
+        """`files` are all in their order; what is on trial in them is compiled in `trials`."""
         self.files = tuple(files)
+        self.trials = trials
+        self.tapped: list[Tapped] = []
+        self._tapped_topics: frozenset[str] = frozenset()
         self.warnings: tuple[Finding, ...] = compiled.warnings
         self._compiled = compiled
         self._turn = compiled.turn
         self._on_fault: OnFault = on_fault
         self._patience = patience
-        nodes = [node for file in files for node in file.specifications]
-        self._monitors = monitors_of(compiled, nodes, 0)
+        nodes = {node.name: node for file in files for node in file.specifications}
+        self._order = tuple(nodes)
+        self._monitors = monitors_of(compiled, [nodes[one.name] for one in compiled.specifications], 0)
         self._steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
         self._requests: dict[tuple[str, str], tuple[Step, ...]] = {}
@@ -85,10 +127,14 @@ class MonitorSet:
         definitions: Definitions,
         on_fault: OnFault = "drop",
         patience: Patience = lambda: _never,
+        *,
+        trials: Collection[str] = (),
+        trial_patience: Patience = lambda: _never,
     ) -> "MonitorSet":
         """Compile files (name to text) in this order; raises `SpecificationError` with all that is wrong.
 
-        `patience()` is asked when something is due: what says whether that has taken too long.
+        `patience()` is asked when something is due: what says whether that has taken too long (`trial_patience` for
+        those on trial). With one that is named in `trials`, all that share variables with it are on trial.
         """
         files: list[tree.File] = []
         findings: list[Finding] = []
@@ -99,7 +145,23 @@ class MonitorSet:
                 findings += error.findings
         if findings:
             raise SpecificationError([*findings, *findings_of(files, definitions)])
-        return cls(compile_files(files, definitions), files, on_fault, patience)
+        compiled = compile_files(files, definitions)
+        uses = {one.name: one.uses for one in compiled.specifications}
+        groups = [group for group in sharing(uses) if not group.isdisjoint(trials)]
+        if not groups:
+            return cls(compiled, files, on_fault, patience)
+        tried = [cls._trial(_part(files, group), definitions, on_fault, trial_patience) for group in groups]
+        others = compile_files(_part(files, set(uses).difference(*groups)), definitions)
+        return cls(replace(others, warnings=compiled.warnings), files, on_fault, patience, tried)
+
+    @classmethod
+    def _trial(
+        cls, files: Sequence[tree.File], definitions: Definitions, on_fault: OnFault, patience: Patience
+    ) -> "MonitorSet":
+        trial = cls(compile_files(files, definitions), files, on_fault, patience)
+        for monitor in trial._monitors:
+            monitor.context.most = TRIAL_BUDGET
+        return trial
 
     # What there is
 
@@ -109,6 +171,11 @@ class MonitorSet:
         for monitor in self._monitors:
             _come_home(monitor)
         return self._monitors
+
+    @property
+    def tried(self) -> tuple[Monitor, ...]:
+        """The specifications on trial, with their state."""
+        return tuple(monitor for trial in self.trials for monitor in trial.monitors)
 
     @property
     def topics(self) -> Mapping[str, str]:
@@ -136,8 +203,11 @@ class MonitorSet:
 
     @property
     def publications(self) -> Mapping[str, str]:
-        """The topics that specifications publish, and their message types."""
-        return MappingProxyType({each.topic: each.type for each in self._compiled.publications})
+        """The topics that specifications publish, or would if they were not on trial, and their message types."""
+        sets = (self, *self.trials)
+        return MappingProxyType(
+            {each.topic: each.type for one in sets for each in one._compiled.publications}
+        )
 
     def published_by(self, file: str) -> frozenset[str]:
         """The topics that the specifications of a file publish."""
@@ -156,23 +226,27 @@ class MonitorSet:
         """Whether an enabled monitor has an event on this topic."""
         return topic in self._steps
 
-    def type_of(self, topic: str) -> str | None:
-        """The message type of a topic that `wants`; None of another."""
-        steps = self._steps.get(topic)
-        return steps[0].event.type if steps else None
+    def taps(self, topic: str) -> bool:
+        """Whether messages on this topic may be copied into `tapped`."""
+        return topic in self._tapped_topics
+
+    def type_of(self, topic: str, *, tried: bool = False) -> str | None:
+        """The message type of a topic that `wants`; None where none does, or (unless `tried`) only on trial."""
+        steps = self._steps.get(topic, ())
+        return next((step.event.type for step in steps if tried or not isinstance(step, _Tap)), None)
 
     def stamped(self, topic: str) -> bool:
         """Whether the messages of a topic begin with a `std_msgs/Header`, as their type is known here."""
-        name = self.type_of(topic)
+        name = self.type_of(topic, tried=True)
         fields = self.definitions.message(name).fields if name is not None else ()
         return bool(fields) and fields[0].notation == "std_msgs/Header"
 
-    def service_type_of(self, service: str) -> str | None:
-        """The type of a service with an enabled event; None of another."""
+    def service_type_of(self, service: str, *, tried: bool = False) -> str | None:
+        """The type of a service with an enabled event; None of another, or (unless `tried`) where it is on trial."""
         for part in ("request", "response"):
-            steps = self._requests.get((service, part))
-            if steps:
-                return steps[0].event.service_type
+            for step in self._requests.get((service, part), ()):
+                if tried or not isinstance(step, _Tap):
+                    return step.event.service_type
         return None
 
     def write_module(self) -> None:
@@ -190,7 +264,7 @@ class MonitorSet:
 
     def walker(self, topic: str) -> Walker | None:
         """The walk for messages on this topic; None if there is none."""
-        return self._walks.of_topic.get(topic) if topic in self._steps else None
+        return self._walks.of_topic.get(topic) if topic in self._steps and not self.taps(topic) else None
 
     def walks(self, walker: Walker, time_ns: int) -> bool:
         """Whether walks may be used now: nothing is due, no monitor waits for its first message or could not begin."""
@@ -218,9 +292,10 @@ class MonitorSet:
 
         `expected` are the topics that are known to carry messages (of a recording); a specification with events
         on one of them starts its timers with its first message. With `restarted`, specifications with the
-        modifier `hold` block their topics until `resume`.
+        modifier `hold` block their topics until `resume`; none on trial does.
         """
-        return self._start(self._monitors, time_ns, expected, restarted=restarted)
+        outcome = self._start(self._monitors, time_ns, expected, restarted=restarted)
+        return self._with_trials(outcome, [trial.start(time_ns, expected) for trial in self.trials])
 
     def _start(
         self, monitors: Sequence[Monitor], time_ns: int, expected: frozenset[str] | None, *, restarted: bool
@@ -251,25 +326,54 @@ class MonitorSet:
         following = MonitorSet.load(sources, definitions, self._on_fault, self._patience)
         return following, following.succeed(self, time_ns)
 
-    def succeed(self, before: "MonitorSet", time_ns: int) -> Outcome:
-        """Take the place of another set, as `replaced` says; `began` names those that begin with this one."""
-        known = {monitor.name: monitor for monitor in before.monitors}
+    def succeed(
+        self, before: "MonitorSet", time_ns: int, incomplete: Collection[str] = frozenset()
+    ) -> Outcome:
+        """Take the place of another set, as `replaced` says; `began` names those that begin with this one.
+
+        What goes on trial, or comes from it, keeps its state as others do; on trial it holds no topic. Those that are
+        `incomplete` have not seen all messages on trial: they begin anew when they are not on trial any more.
+        """
+        known = {
+            monitor.name: (monitor, one._compiled)
+            for one in (before, *before.trials)
+            for monitor in one.monitors
+        }
         others = redefined(before.definitions, self.definitions)
+        tried = [trial._follow(known, others, time_ns) for trial in self.trials]
+        for monitor in self.tried:
+            monitor.held = False
+        known = {name: found for name, found in known.items() if name not in incomplete}
+        outcome = self._follow(known, others, time_ns)
+        was_tried, is_tried = ({monitor.name for monitor in one.tried} for one in (before, self))
+        for monitor in (*self._monitors, *self.tried):
+            if (monitor.name in was_tried) is not (monitor.name in is_tried):
+                monitor.faults = 0
+        return self._with_trials(outcome, tried)
+
+    def _follow(
+        self, known: Mapping[str, tuple[Monitor, Compiled]], redefined: frozenset[str], time_ns: int
+    ) -> Outcome:
         fresh = []
         for monitor in self.monitors:
-            earlier = known.get(monitor.name)
+            earlier, compiled = known.get(monitor.name, (None, self._compiled))
             if (
                 earlier is not None
                 and earlier.node == monitor.node
-                and (not others or others.isdisjoint(reached(monitor.node, self.definitions)))
+                and (not redefined or redefined.isdisjoint(reached(monitor.node, self.definitions)))
             ):
-                self._take_over(monitor, earlier, before._compiled)
+                self._take_over(monitor, earlier, compiled)
             else:
                 fresh.append(monitor)
         self._index()
         outcome = self._start(fresh, time_ns, None, restarted=False)
         for monitor in fresh:  # only an operator lets the topics go on
-            monitor.held = monitor.code.hold and monitor.name in known and known[monitor.name].held
+            monitor.held = monitor.code.hold and monitor.name in known and known[monitor.name][0].held
+        return outcome
+
+    def _with_trials(self, outcome: Outcome, tried: Sequence[Outcome]) -> Outcome:
+        outcome.tried = tried
+        self.began += tuple(name for trial in self.trials for name in trial.began)
         return outcome
 
     def set_enabled(self, name: str, enabled: bool, time_ns: int) -> None:
@@ -282,7 +386,7 @@ class MonitorSet:
 
     def switch(self, enabled: Mapping[str, bool], time_ns: int) -> tuple[Monitor, ...]:
         """The same of many at once, unknown ones left out; those that were not so already."""
-        changed = []
+        changed = [monitor for trial in self.trials for monitor in trial.switch(enabled, time_ns)]
         for monitor in self._monitors:
             wanted = enabled.get(monitor.name, monitor.enabled)
             if wanted is monitor.enabled:
@@ -367,7 +471,7 @@ class MonitorSet:
         for step in steps:
             if step.first:
                 monitor = step.monitor
-                monitor.context.budget = BUDGET
+                monitor.context.budget = monitor.context.most
                 if (not monitor.seen or monitor.held) and self._first(monitor, message, outcome):
                     outcome.dropped_by = monitor.name
                     break
@@ -516,7 +620,7 @@ class MonitorSet:
         outcome = Outcome(time=due)
         outcome.timer = step.name
         self._turn.now = due
-        step.monitor.context.budget = BUDGET
+        step.monitor.context.begin()
         timer.ticked = True
         timer.due = due + timer.period
         outcome.events = (step.name,)
@@ -556,7 +660,7 @@ class MonitorSet:
         outcome = Outcome(time=deadline)
         outcome.timer = f"{monitor.name}.{word}"
         self._turn.now = deadline
-        monitor.context.budget = BUDGET
+        monitor.context.begin()
         categories = running.run.expire()
         self._tell(monitor, running, categories, None, outcome, in_order_told=True)
         self._collect(outcome)
@@ -597,7 +701,7 @@ class MonitorSet:
     def _begin(self, monitors: Sequence[Monitor], time_ns: int, outcome: Outcome) -> None:
         """Constants, first values, `init`: each for all before the next, as one may read another's variables."""
         for monitor in monitors:
-            monitor.context.budget = BUDGET
+            monitor.context.begin()
             for running in monitor.properties:
                 running.run = running.code.property.start(time_ns)
         beginning = list(monitors)
@@ -615,6 +719,8 @@ class MonitorSet:
             self._compiled.namespace[code] = compiled.namespace[before.code.variables[name]]
         for running, old in zip(monitor.properties, before.properties, strict=True):
             running.run = old.run
+        for step, old_step in zip(monitor.steps, before.steps, strict=True):
+            step.past, step.told = old_step.past, old_step.told
         for timer, ticking in zip(monitor.timers, before.timers, strict=True):
             timer.due, timer.ticked = ticking.due, ticking.ticked
         monitor.enabled, monitor.held, monitor.seen = before.enabled, before.held, before.seen
@@ -625,18 +731,24 @@ class MonitorSet:
         """Which steps a message on which topic takes."""
         steps: dict[str, list[Step]] = {}
         requests: dict[tuple[str, str], list[Step]] = {}
-        for monitor in self._monitors:
-            if not monitor.enabled:
-                continue
-            for step in monitor.steps:
-                topic, part = step.event.topic or "", step.event.part
-                if part is None:
-                    steps.setdefault(topic, []).append(step)
-                else:
-                    requests.setdefault((topic, part), []).append(step)
+        standing = {monitor.name: monitor.steps for monitor in self._monitors if monitor.enabled}
+        standing |= {trial._order[0]: self._taps(trial) for trial in self.trials}
+        for step in (step for name in self._order for step in standing.get(name, ())):
+            topic, part = step.event.topic or "", step.event.part
+            if part is None:
+                steps.setdefault(topic, []).append(step)
+            else:
+                requests.setdefault((topic, part), []).append(step)
         for found in (*steps.values(), *requests.values()):
-            for place, step in enumerate(found):
-                step.first = not place or found[place - 1].monitor is not step.monitor
+            acting = [step for step in found if not isinstance(step, _Tap)]
+            for place, step in enumerate(acting):
+                step.first = not place or acting[place - 1].monitor is not step.monitor
+            for step in found if acting else ():
+                if isinstance(step, _Tap):
+                    step.monitor = acting[0].monitor  # whose state has to come home
+        self._tapped_topics = frozenset(
+            topic for topic, found in steps.items() if any(isinstance(step, _Tap) for step in found)
+        )
         self._steps = {topic: tuple(found) for topic, found in steps.items()}
         self._requests = {key: tuple(found) for key, found in requests.items()}
         self._contexts = {
@@ -647,3 +759,34 @@ class MonitorSet:
             monitor.timers or any(running.code.property.timed for running in monitor.properties)
             for monitor in self._monitors
         )
+
+    def _taps(self, trial: "MonitorSet") -> tuple[Step, ...]:
+        """One for each topic and part of a service on which the trial has an enabled event."""
+        return tuple(
+            _Tap(found[0].monitor, found[0].event, 0, "", self._tap(trial, found[0].event))
+            for found in (*trial._steps.values(), *trial._requests.values())
+        )
+
+    def _tap(self, trial: "MonitorSet", event: EventCode) -> Callable[[Message | None], bool]:
+        resource, part, tapped = event.topic or "", event.part, self.tapped
+
+        def tap(message: Message | None) -> bool:
+            assert message is not None  # noqa: S101  no timer stands here
+            tapped.append(Tapped(trial, resource, part, bytes(message.buffer), message.time))
+            return False
+
+        return tap
+
+
+def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
+    """Specifications by those that share variables, however indirectly; `uses` says whose each one uses."""
+    names = list(uses)
+    return [{names[number] for number in one} for one in connected([(name, *uses[name]) for name in names])]
+
+
+def _part(files: Sequence[tree.File], names: Collection[str]) -> list[tree.File]:
+    """The files with these of their specifications only."""
+    return [
+        replace(file, specifications=tuple(one for one in file.specifications if one.name in names))
+        for file in files
+    ]

@@ -37,7 +37,8 @@ class Outcome:
     `buffer` is what to relay: the buffer that came in (changed in place where that was possible), or another.
     `events` are named `specification.event`. `timer` names what a tick or deadline belongs to
     (`specification.tick`, `specification.timeout`, `specification.deadline`); `time` is in nanoseconds. `before`
-    are ticks and deadlines that were due before this message.
+    are ticks and deadlines that were due before this message. `tried` is, of the beginning of a set, that of each of
+    its sets on trial.
 
     `changed_by` are the events whose actions made its bytes others than they found them, in order; empty unless the
     result is `changed`. An event that happened without a change, or assigned what was there, is not among them.
@@ -58,6 +59,7 @@ class Outcome:
     log: Sequence[LogLine] = ()
     faults: Sequence[Fault] = ()
     before: Sequence["Outcome"] = ()
+    tried: Sequence["Outcome"] = ()
     reason: str | None = None
     changed_by: Sequence[str] = ()
     dropped_by: str = ""

@@ -1,6 +1,6 @@
 """What belongs together in a set: specifications that share topics, services or variables, as the form has them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from appliance.rosmop.compile.specification import SpecificationCode
@@ -22,24 +22,31 @@ class Group:
 
 def groups(specifications: Sequence[SpecificationCode]) -> Iterator[Group]:
     """The components of a set."""
+    found = connected([
+        [one.name, *one.uses, *((event.topic, event.part) for event in one.events if event.topic is not None)]
+        for one in specifications
+    ])  # fmt: skip
+    for numbers in found:
+        yield _group(specifications, numbers)
+
+
+def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
+    """The numbers of what has keys in common, however indirectly, in order."""
     owners: dict[object, int] = {}
-    chief = list(range(len(specifications)))
+    chief = list(range(len(keys)))
 
     def find(number: int) -> int:
         while chief[number] != number:
             chief[number] = number = chief[chief[number]]
         return number
 
-    for number, specification in enumerate(specifications):
-        keys: list[object] = [specification.name, *specification.uses]
-        keys += [(event.topic, event.part) for event in specification.events if event.topic is not None]
-        for key in keys:
+    for number, own in enumerate(keys):
+        for key in own:
             chief[find(number)] = find(owners.setdefault(key, number))
     together: dict[int, list[int]] = {}
-    for number in range(len(specifications)):
+    for number in range(len(keys)):
         together.setdefault(find(number), []).append(number)
-    for numbers in together.values():
-        yield _group(specifications, numbers)
+    return together.values()
 
 
 def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) -> Group:

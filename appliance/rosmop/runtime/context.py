@@ -77,11 +77,22 @@ class Turn:
 class Context:
     """One specification: its name, what it has left of its budget, and where its output goes."""
 
-    __slots__ = ("_allocated", "_measures", "_pending", "budget", "live", "monitor", "throttled", "turn")
+    __slots__ = (
+        "_allocated",
+        "_measures",
+        "_pending",
+        "budget",
+        "live",
+        "monitor",
+        "most",
+        "throttled",
+        "turn",
+    )
 
     def __init__(self, monitor: str, turn: Turn, measures: Mapping[str, Measure]) -> None:
         self.monitor = monitor
         self.turn = turn
+        self.most = BUDGET
         self.budget = BUDGET
         self.throttled: dict[int, int] = {}
         self._allocated = 0
@@ -92,14 +103,14 @@ class Context:
 
     def begin(self) -> None:
         """A new message: the whole budget."""
-        self.budget = BUDGET
+        self.budget = self.most
 
     def spend(self, instructions: int, site: int) -> None:
         """Take from the budget; a fault if nothing is left."""
         self.budget -= instructions
         if self.budget < 0:
             raise FaultError(
-                site, f"more than {BUDGET} instructions for one message; is there a loop without end?"
+                site, f"more than {self.most} instructions for one message; is there a loop without end?"
             )
 
     def walk(self, elements: int) -> None:
@@ -107,7 +118,8 @@ class Context:
         self.budget -= elements
         if self.budget < 0:
             raise FaultError(
-                -1, f"more than {BUDGET} instructions for one message: too many elements stand before a field"
+                -1,
+                f"more than {self.most} instructions for one message: too many elements stand before a field",
             )
 
     def allocate(self, size: int, site: int, replaced: int = 0) -> None:
