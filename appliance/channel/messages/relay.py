@@ -279,7 +279,8 @@ class SpecificationsStated(Message):
     takes the place of one that died, so monitors with the modifier `hold` block their topics. So do those in `moved`:
     they come from another relay, and begin here. `statement` is a number of its own for every statement, which the
     answer has, too: the same revision may be stated again. `ahead`: what is stated after it is carried out when it is
-    in force (or refused), so that nothing is placed where its monitors are not yet.
+    in force (or refused), so that nothing is placed where its monitors are not yet. `trials` are the monitors that are
+    on trial: they are given copies of messages.
     """
 
     revision: int
@@ -291,6 +292,7 @@ class SpecificationsStated(Message):
     moved: tuple[str, ...] = ()
     statement: int = 0
     ahead: bool = False
+    trials: tuple[str, ...] = ()
 
 
 class MonitorSwitched(Message):
@@ -350,7 +352,8 @@ class PublicationRefused(Message):
 class MonitorEvent(msgspec.Struct, frozen=True, array_like=True):
     """Something a monitor did: the first of its kind and second in full, the others as a count.
 
-    `kind` is verdict, drop, change, fault, log or publish; `time` is nanoseconds since the epoch; `before` and
+    `kind` is verdict, drop, change, fault, log or publish, behind "trial " what one on trial would have done (or
+    "trial missed": what it was not given); `time` is nanoseconds since the epoch; `before` and
     `after` are the message, as far as the bound goes (`size` is its whole length). `count` is 0 when told in full,
     else how many more there were. `monitor` is who did it, of a change the last who did; `changed_by` in the detail
     names the events of all (in a count: if it was more than one monitor). `host` and `caller_id` are of the node that
@@ -381,7 +384,11 @@ class MonitorsReported(Message):
 
 
 class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
-    """The state and counters of one running monitor; counters since it was loaded or the relay started."""
+    """The state and counters of one running monitor; counters since it was loaded or the relay started.
+
+    Of one on `trial` drops and changes are what it would have done, since it is; `missed` are messages that it was not
+    given as others would be.
+    """
 
     name: str
     file: str
@@ -393,6 +400,8 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     drops: int
     changes: int
     faults: int
+    trial: bool = False
+    missed: int = 0
 
 
 class MonitorsCounted(Message):

@@ -21,6 +21,7 @@ from appliance.rosmop.syntax.errors import SpecificationError
 
 _SWITCH_SECONDS = 0.0005  # the loop waits so long at most for the compiler
 _TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in one go
+_TRIAL_TICKS_SECONDS = 0.02
 
 Result = MonitorSet | list[str]
 """The monitors, or what is wrong with the specifications."""
@@ -91,7 +92,14 @@ class Compiler:
             if self._standard is None:
                 self._standard = standard_definitions()
             definitions = self._standard.extended(Definitions.from_files(message.definitions))
-            monitors = MonitorSet.load(dict(message.files), definitions, message.on_fault, _patience)
+            monitors = MonitorSet.load(
+                dict(message.files),
+                definitions,
+                message.on_fault,
+                _patience,
+                trials=message.trials,
+                trial_patience=lambda: _patience(_TRIAL_TICKS_SECONDS),
+            )
             monitors.write_module()
             return monitors
         except SpecificationError as error:
@@ -102,6 +110,6 @@ class Compiler:
             return [f"a defect of rosrv, please report it: {type(error).__name__}: {error}"]
 
 
-def _patience() -> Callable[[], bool]:
-    ends = time.thread_time() + _TICKS_SECONDS
+def _patience(seconds: float = _TICKS_SECONDS) -> Callable[[], bool]:
+    ends = time.thread_time() + seconds
     return lambda: time.thread_time() > ends

@@ -19,6 +19,7 @@ from appliance.relay.monitors.observations import SHOWN
 from appliance.relay.monitors.passage import Passage
 from appliance.relay.monitors.places import HEAD, Place, Sighting
 from appliance.relay.monitors.telling import Telling
+from appliance.relay.monitors.trials import Trials
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.context import BUDGET
@@ -53,6 +54,9 @@ class Monitors(Protocol):
 
     telling: Telling
     """What is told to control."""
+
+    trials: Trials
+    """Those that are given copies."""
 
     def now(self) -> int:
         """Nanoseconds."""
@@ -171,6 +175,7 @@ class Lane:
         shows = telling.shows(place)
         contexts = monitors.contexts(topic)
         head = HEAD if monitors.stamped(topic) else 0
+        number = passage.number_at(position) if monitors.taps(topic) else 0
         looked = 0
         middle.look_again()
         spent = middle.spent - time.thread_time()
@@ -186,6 +191,8 @@ class Lane:
                 )
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
                 outcome = dropped(body, now, telling.defect(error, place, now, sighting))
+            if monitors.tapped:
+                middle.trials.wait(place, sighting.at(number + looked))
             if outcome.events or outcome.log or outcome.faults or outcome.before:
                 telling.told(outcome, place, sighting)
             result = outcome.result
@@ -195,11 +202,8 @@ class Lane:
                 telling.dropped(outcome, place, body, sighting)
                 passage.cut(position, following)
             elif result == "changed":
-                if shows:
-                    telling.changed(outcome, place, before, len(body), sighting)
-                    shows = telling.shows(place)
-                else:
-                    telling.changed_again(outcome, place)
+                telling.changed(outcome, place, before, len(body), sighting)
+                shows = False
                 if outcome.buffer is not body:
                     passage.replace(position, following, outcome.buffer)
             position = following

@@ -31,6 +31,7 @@ from appliance.relay.monitors.lane import LONGEST, TOO_LONG, Lane, dropped
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.places import NOWHERE, Place
 from appliance.relay.monitors.telling import Telling, refusal
+from appliance.relay.monitors.trials import Trials
 from appliance.relay.report import Reporter
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.monitor import Monitor
@@ -78,6 +79,8 @@ class Middle:
         self.observations = Observations(loop, reporter, self._rows)
         self._changed = changed
         self.telling = Telling(self.observations, publish)
+        self._on_trial = Telling(self.observations, lambda _published: None, "trial ")
+        self.trials = Trials(loop, self.now, self._on_trial)
 
     # --- what control states ---
 
@@ -103,9 +106,10 @@ class Middle:
             self._refuse(message, result)
             return
         before, now, blocked = self.monitors, self.now(), self.blocked
-        outcome = (
-            result.start(now, restarted=message.restarted) if before is None else result.succeed(before, now)
-        )
+        if before is None:
+            outcome = result.start(now, restarted=message.restarted)
+        else:
+            outcome = result.succeed(before, now, self.trials.settle())
         self.monitors, self._stated, self.blocked = result, message, ""
         began = list(result.began)
         for monitor in result.monitors:
@@ -114,6 +118,7 @@ class Middle:
             )
         self.telling.keep([one.name for one in result.monitors], began, now)
         self.telling.told(outcome, NOWHERE)
+        self.trials.take(result, outcome)
         anew = None if before is None or blocked else _topics(_replaced(before, result))
         self._taken(message, began, anew)
 
@@ -121,11 +126,13 @@ class Middle:
         self.look_again()
         held: list[str] = []
         if self.monitors is not None:
-            switches = {one.name: self._switches.get(one.name, True) for one in self.monitors.monitors}
+            both = (*self.monitors.monitors, *self.monitors.tried)
+            switches = {one.name: self._switches.get(one.name, True) for one in both}
             switched = _topics(self.monitors.switch(switches, self.now()))
             anew = None if anew is None else anew | switched
             held = [monitor.name for monitor in self.monitors.monitors if monitor.held]
         self.schedule()
+        self.trials.schedule()
         self._changed(anew)
         self._reporter.send(SpecificationsTaken(message.revision, began, held, message.statement))
 
@@ -145,6 +152,7 @@ class Middle:
             switched = self.monitors.switch({name: enabled}, self.now())
             if switched:
                 self.schedule()
+                self.trials.schedule()
                 self._changed(_topics(switched))
 
     def resume(self, name: str) -> frozenset[str]:
@@ -174,17 +182,26 @@ class Middle:
 
     def objection(self, topic: str, header: Mapping[str, str]) -> str:
         """Why a publisher's messages cannot be understood by the monitors of its topic; empty when they can."""
-        name = self.monitors.type_of(topic) if self.monitors is not None else None
-        if self.monitors is None or name is None:
+        monitors = self.monitors
+        name = monitors.type_of(topic, tried=True) if monitors is not None else None
+        if monitors is None or name is None:
             return ""
-        return _other_definition(topic, name, self.monitors.md5sum(name), header)
+        objection = _other_definition(topic, name, monitors.md5sum(name), header)
+        return self._objection(topic, objection, monitors.type_of(topic) is None)
 
     def service_objection(self, service: str, header: Mapping[str, str]) -> str:
         """The same of a service, by the header it answers with."""
-        name = self.monitors.service_type_of(service) if self.monitors is not None else None
-        if self.monitors is None or name is None:
+        monitors = self.monitors
+        name = monitors.service_type_of(service, tried=True) if monitors is not None else None
+        if monitors is None or name is None:
             return ""
-        return _other_definition(service, name, self.monitors.definitions.service_md5sum(name), header)
+        objection = _other_definition(service, name, monitors.definitions.service_md5sum(name), header)
+        return self._objection(service, objection, monitors.service_type_of(service) is None)
+
+    def _objection(self, resource: str, objection: str, only_tried: bool) -> str:
+        """Those on trial object to nothing: they are not given what they do not understand."""
+        self.trials.understand(resource, objection)
+        return "" if only_tried else objection
 
     def header_of(self, topic: str) -> dict[str, str] | None:
         """The connection header, without names, for what monitors publish on a topic; None if none does."""
@@ -221,24 +238,29 @@ class Middle:
         self.look_again()
         self.spent = 0.0
         self.telling.tick(self.now())
+        self.trials.tick()
         self.observations.tick()
 
     def close(self) -> None:
         """The relay ends."""
         self._compiler.close()
+        self.trials.close()
         if self._timer is not None:
             self._timer.cancel()
 
     # --- inside ---
 
     def _rows(self) -> list[MonitorRow]:
-        return self.telling.rows(self.monitors.monitors, self.now()) if self.monitors is not None else []
+        if self.monitors is None:
+            return []
+        rows = self.telling.rows(self.monitors.monitors, self.now())
+        return rows + self._on_trial.rows(self.monitors.tried, self.now())
 
     def _service(self, place: Place, part: str, body: bytes) -> Judged:
         service = place.resource
         if self.blocked:
             return Judged(b"", self.blocked)
-        if self.monitors is None or self.monitors.service_type_of(service) is None:
+        if self.monitors is None or self.monitors.service_type_of(service, tried=True) is None:
             return Judged(body)
         if self.spent > LONGEST:
             return Judged(b"", TOO_LONG)
@@ -249,6 +271,8 @@ class Middle:
             outcome = self.monitors.process_service(service, part, bytearray(body), now)
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
             outcome = dropped(view, now, self.telling.defect(error, place, now))
+        if self.monitors.tapped:
+            self.trials.wait(place, None)
         self.telling.told(outcome, place)
         self.spent += time.thread_time() - began
         self.schedule()
@@ -301,12 +325,17 @@ def _topics(monitors: Iterable[Monitor]) -> frozenset[str]:
 
 def _replaced(before: MonitorSet, after: MonitorSet) -> list[Monitor]:
     """The monitors of both sets that do not go on as they were."""
-    kept = {monitor.name for monitor in after.monitors} - set(after.began)
+    kept = {one.name for one in after.monitors} & {one.name for one in before.monitors} - set(after.began)
     return [one for each in (before, after) for one in each.monitors if one.name not in kept]
 
 
 def _same(one: SpecificationsStated, other: SpecificationsStated) -> bool:
-    return (one.files, one.definitions, one.on_fault) == (other.files, other.definitions, other.on_fault)
+    return (one.files, one.definitions, one.on_fault, one.trials) == (
+        other.files,
+        other.definitions,
+        other.on_fault,
+        other.trials,
+    )
 
 
 def _other_definition(resource: str, name: str, md5sum: str, header: Mapping[str, str]) -> str:

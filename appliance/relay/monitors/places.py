@@ -26,18 +26,26 @@ NOWHERE = Place("", "")
 
 
 class Sighting:
-    """One message of a publication: where it is in its passage, and how it began when it came, if it has a header."""
+    """One message of a publication: where it is in its passage, and how it began when it came, if it has a header.
+
+    When the passage is over (None), `position` is its number.
+    """
 
     __slots__ = ("_head", "_passage", "_position")
 
-    def __init__(self, passage: Passage, position: int, head: bytes) -> None:
+    def __init__(self, passage: Passage | None, position: int, head: bytes) -> None:
         self._passage = passage
         self._position = position
         self._head = head
 
+    def at(self, number: int) -> "Sighting":
+        """The same for when the passage is over; the number of the message is known."""
+        return Sighting(None, number, self._head)
+
     def detail(self) -> Mapping[str, Any]:
         """Its number among those of its publication that this relay received; seq and stamp if it has a header."""
-        detail: dict[str, Any] = {"number": self._passage.number_at(self._position)}
+        passage, position = self._passage, self._position
+        detail: dict[str, Any] = {"number": passage.number_at(position) if passage is not None else position}
         if len(self._head) == HEAD:
             detail["seq"], seconds, nanoseconds = _HEADER.unpack(self._head)
             detail["stamp"] = f"{seconds}.{nanoseconds:09}"

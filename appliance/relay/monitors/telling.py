@@ -23,14 +23,21 @@ class _Counters:
     verdicts: int = 0
     drops: int = 0
     changes: int = 0
+    missed: int = 0
 
 
 class Telling:
-    """Counts what monitors do, and tells the first of each second in full. `publish` sends what they publish."""
+    """Counts what monitors do, and tells the first of each second in full. `publish` sends what they publish.
 
-    def __init__(self, observations: Observations, publish: Callable[[Published], None]) -> None:
+    What those on trial would have done is told in kinds of its own, with `prefix`.
+    """
+
+    def __init__(
+        self, observations: Observations, publish: Callable[[Published], None], prefix: str = ""
+    ) -> None:
         self._observations = observations
         self._publish = publish
+        self._prefix = prefix
         self._counters: dict[str, _Counters] = {}
         self._happened: dict[tuple[str, ...], int] = {}
         self._again: dict[tuple[tuple[str, ...], Place], int] = {}
@@ -67,7 +74,7 @@ class Telling:
         self._faults(outcome, place, sighting)
         for line in outcome.log:
             self._observations.note(
-                "log",
+                f"{self._prefix}log",
                 line.monitor,
                 place,
                 outcome.time,
@@ -78,7 +85,7 @@ class Telling:
             )
         for published in outcome.published:
             self._observations.note(
-                "publish",
+                f"{self._prefix}publish",
                 published.monitor,
                 place._replace(key="", resource=published.topic),
                 outcome.time,
@@ -90,20 +97,19 @@ class Telling:
             )
             self._publish(published)
 
-    def changed_again(self, outcome: Outcome, place: Place) -> None:
-        """A change at a place where one has been shown in this second: it is counted."""
-        key = (tuple(outcome.changed_by), place)
-        self._again[key] = self._again.get(key, 0) + 1
-
     def changed(
         self, outcome: Outcome, place: Place, before: bytes, size: int, sighting: Sighting | None = None
     ) -> None:
-        """Tell a change with the bytes before and after."""
+        """Tell a change with the bytes before and after; where one has been shown in this second it is counted."""
+        if place in self._shown:
+            key = (tuple(outcome.changed_by), place)
+            self._again[key] = self._again.get(key, 0) + 1
+            return
         self._shown.add(place)
         monitors = self._count_change(outcome.changed_by, 1)
         together = _together(outcome.changed_by)
         self._observations.note(
-            "change",
+            f"{self._prefix}change",
             monitors[-1],
             place,
             outcome.time,
@@ -123,7 +129,7 @@ class Telling:
         """Tell a drop."""
         self._counter(outcome.dropped_by).drops += 1
         self._observations.note(
-            "drop",
+            f"{self._prefix}drop",
             outcome.dropped_by,
             place,
             outcome.time,
@@ -138,9 +144,23 @@ class Telling:
         """Tell an exception that no action of a monitor explains; its words."""
         text = f"a defect of rosrv, please report it: {type(error).__name__}: {error}"
         self._observations.note(
-            "fault", "", place, time, text, distinction=type(error).__name__, sighting=sighting
+            f"{self._prefix}fault", "", place, time, text, distinction=type(error).__name__, sighting=sighting
         )
         return text
+
+    def missed(
+        self, monitor: str, place: Place, time: int, text: str, sighting: Sighting | None = None
+    ) -> None:
+        """Tell that a monitor on trial was not given a message as others would be."""
+        self._counter(monitor).missed += 1
+        self._observations.note(
+            f"{self._prefix}missed", monitor, place, time, text, distinction=text, sighting=sighting
+        )
+
+    @property
+    def incomplete(self) -> frozenset[str]:
+        """The monitors that missed something."""
+        return frozenset(name for name, counters in self._counters.items() if counters.missed)
 
     def tick(self, time: int) -> None:
         """A second is over: sum up."""
@@ -157,7 +177,7 @@ class Telling:
             monitors = self._count_change(events, count)
             together = _together(events)
             self._observations.add(
-                "change",
+                f"{self._prefix}change",
                 monitors[-1],
                 place,
                 time,
@@ -184,7 +204,9 @@ class Telling:
                 self._happened[events] = self._happened.get(events, 0) + count.happened
                 if count.dropped:
                     self._counter(monitor).drops += count.dropped
-                    self._observations.add("drop", monitor, place, count.last_drop, count.dropped)
+                    self._observations.add(
+                        f"{self._prefix}drop", monitor, place, count.last_drop, count.dropped
+                    )
             for writers, messages in changed.items():
                 self._again[writers, place] = self._again.get((writers, place), 0) + messages
         self._owed.clear()
@@ -207,6 +229,8 @@ class Telling:
             counters.drops,
             counters.changes,
             monitor.faults,
+            bool(self._prefix),
+            counters.missed,
         )
 
     def _verdicts(self, outcome: Outcome, place: Place, sighting: Sighting | None) -> None:
@@ -214,7 +238,7 @@ class Telling:
             self._counter(verdict.monitor).verdicts += 1
             name = f"property {verdict.property + 1} of {verdict.monitor} ({verdict.logic})"
             self._observations.note(
-                "verdict",
+                f"{self._prefix}verdict",
                 verdict.monitor,
                 place,
                 outcome.time,
@@ -235,7 +259,7 @@ class Telling:
         for fault in outcome.faults:
             where = fault.position
             self._observations.note(
-                "fault",
+                f"{self._prefix}fault",
                 fault.monitor,
                 place,
                 outcome.time,

@@ -1,0 +1,179 @@
+"""Specifications on trial, beside the traffic: they are given copies of messages that have gone on.
+
+Invariants:
+- Nothing that they do reaches a message, a subscriber or a monitor in force; what they would have done is told.
+- They take at most `SHARE` of the processor's time, in slices between which the loop goes on, and at most `_MOST_BYTES`
+  wait for them.
+- What is beyond that they are not given, and that is told: they are incomplete then, and so is one that was given a
+  message on which it spent more than it may.
+- Ticks and deadlines happen after the messages that came before them.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+from appliance.relay.loop import Loop, Timer
+from appliance.relay.monitors.places import NOWHERE, Place, Sighting
+from appliance.relay.monitors.telling import Telling
+from appliance.rosmop.engine import TRIAL_BUDGET, MonitorSet, Tapped
+from appliance.rosmop.outcomes import Outcome
+
+SHARE = 0.2
+"""Seconds of processor time in a second."""
+
+_SLICE = 0.002  # seconds of processor time
+_LAST_SLICE = 0.02  # before what they know is taken over
+_MOST_WAITING = 2000  # messages
+_MOST_BYTES = 8 << 20
+
+_TOO_SLOW = f"monitors on trial take more than {SHARE:.0%} of a processor; this one did not see all messages"
+_TOO_MANY = "more messages wait for monitors on trial than can be kept; this one did not see all"
+_TOO_LONG = f"more than {TRIAL_BUDGET} instructions for one message, which a monitor on trial may not take"
+
+
+class _Waiting(NamedTuple):
+    tapped: Tapped
+    place: Place
+    sighting: Sighting | None
+
+
+class Trials:
+    """What waits for the specifications on trial, and when they have their turn."""
+
+    def __init__(self, loop: Loop, now: Callable[[], int], telling: Telling) -> None:
+        self._loop = loop
+        self._now = now
+        self._telling = telling
+        self._monitors: MonitorSet | None = None
+        self._waiting: deque[_Waiting] = deque()
+        self._bytes = 0
+        self._spent = 0.0
+        self._foreign: set[str] = set()
+        self._timer: Timer | None = None
+        self._stopped = False
+
+    # --- which there are ---
+
+    def settle(self) -> frozenset[str]:
+        """Give what waits, as others take over; those that are incomplete."""
+        self._turn(_LAST_SLICE)
+        for waiting in self._waiting:
+            self._miss(waiting.tapped.trial, waiting.place, _TOO_SLOW)
+        self._waiting.clear()
+        self._bytes = 0
+        return self._telling.incomplete
+
+    def take(self, monitors: MonitorSet, outcome: Outcome) -> None:
+        """These have taken over, and this came of their beginning."""
+        self._monitors = monitors
+        self._telling.keep([one.name for one in monitors.tried], list(monitors.began), self._now())
+        for tried in outcome.tried:
+            self._telling.told(tried, NOWHERE)
+        self.schedule()
+
+    def understand(self, resource: str, objection: str) -> None:
+        """Whether the messages of a topic or service can be understood, and why not."""
+        if not objection:
+            self._foreign.discard(resource)
+            return
+        self._foreign.add(resource)
+        for trial in self._monitors.trials if self._monitors is not None else ():
+            if trial.wants(resource) or trial.service_type_of(resource) is not None:
+                self._miss(trial, Place("", resource), objection)
+
+    # --- what they are given ---
+
+    def wait(self, place: Place, sighting: Sighting | None) -> None:
+        """A message is on its way and was copied: it is given when it has gone on."""
+        assert self._monitors is not None  # noqa: S101  they have copied it
+        idle = not self._waiting
+        for tapped in self._monitors.tapped:
+            if tapped.resource in self._foreign:
+                continue
+            if len(self._waiting) >= _MOST_WAITING or self._bytes + len(tapped.data) > _MOST_BYTES:
+                self._miss(tapped.trial, place, _TOO_MANY, sighting)
+                continue
+            self._waiting.append(_Waiting(tapped, place, sighting))
+            self._bytes += len(tapped.data)
+        self._monitors.tapped.clear()
+        if idle and self._waiting:
+            self.schedule()
+
+    def tick(self) -> None:
+        """A second is over."""
+        self._spent, self._stopped = 0.0, False
+        self._telling.tick(self._now())
+        self.schedule()
+
+    def close(self) -> None:
+        """The relay ends."""
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def schedule(self) -> None:
+        """See that they have their turn when messages wait, or something is due."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        due = self._due()
+        if self._waiting:
+            self._timer = self._loop.after(0, self._have_turn)
+        elif due is not None and self._spent <= SHARE and not self._stopped:
+            self._timer = self._loop.after(max(0, due - self._now()) / 1e9, self._have_turn)
+
+    def _due(self) -> int | None:
+        trials = self._monitors.trials if self._monitors is not None else ()
+        return min((trial.next_due for trial in trials if trial.next_due is not None), default=None)
+
+    def _have_turn(self) -> None:
+        self._timer = None
+        self._turn(_SLICE)
+        self.schedule()
+
+    def _turn(self, longest: float) -> None:
+        began = last = time.thread_time()
+        while self._waiting and last - began < longest:
+            waiting = self._waiting.popleft()
+            self._bytes -= len(waiting.tapped.data)
+            if self._spent > SHARE:
+                self._miss(waiting.tapped.trial, waiting.place, _TOO_SLOW, waiting.sighting)
+            else:
+                self._give(waiting)
+            now = time.thread_time()
+            self._spent += now - last
+            last = now
+        if not self._waiting and self._spent <= SHARE and not self._stopped:
+            self._advance()
+            self._spent += time.thread_time() - last
+
+    def _give(self, waiting: _Waiting) -> None:
+        (trial, _, _, data, _), place, sighting = waiting
+        telling, view = self._telling, memoryview(data)
+        try:
+            outcome = waiting.tapped.give()
+        except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
+            self._miss(trial, place, telling.defect(error, place, self._now(), sighting), sighting)
+            return
+        telling.told(outcome, place, sighting)
+        if outcome.faults and any(monitor.context.budget < 0 for monitor in trial.monitors):
+            self._miss(trial, place, _TOO_LONG, sighting)
+        elif outcome.result == "dropped":
+            telling.dropped(outcome, place, view, sighting)
+        elif outcome.result == "changed":
+            telling.changed(outcome, place, data, len(data), sighting)
+
+    def _advance(self) -> None:
+        now = self._now()
+        try:
+            for trial in self._monitors.trials if self._monitors is not None else ():
+                for outcome in trial.advance(now):
+                    self._telling.told(outcome, NOWHERE)
+        except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
+            self._telling.defect(error, NOWHERE, now)
+            self._stopped = True  # for this second
+
+    def _miss(self, trial: MonitorSet, place: Place, text: str, sighting: Sighting | None = None) -> None:
+        for monitor in trial.monitors:
+            self._telling.missed(monitor.name, place, self._now(), text, sighting)

@@ -1,0 +1,235 @@
+"""Monitors on trial in the whole relay: messages go on as if they were not there, and what they say is told as such."""
+
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.channel.messages import (
+    MonitorRow,
+    MonitorsCounted,
+    MonitorsReported,
+    PublicationRefused,
+    SpecificationsStated,
+    SpecificationsTaken,
+)
+from appliance.relay.monitors import trials
+from appliance.ros.tcpros import encode_frame, encode_header, encode_service_reply
+from tests.unit.relay.monitors.test_middle import (
+    GUARD,
+    TYPED,
+    WANTED,
+    Monitored,
+    _called,
+    data_of,
+    string,
+)
+
+
+class Trying(Monitored):
+    """A relay whose control states specifications, some of them on trial."""
+
+    def state_trials(self, *texts: str, tried: tuple[str, ...] = (), revision: int = 1) -> list[str]:
+        """State these; those that began."""
+        files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
+        self.state(SpecificationsStated(revision, files, {}, {}, False, trials=tried))
+        taken: SpecificationsTaken = self.until(lambda: self.taken(SpecificationsTaken, revision))
+        return taken.began
+
+    def row(self, name: str) -> MonitorRow:
+        """The counters of a monitor, as control was told last."""
+        self.engine._middle.observations._tell_counters()
+        self.link.catch_up()
+
+        def last() -> MonitorRow | None:
+            rows = [row for one in self.told if isinstance(one, MonitorsCounted) for row in one.rows]
+            return next((row for row in reversed(rows) if row.name == name), None)
+
+        found: MonitorRow = self.until(last)
+        return found
+
+    def kinds(self) -> set[str]:
+        """What control was told that monitors did."""
+        return {event.kind for one in self.told if isinstance(one, MonitorsReported) for event in one.events}
+
+
+@pytest.fixture
+def world() -> Iterator[Trying]:
+    """A relay with one node."""
+    world = Trying()
+    yield world
+    world.close()
+
+
+def test_what_it_would_have_done_is_told_and_not_done(world: Trying) -> None:
+    """With the messages it was about, their numbers and who said them; nothing of it is a drop or a change."""
+    assert world.state_trials(GUARD, tried=("guard",)) == ["guard"]
+    publisher, subscriber = world.typed()
+    frames = b"".join(map(string, ("a", "bad", "one", "long", "z")))
+    publisher.send(frames)
+    world.gets(subscriber, frames)
+    drop = world.event("trial drop", monitor="guard", count=0)
+    assert (drop.resource, drop.before, drop.detail["number"]) == ("/chatter", string("bad")[4:], 2)
+    assert (drop.text, drop.caller_id) == ("guard.said dropped it: no such word", "/talker")
+    change = world.event("trial change", monitor="guard", count=0)
+    assert (change.before, change.after) == (string("one")[4:], string("two")[4:])
+    assert change.detail["number"] == 3
+    assert world.event("trial log", monitor="guard").text == "no such word"
+    world.event("trial change", count=1)
+    row = world.row("guard")
+    assert (row.trial, row.enabled, row.drops, row.changes, row.missed) == (True, True, 1, 2, 0)
+    assert all(kind.startswith("trial ") for kind in world.kinds())
+
+
+def test_it_is_promoted_between_two_messages_with_its_state_and_goes_back_on_trial(world: Trying) -> None:
+    """The counters are of the trial or of what was done, never of both."""
+    world.state_trials(GUARD, tried=("guard",))
+    publisher, subscriber = world.typed()
+    publisher.send(string("bad") + string("count"))
+    world.gets(subscriber, string("bad") + string("count"))
+    assert world.state_trials(GUARD, revision=2) == []
+    publisher.send(string("bad") + string("count"))
+    world.gets(subscriber, string("4"))
+    assert world.event("drop", monitor="guard", count=0).detail["number"] == 3
+    row = world.row("guard")
+    assert (row.trial, row.drops, row.changes) == (False, 1, 1)
+    assert world.state_trials(GUARD, tried=("guard",), revision=3) == []
+    publisher.send(string("count"))
+    world.gets(subscriber, string("count"))
+    world.event("trial change")
+    assert world.row("guard").trial
+    assert world.state_trials(GUARD, revision=4) == []
+    publisher.send(string("count"))
+    world.gets(subscriber, string("6"))
+
+
+def test_messages_that_wait_are_given_before_it_is_promoted(world: Trying) -> None:
+    """So what it has seen is complete."""
+    world.state_trials(GUARD, tried=("guard",))
+    publisher, subscriber = world.typed()
+    middle = world.engine._middle
+    have_turn = middle.trials._have_turn
+    middle.trials._have_turn = lambda: None  # type: ignore[method-assign]  # it never has its turn
+    publisher.send(string("a") * 3)
+    world.gets(subscriber, string("a") * 3)
+    assert len(middle.trials._waiting) == 3
+    middle.trials._have_turn = have_turn  # type: ignore[method-assign]
+    assert world.state_trials(GUARD, revision=2) == []
+    publisher.send(string("count"))
+    world.gets(subscriber, string("4"))
+
+
+def test_a_loop_without_end_delays_and_drops_nothing(world: Trying) -> None:
+    """It ends at a tenth of what others may take, and what it saw is not complete: it begins anew when promoted."""
+    world.state_trials(GUARD, tried=("guard",))
+    publisher, subscriber = world.typed()
+    for _ in range(20):
+        publisher.send(string("loop") + string("bad"))
+    world.gets(subscriber, (string("loop") + string("bad")) * 20)
+    assert "more than 100000 instructions" in world.event("trial fault", monitor="guard", count=0).text
+    assert "may not take" in world.event("trial missed", monitor="guard", count=0).text
+    assert world.row("guard").missed
+    assert world.state_trials(GUARD, revision=2) == ["guard"]
+    publisher.send(string("count"))
+    world.gets(subscriber, string("1"))
+
+
+def test_trials_have_a_share_of_the_processor_and_no_more(
+    world: Trying, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is beyond it they are not given; messages go on."""
+    world.state_trials(GUARD, tried=("guard",))
+    publisher, subscriber = world.typed()
+    thread_time, more = time.thread_time, [0.0]
+
+    def slow() -> float:
+        more[0] += 0.03
+        return thread_time() + more[0]
+
+    monkeypatch.setattr("appliance.relay.monitors.trials.time.thread_time", slow)
+    monkeypatch.setattr(trials.Trials, "tick", lambda _self: None)  # the second is not over
+    publisher.send(string("a") * 100)
+    world.gets(subscriber, string("a") * 100)
+    world.until(lambda: not world.engine._middle.trials._waiting)
+    monkeypatch.undo()
+    world.engine._middle.trials.tick()
+    row = world.row("guard")
+    assert row.events + row.missed == 100
+    assert 0 < row.events < 10
+    assert "take more than 20%" in world.event("trial missed", count=0).text
+
+
+def test_what_waits_is_bounded(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More messages than can be kept are missed by the trial, not by the subscriber."""
+    monkeypatch.setattr(trials, "_MOST_WAITING", 5)
+    world.state_trials(GUARD, tried=("guard",))
+    publisher, subscriber = world.typed()
+    publisher.send(string("a") * 30)
+    world.gets(subscriber, string("a") * 30)
+    assert "more messages wait" in world.event("trial missed", count=0).text
+
+
+def test_a_defect_in_it_ends_no_message(world: Trying) -> None:
+    """An exception that no action explains is told, and the relay goes on."""
+    world.state_trials(GUARD, tried=("guard",))
+    publisher, subscriber = world.typed()
+    assert world.engine._middle.monitors is not None
+    (trial,) = world.engine._middle.monitors.trials
+    trial._steps = {"/chatter": (None,)}  # type: ignore[dict-item]
+    publisher.send(string("a"))
+    world.gets(subscriber, string("a"))
+    assert "a defect of rosrv" in world.event("trial fault").text
+    assert world.row("guard").missed == 1
+
+
+def test_a_publisher_with_another_definition_is_not_refused_for_its_sake(world: Trying) -> None:
+    """It is not given what it would not understand, and that is told."""
+    world.state_trials(GUARD, tried=("guard",))
+    publisher, subscriber = world.subscribed()
+    publisher.send(string("bad"))
+    world.gets(subscriber, string("bad"))
+    assert "std_msgs/String" in world.event("trial missed", monitor="guard").text
+    assert not [one for one in world.told if isinstance(one, PublicationRefused)]
+    assert not world.row("guard").events
+    world.state_trials(GUARD, revision=2)
+    world.hears(PublicationRefused, key="k", resource="/chatter")
+    world.ends(publisher)
+
+
+def test_it_hears_a_topic_that_nobody_subscribes_to_and_its_ticks(world: Trying) -> None:
+    """As an enabled one does; and what it would have published nobody gets."""
+    text = """s() { std_msgs::String said; event e(std::string t) /chatter std_msgs/String '{data:t}' {
+        said.data = t; PUBLISH(/alarm, std_msgs/String, said); } event tick() every 10ms { ROS_INFO("tick"); } }"""
+    world.state_trials(text, tried=("s",))
+    publisher = world.upstream(TYPED)
+    publisher.send(string("fire"))
+    published = world.event("trial publish", monitor="s")
+    assert (published.resource, published.after) == ("/alarm", string("fire")[4:])
+    assert world.event("trial log", monitor="s").text == "tick"
+
+
+def test_requests_and_replies_pass_as_they_are(world: Trying) -> None:
+    """What it would have refused is told."""
+    text = """s() { event ask(bool on) service /mode std_srvs/SetBool request '{data:on}' { if (on) { return; } }
+        event told(std::string m) service /mode std_srvs/SetBool response '{message:m}' { m = "changed"; } }"""
+    world.state_trials(text, tried=("s",))
+    client, service = _called(world)
+    client.send(encode_frame(b"\x01"))
+    world.gets(service, encode_frame(b"\x01"))
+    reply = encode_service_reply(b"\x01" + string("as it was")[4:])
+    service.send(reply)
+    world.gets(client, reply)
+    assert world.event("trial drop", monitor="s").resource == "/mode"
+    assert world.event("trial change", monitor="s").resource == "/mode"
+    assert data_of(client) == b""
+
+
+def test_a_late_subscriber_of_a_latched_topic_gets_what_was_said(world: Trying) -> None:
+    """Nothing is kept back on trial; once it is promoted, the last message is as it was when it came."""
+    world.state_trials(GUARD, tried=("guard",))
+    publisher = world.upstream(TYPED | {"latching": "1"})
+    publisher.send(string("one"))
+    world.event("trial change")
+    subscriber = world.connect(encode_header(WANTED))
+    world.gets_header(subscriber)
+    world.gets(subscriber, string("one"))
