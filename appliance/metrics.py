@@ -75,7 +75,7 @@ METRICS = (
         ("kind", "monitor"),
         "what monitors did: verdict, drop, change, fault, log, publish; what several changed counts for each",
     ),
-    Metric("rosrv_monitors", "gauge", ("state",), "monitors: enabled, disabled, holding, failing"),
+    Metric("rosrv_monitors", "gauge", ("state",), "monitors: enabled, trial, disabled, holding, failing"),
     Metric("rosrv_nodes", "gauge", ("state",), "nodes: live, or lost and awaited"),
     Metric("rosrv_registrations", "gauge", ("kind",), "registrations of live nodes"),
     Metric("rosrv_rosmaster_reachable", "gauge", (), "1 while the real ROS Master answers"),

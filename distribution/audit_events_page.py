@@ -52,6 +52,7 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
     ),
     "monitor published": (*_MONITOR, "because_of"),
     "message changed": (*_MONITOR, "changed_by"),
+    "trial observed": (*_MONITOR, "changed_by", "trial", "would"),
 }  # fmt: skip
 
 _HEAD = """\

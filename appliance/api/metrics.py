@@ -120,7 +120,8 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         "rosrv_monitor_events_total": [((kind, name), count) for kind, name, count in body.monitors],
         "rosrv_monitors": [
             (("enabled",), monitors.enabled),
-            (("disabled",), monitors.loaded - monitors.enabled),
+            (("trial",), len(monitors.trials)),
+            (("disabled",), monitors.loaded - monitors.enabled - len(monitors.trials)),
             (("holding",), len(monitors.held)),
             (("failing",), len(monitors.failing)),
         ],

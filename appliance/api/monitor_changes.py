@@ -160,7 +160,10 @@ def _add_switches(router: Routes, control: ControlLink) -> None:
     async def switch_monitor(
         name: OneName, to: Annotated[Switch, body(Switch)], bearer: Operator, if_match: IfMatch = None
     ) -> Tagged[Switched]:
-        """Enable or disable a monitor, or let the topics that it holds go on (`{"held": false}`)."""
+        """Enable or disable a monitor, put it on trial (`{"trial": true}`) or bring it from there into force (`false`).
+
+        `{"held": false}` lets the topics that it holds go on.
+        """
         return await _switched(control, [name], to, _expected(if_match), bearer)
 
     @router.patch("", operation_id="switch_monitors", responses=_CHANGES | UNKNOWN)
@@ -207,6 +210,8 @@ async def _switched(
     order: AdminRequest[Switched] = admin.MonitorResume(names, expected)
     if to.enabled is not None:
         order = admin.MonitorSwitch(names, to.enabled, expected)
+    elif to.trial is not None:
+        order = admin.MonitorTrial(names, to.trial, expected)
     done = await _ordered(control, order, bearer)
     return Tagged(done, done.tag)
 

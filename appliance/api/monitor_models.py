@@ -132,15 +132,18 @@ class Replaced(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is to become of a monitor: exactly one of both."""
+    """What is to become of a monitor: exactly one of the three."""
 
     enabled: bool | None = None
     held: Annotated[bool | None, told("false: let its topics go on")] = None
+    trial: Annotated[
+        bool | None, told("true: on trial, it does nothing; false: bring it from its trial into force")
+    ] = None
 
     def __post_init__(self) -> None:
         """Raises `ValueError`."""
-        if (self.enabled is None) is (self.held is None) or self.held is True:
-            raise ValueError("either `enabled` (true or false), or `held` (false)")
+        if [self.enabled, self.held, self.trial].count(None) != 2 or self.held is True:
+            raise ValueError("one of `enabled` (true or false), `trial` (true or false) and `held` (false)")
 
 
 class SwitchMany(Switch, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -39,6 +39,9 @@ EVENTS: dict[str, str] = {
     "specifications refused": "Specifications have errors and were refused whole; those before stay in force.",
     "monitor enabled": "A monitor was switched on; `detail` has who.",
     "monitor disabled": "A monitor was switched off: messages pass it untouched; `detail` has who.",
+    "monitor on trial": "A monitor is on trial: it is given copies of messages, and does nothing; `detail` has who.",
+    "trial observed": "What a monitor on trial would have done; `detail.would` is drop, change, verdict, fault, log,"
+    " publish, or `missed`: what it was not given.",
     "monitor resumed": "The topics that a monitor held after a restart go on; `detail` has who.",
     "monitors restarted": "A new relay process: monitors began in their initial state, some hold their topics.",
     "monitor verdict": "A property of a monitor is in a category that is handled; `detail` has logic and category.",

@@ -117,6 +117,8 @@ KINDS: dict[str, Kind] = {
     "specifications refused": Kind(ENTITY, _UPDATE, _REJECTED, "Specifications"),
     "monitor enabled": Kind(ENTITY, _ENABLE, about="Monitor"),
     "monitor disabled": Kind(ENTITY, _DISABLE, about="Monitor"),
+    "monitor on trial": Kind(ENTITY, _UPDATE, about="Monitor"),
+    "trial observed": Kind(FINDING, _FOUND, _LOGGED),
     "monitor resumed": Kind(ENTITY, _RESUME, about="Monitor"),
     "monitors restarted": Kind(LIFECYCLE, _RESTART),
     "monitor verdict": Kind(FINDING, _FOUND, _DETECTED),

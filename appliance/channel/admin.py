@@ -196,6 +196,14 @@ class MonitorSwitch(AdminRequest[monitors.Switched], frozen=True, tag="monitor s
     expected: str | None = None
 
 
+class MonitorTrial(AdminRequest[monitors.Switched], frozen=True, tag="monitor trial"):
+    """Put these monitors on trial, or (false) bring those that are on trial into force."""
+
+    names: list[str]
+    trial: bool
+    expected: str | None = None
+
+
 class MonitorResume(AdminRequest[monitors.Switched], frozen=True, tag="monitor resume"):
     """Let the topics that these monitors hold go on."""
 
@@ -205,7 +213,7 @@ class MonitorResume(AdminRequest[monitors.Switched], frozen=True, tag="monitor r
 
 MonitorChange = (
     MonitorLoad | MonitorReplace | MonitorReload | MonitorRemove | MonitorRollback | MonitorConfirm | MonitorSwitch
-    | MonitorResume
+    | MonitorTrial | MonitorResume
 )  # fmt: skip
 
 

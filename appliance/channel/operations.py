@@ -71,6 +71,8 @@ OPERATIONS = (
     Operation(admin.MonitorRemove, "admin", "DELETE", "/v1/monitors/{names}", _WITHIN),
     Operation(admin.MonitorSwitch, "operator", "PATCH", "/v1/monitors"),
     Operation(admin.MonitorSwitch, "operator", "PATCH", "/v1/monitors/{names}"),
+    Operation(admin.MonitorTrial, "operator", "PATCH", "/v1/monitors"),
+    Operation(admin.MonitorTrial, "operator", "PATCH", "/v1/monitors/{names}"),
     Operation(admin.MonitorResume, "operator", "PATCH", "/v1/monitors", says={"held": False}),
     Operation(admin.MonitorResume, "operator", "PATCH", "/v1/monitors/{names}", says={"held": False}),
     Operation(admin.LogSealed, "operator"),

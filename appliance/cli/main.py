@@ -72,7 +72,12 @@ VERBS: dict[str, Verb | Group] = {
                 "Show every monitor: enabled or not, what it listens to, what it did.",
             ),
             "enable": Verb(
-                "appliance.cli.monitor.running:enable", "Let the events of these monitors happen again."
+                "appliance.cli.monitor.running:enable",
+                "Let the events of these monitors happen again, or first on trial.",
+            ),
+            "promote": Verb(
+                "appliance.cli.monitor.running:promote",
+                "Bring monitors that are on trial into force, with the state that they have.",
             ),
             "disable": Verb(
                 "appliance.cli.monitor.running:disable",

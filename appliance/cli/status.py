@@ -111,6 +111,8 @@ def _show(body: Status, troubles: list[str]) -> None:
     monitors = body.monitors
     loaded = counted(monitors.loaded, "monitor")
     shown = f"revision {monitors.revision}, {monitors.enabled} of {loaded} enabled"
+    if monitors.trials:
+        shown += f", {len(monitors.trials)} on trial"
     if monitors.differs_from_folder:
         shown += f"; loaded by {monitors.who}, not what the folder has"
     grid.add_row("monitors", shown)

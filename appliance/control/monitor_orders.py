@@ -127,6 +127,13 @@ class MonitorOrders:
         )
         return answers.Switched(names, self._monitors.revision, self._monitors.tag)
 
+    async def trial(self, request: admin.MonitorTrial, who: str) -> answers.Switched:
+        """Put monitors on trial, or bring them into force."""
+        order = self._monitors.try_out if request.trial else self._monitors.promote
+        names = await order(request.names, who=who, expected=request.expected)
+        began = self._monitors.began(names)
+        return answers.Switched(names, self._monitors.revision, self._monitors.tag, began)
+
     async def resume(self, request: admin.MonitorResume, who: str) -> answers.Switched:
         """Let topics go on that monitors hold."""
         names = await self._monitors.resume(request.names, who=who, expected=request.expected)
@@ -145,11 +152,12 @@ def monitors_status(monitors: Monitors) -> MonitorsState:
         loaded=len(rows),
         enabled=sum(row.enabled for row in rows),
         held=[row.name for row in rows if row.held],
-        failing=[row.name for row in rows if row.failing],
+        failing=[row.name for row in rows if row.failing and not row.trial],
         refused=monitors.refused,
         who=monitors.who,
         differs_from_folder=monitors.differs_from_folder,
         confirm_by=monitors.confirm_by,
+        trials=[row.name for row in rows if row.trial],
     )
 
 
@@ -160,6 +168,8 @@ def states_of(monitors: Monitors) -> list[answers.MonitorState]:
 
 def _state(monitors: Monitors, name: str) -> answers.MonitorState:
     row, checked = monitors.rows.get(name), monitors.checked
+    drops, changes = (row.drops, row.changes) if row is not None else (0, 0)
+    tried = row is not None and row.trial
     return answers.MonitorState(
         name=name,
         file=checked.monitors[name],
@@ -170,8 +180,12 @@ def _state(monitors: Monitors, name: str) -> answers.MonitorState:
         services=sorted(checked.services[name]),
         events=row.events if row is not None else 0,
         verdicts=row.verdicts if row is not None else 0,
-        drops=row.drops if row is not None else 0,
-        changes=row.changes if row is not None else 0,
+        drops=0 if tried else drops,
+        changes=0 if tried else changes,
         faults=row.faults if row is not None else 0,
         certificates=checked.certificates.get(name, []),
+        trial=monitors.on_trial(name),
+        would_drop=drops if tried else 0,
+        would_change=changes if tried else 0,
+        missed=row.missed if row is not None else 0,
     )

@@ -7,6 +7,9 @@ and say everything that is wrong with them. The relay compiles them again and ha
 Switches survive restarts, too: a monitor that nobody has switched is enabled or not as `--enable` says. A switch goes
 with its monitor: another that is loaded later under the same name is as if nobody had switched it.
 
+A monitor is enabled, disabled or on trial. Those that share variables are on trial together (apart from disabled ones):
+one that is loaded joins those that are, and no load and no switch takes one that is in force along.
+
 A reload takes what the folder has, and leaves what the folder does not have in force unless it is told to remove that:
 nobody's protection ends because a file is not where it was.
 
@@ -32,6 +35,7 @@ from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.fingerprints import fingerprint_of_all
+from appliance.rosmop.engine import sharing
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.files import (
     Checked,
@@ -42,7 +46,7 @@ from appliance.specifications.files import (
 from appliance.specifications.folder import SpecificationFolder
 from appliance.specifications.observed import MonitorRecords
 from appliance.specifications.relays import Relays
-from appliance.specifications.stating import Revision, Stating
+from appliance.specifications.stating import TRIAL, Revision, Stating, Switch
 from appliance.store.revisions import Trial, UnknownRevisionError, wanted
 from appliance.store.state import MonitorRevisionRow, StateStore
 
@@ -96,7 +100,7 @@ class Replaced:
 class Kept(Sources, frozen=True):
     """A revision as it is in the store; `switches` are those of its monitors when it was replaced."""
 
-    switches: dict[str, bool] = {}  # noqa: RUF012  each struct gets one of its own
+    switches: dict[str, Switch] = {}  # noqa: RUF012  each struct gets one of its own
 
 
 class Monitors:
@@ -127,8 +131,9 @@ class Monitors:
         self.site_keys = site_keys
         self._store = store
         self._trail = trail
-        self._stating = Stating(allocation, trail, on_fault, self.enabled, relays)
-        self._switches: dict[str, bool] = {}
+        self._stating = Stating(allocation, trail, on_fault, self._states_of, relays)
+        self._switches: dict[str, Switch] = {}
+        self._states: dict[str, Switch] = {}  # of those in force
         self._acts = 0  # switches and resumptions, ever
         self._changing = asyncio.Lock()
         self._trial = Trial(store, "confirm monitors", self._go_back, (SpecificationsRefusedError,))
@@ -211,9 +216,16 @@ class Monitors:
         return self._trial.confirm_by
 
     def enabled(self, name: str) -> bool:
-        """Whether a monitor's events happen."""
-        default = self._enable == "all" or (self._enable != "none" and name in self._named())
-        return self._switches.get(name, default)
+        """Whether what a monitor does is done."""
+        return self._states.get(name) is True
+
+    def on_trial(self, name: str) -> bool:
+        """Whether a monitor is given copies, and what it would do is only told."""
+        return self._states.get(name) == TRIAL
+
+    def began(self, names: Sequence[str]) -> list[str]:
+        """Those of these monitors that are in their initial state since the last change."""
+        return self._stating.began(names)
 
     def names(self) -> list[str]:
         """All monitors, in the order in which they see messages."""
@@ -345,29 +357,74 @@ class Monitors:
     async def switch(
         self, names: list[str], enabled: bool, *, who: str, expected: str | None = None
     ) -> list[str]:
-        """Enable or disable monitors; those that were not so already. Raises `UnknownMonitorError`."""
+        """Enable or disable monitors; those that were not so already.
+
+        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for one that is to be enabled but is on trial, or
+        shares variables with one that is.
+        """
         async with self._changing:
             self._expect(expected)
             self._all_known(names)
-            changed = [name for name in dict.fromkeys(names) if self.enabled(name) is not enabled]
-            if changed:
-                await self._count()
-            for name in changed:
-                self._switches[name] = enabled
-                self._stating.tell(name, messages.MonitorSwitched(name, enabled))
-                word = "enabled" if enabled else "disabled"
-                self._trail.happened(
-                    f"monitor {word}",
-                    f"{name} is {word}",
-                    severity=Severity.NOTICE,
-                    category="monitor",
-                    resource=name,
-                    who=who,
-                )
-            if changed:
-                self._store.save_setting(_SWITCHES, json.dumps(self._switches))
-                await self._store.settled()
+            tried = [name for name in names if enabled and self.on_trial(name)]
+            if tried:
+                text = f"{', '.join(tried)} is on trial: rosrv monitor promote brings it into force"
+                raise SpecificationsRefusedError([text])
+            return await self._switch(names, enabled, who)
+
+    async def try_out(self, names: list[str], *, who: str, expected: str | None = None) -> list[str]:
+        """Put monitors on trial; those that were not so already. The same errors, where variables are shared."""
+        async with self._changing:
+            self._expect(expected)
+            self._all_known(names)
+            return await self._switch(names, TRIAL, who)
+
+    async def promote(self, names: list[str], *, who: str, expected: str | None = None) -> list[str]:
+        """Bring monitors on trial into force; those that were not already. The same errors, and for a disabled one."""
+        async with self._changing:
+            self._expect(expected)
+            self._all_known(names)
+            disabled = [name for name in names if self._states[name] is False]
+            if disabled:
+                text = f"{', '.join(disabled)} is disabled, not on trial: rosrv monitor enable"
+                raise SpecificationsRefusedError([text])
+            return await self._switch(names, True, who)
+
+    async def _switch(self, names: list[str], to: Switch, who: str) -> list[str]:
+        changed = [name for name in dict.fromkeys(names) if self._states[name] != to]
+        if not changed:
             return changed
+        before, after = self._switches, self._switches | dict.fromkeys(changed, to)
+        torn = self._torn(self._states | dict.fromkeys(changed, to), self.checked)
+        if torn:
+            raise SpecificationsRefusedError([torn])
+        retried = to == TRIAL or any(self.on_trial(name) for name in changed)
+        await self._count()
+        self._switches = after
+        if retried:
+            try:
+                await self._stating.take(Revision(self.revision, self.sources, self.checked))
+            except SpecificationsRefusedError:
+                self._switches = before
+                raise
+        word = "on trial" if to == TRIAL else "enabled" if to else "disabled"
+        for name in changed:
+            self._states[name] = to
+            if not retried:
+                self._stating.tell(name, messages.MonitorSwitched(name, to is True))
+            self._say_switched(name, word, who, f"{name} is {word}")
+        self._store.save_setting(_SWITCHES, json.dumps(self._switches))
+        await self._store.settled()
+        return changed
+
+    def _say_switched(self, name: str, word: str, who: str, text: str) -> None:
+        self._trail.happened(
+            f"monitor {word}",
+            text,
+            severity=Severity.NOTICE,
+            category="monitor",
+            resource=name,
+            who=who,
+        )
 
     async def resume(self, names: list[str], *, who: str, expected: str | None = None) -> list[str]:
         """Let the topics of held monitors go on; which were held.
@@ -417,6 +474,31 @@ class Monitors:
 
     # --- inside ---
 
+    def _states_of(self, checked: Checked) -> dict[str, Switch]:
+        """What these monitors are, or would be; whoever shares variables with one on trial is on trial, too."""
+        named = self._named()
+        states: dict[str, Switch] = {
+            name: self._switches.get(name, self._enable == "all" or name in named)
+            for name in checked.monitors
+        }
+        if TRIAL in states.values():
+            for group in sharing(checked.uses):
+                if any(states[name] == TRIAL for name in group):
+                    states |= {name: TRIAL for name in group if states[name] is True}
+        return states
+
+    def _torn(self, states: Mapping[str, Switch], checked: Checked) -> str:
+        """Why monitors cannot be so: which are in force and share variables with some that are on trial."""
+        for group in sharing(checked.uses):
+            tried = sorted(name for name in group if states[name] == TRIAL)
+            others = sorted(name for name in group if states[name] is True)
+            if tried and others:
+                return (
+                    f"{', '.join(tried)} on trial and {', '.join(others)} in force do not go together,"
+                    " because they share variables: name them all"
+                )
+        return ""
+
     def _named(self) -> set[str]:
         return set() if self._enable in {"all", "none"} else {one.strip() for one in self._enable.split(",")}
 
@@ -451,7 +533,7 @@ class Monitors:
         confirm_within: float | None = None,
         *,
         kept: Sequence[str] = (),
-        switches: Mapping[str, bool] = {},
+        switches: Mapping[str, Switch] = {},
     ) -> Replaced:
         """`switches` are for monitors that are not in force yet."""
         before, previous, switched = self.revision, self.sources, self._switches
@@ -461,6 +543,10 @@ class Monitors:
         }
         try:
             checked = await asyncio.to_thread(check, sources, self.site_keys)
+            in_force = {name: True for name in checked.monitors if self.enabled(name)}
+            torn = self._torn(self._states_of(checked) | in_force, checked)
+            if torn:
+                raise SpecificationsRefusedError([torn])
             moved = await self._stating.take(Revision(before + 1, sources, checked))
         except SpecificationsRefusedError as error:
             self._switches = switched
@@ -537,7 +623,13 @@ class Monitors:
     def _enforce(self, sources: Sources, checked: Checked, row: MonitorRevisionRow) -> None:
         self.sources, self.checked, self.revision = sources, checked, row.revision
         self._row, self.who, self.note, self.loaded = row, row.who, row.note, row.loaded
-        self._switches = {name: on for name, on in self._switches.items() if name in checked.monitors}
+        self._switches = {name: to for name, to in self._switches.items() if name in checked.monitors}
+        self._states = self._states_of(checked)
+        for name, state in self._states.items():
+            if state == TRIAL and self._switches.get(name) != TRIAL:
+                self._switches[name] = TRIAL
+                text = f"{name} is on trial: it shares variables with one that is"
+                self._say_switched(name, TRIAL, row.who, text)
         self._store.save_setting(_SWITCHES, json.dumps(self._switches))
 
 

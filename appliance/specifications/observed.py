@@ -17,6 +17,8 @@ _EVENTS = {
     "log": ("monitor log", Severity.INFO),
     "publish": ("monitor published", Severity.INFO),
 }
+_TRIED = {f"trial {kind}": kind for kind in (*_EVENTS, "missed")}
+_NOT_DONE = ("drop", "change", "publish")
 KINDS = tuple(_EVENTS)
 _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severity.ALARM}
 
@@ -25,7 +27,7 @@ class MonitorRecords:
     """Makes records of reports; `fields(topic, data)` reads a message.
 
     `counts` has how often each kind happened, by monitor: a change that several made, for each of them. `at` has how
-    often messages of a topic were dropped or changed.
+    often messages of a topic were dropped or changed. What monitors on trial would have done are kinds of their own.
     Each of `told` hears of every event.
     """
 
@@ -58,6 +60,10 @@ class MonitorRecords:
     def _record(self, event: MonitorEvent) -> None:
         name, severity = _EVENTS.get(event.kind, ("monitor log", Severity.INFO))
         detail: dict[str, Any] = {"monitor": event.monitor}
+        tried = _TRIED.get(event.kind)
+        if tried is not None:
+            name, severity = "trial observed", Severity.INFO
+            detail |= {"trial": True, "would": tried}
         detail["happened"] = datetime.datetime.fromtimestamp(event.time / 1e9, datetime.UTC).isoformat()
         if event.kind == "log":
             severity = _LEVELS.get(str(event.detail.get("level")), severity)
@@ -73,6 +79,8 @@ class MonitorRecords:
         if event.count:
             detail["count"] = event.count
             text = f"{event.count} more in the same second" + (f": {text}" if text else "")
+        if tried is not None:
+            text = f"on trial, not done: {text}" if tried in _NOT_DONE else f"on trial: {text}"
         self._trail.happened(
             name,
             text,

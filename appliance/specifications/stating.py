@@ -11,7 +11,7 @@ its topics.
 import asyncio
 import itertools
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -21,6 +21,10 @@ from appliance.channel import messages
 from appliance.specifications.allocation import Allocation, Plan
 from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError
 from appliance.specifications.relays import Relays
+
+TRIAL: Literal["on trial"] = "on trial"
+Switch = bool | Literal["on trial"]
+"""Whether what a monitor does is done; on trial it is only told."""
 
 _RELAY_SECONDS = 15.0
 _TRIES = 5  # while nodes that are affected register and go
@@ -37,7 +41,7 @@ class Revision:
 
 
 class Stating:
-    """What the relays were told and what they said; `enabled(name)` says whether a monitor's events happen.
+    """What the relays were told and what they said; `states(checked)` says of each monitor whether it is in force.
 
     `rows` has state and counters of the monitors, as far as their relays have told.
     """
@@ -47,14 +51,14 @@ class Stating:
         allocation: Allocation,
         trail: AuditTrail,
         on_fault: Literal["drop", "pass"],
-        enabled: Callable[[str], bool],
+        states: Callable[[Checked], Mapping[str, Switch]],
         relays: Relays,
     ) -> None:
         self.allocation = allocation
         self._relays = relays
         self._trail = trail
         self._on_fault: Literal["drop", "pass"] = on_fault
-        self._enabled = enabled
+        self._states = states
         self._now = Revision()
         self._known: set[int] = set()  # relays that had specifications before
         self._fresh: set[int] = set()  # relays that have not answered since they are there
@@ -241,16 +245,18 @@ class Stating:
     ) -> messages.SpecificationsStated:
         files = [(name, text) for name, text in revision.sources.files.items() if of_file(name) == relay]
         mine = {name for name, file in revision.checked.monitors.items() if of_file(file) == relay}
+        states = self._states(revision.checked)
         return messages.SpecificationsStated(
             revision.number,
             files,
             revision.sources.definitions,
-            {name: self._enabled(name) for name in revision.checked.monitors if name in mine},
+            {name: states[name] is not False for name in revision.checked.monitors if name in mine},
             restarted,
             self._on_fault,
             tuple(name for name, file in revision.checked.monitors.items() if name in mine and file in moved),
             next(self._numbers),
             ahead,
+            tuple(name for name in revision.checked.monitors if name in mine and states[name] == TRIAL),
         )
 
     # --- what the relays say ---

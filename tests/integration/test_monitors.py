@@ -127,6 +127,49 @@ def test_a_monitor_is_disabled_enabled_replaced_and_removed_while_nodes_talk(
     assert ["words.rv"] in [detail["changed"] for detail in loaded]
 
 
+def test_a_monitor_on_trial_says_what_it_would_do_until_it_is_promoted(
+    appliance: Appliance, ros: RosSession
+) -> None:
+    """No message is lost meanwhile, and the first changed one follows the last untouched one."""
+    assert appliance.rosrv("monitor", "enable", "words", "--trial").stdout == "on trial: words\n"
+    listener = ros.listener("roscpp", "/chatter")
+    ros.talker("roscpp", "/chatter", name="voice")
+    rude = ros.talker("rospy", "/chatter", "--text", "bad", name="rude")
+    rude.wait_for_count(5, event="sent")
+    heard = listener.wait_for_count(5, event="received", publisher="/rude")
+    assert all(event["data"].startswith("bad") for event in heard)
+
+    def observed() -> bool:
+        records = appliance.audit("--event", "trial observed", resource="/chatter")
+        return {"drop", "change", "log"} <= {
+            one["detail"]["trial"] and one["detail"]["would"] for one in records
+        }
+
+    eventually(observed, "a drop, a change and a line that would have been")
+    row = monitor(appliance, "words")
+    assert row["would_drop"]
+    assert row["would_change"]
+    assert (row["trial"], row["enabled"], row["drops"], row["changes"], row["missed"]) == (
+        True,
+        False,
+        0,
+        0,
+        0,
+    )
+    status = appliance.status()["monitors"]
+    assert (status["enabled"], status["trials"]) == (0, ["words"])
+    assert "1 on trial" in appliance.rosrv("status").stdout
+    assert "rosrv monitor promote" in appliance.rosrv("monitor", "enable", "words", check=False).stderr
+    assert appliance.rosrv("monitor", "promote", "words").stdout == "enabled: words\n"
+    listener.wait_for(lambda event: event.get("data", "").startswith("checked hello"))
+    said = [event["data"] for event in listener.seen(event="received") if event["publisher"] == "/voice"]
+    changed = [text.startswith("checked ") for text in said]
+    assert changed == sorted(changed)
+    numbers = [int(text.split()[-1]) for text in said]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert {one["detail"]["who"] for one in appliance.recorded("--event", "monitor on trial")} == {"operator"}
+
+
 def test_a_bad_specification_is_refused_with_its_place_and_changes_nothing(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:

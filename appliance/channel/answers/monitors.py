@@ -20,7 +20,7 @@ class MonitorState(msgspec.Struct, frozen=True):
 
     name: str
     file: Annotated[str, told("the specification file it stands in; a file may have several monitors")]
-    enabled: bool
+    enabled: Annotated[bool, told("what it does is done; false while it is on trial")]
     held: Annotated[bool, told("blocks its topics until it is resumed")]
     failing: bool
     topics: list[str]
@@ -34,6 +34,12 @@ class MonitorState(msgspec.Struct, frozen=True):
         list[str],
         told("of each property: whether its automaton was proved to be what is written, or why not"),
     ]
+    trial: Annotated[bool, told("on trial: given copies of messages, to say what it would have done")] = False
+    would_drop: Annotated[int, told("messages that it would have dropped since it is on trial")] = 0
+    would_change: Annotated[int, told("the same of changes")] = 0
+    missed: Annotated[
+        int, told("messages that it was not given on trial, or not to the end: its counts are not complete")
+    ] = 0
 
 
 class Monitors(msgspec.Struct, frozen=True):
@@ -114,3 +120,6 @@ class Switched(msgspec.Struct, frozen=True):
     names: list[str]
     revision: int
     tag: Tag
+    began: Annotated[
+        list[str], told("of those that are on trial now or were: which are in their initial state")
+    ] = []

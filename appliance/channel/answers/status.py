@@ -94,6 +94,7 @@ class MonitorsState(msgspec.Struct, frozen=True):
     who: str
     differs_from_folder: bool
     confirm_by: Moment | None
+    trials: Annotated[list[str], told("monitors on trial")] = []
 
 
 class ForwardingState(msgspec.Struct, frozen=True):

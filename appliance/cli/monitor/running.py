@@ -12,7 +12,7 @@ from rich.table import Column, Table
 
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
-from appliance.channel.answers.monitors import MonitorState, Replaced
+from appliance.channel.answers.monitors import MonitorState, Replaced, Switched
 from appliance.cli import completion
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.running import Appliance, body_or_exit, speaks
@@ -43,9 +43,12 @@ def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
         box=None, padding=(0, 2, 0, 0), header_style="dim",
     )  # fmt: skip
     for row in body.monitors:
-        counts = [str(getattr(row, name)) for name in ("events", "verdicts", "drops", "changes", "faults")]
+        done = (f"({row.would_drop})", f"({row.would_change})") if row.trial else (row.drops, row.changes)
+        counts = map(str, (row.events, row.verdicts, *done, row.faults))
         table.add_row(row.name, _state(row), "\n".join(row.topics + row.services), *counts)
     Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE).print(table)
+    if any(row.trial for row in body.monitors):
+        say("(in brackets: what a monitor on trial would have dropped and changed)", "dim")
     source = f" ({body.folder})" if body.folder else ""
     differs = (
         "; not what the folder has (rosrv monitor reload takes that, and removes nothing)"
@@ -56,12 +59,33 @@ def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
 
 
 @speaks
-def enable(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
-    """Let the events of these monitors happen again.
+def enable(
+    appliance: Appliance,
+    names: _Names,
+    *,
+    trial: Annotated[
+        bool,
+        typer.Option("--trial", help="On trial: change and drop nothing, record what they would have done"),
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Let the events of these monitors happen again, or first on trial.
 
-    Example: rosrv monitor enable safeTrigger
+    Example: rosrv monitor enable safeTrigger --trial
     """
-    _switch(appliance, names, True, as_json=as_json)
+    order = admin.MonitorTrial(names, True) if trial else admin.MonitorSwitch(names, True)
+    _switch(appliance, order, "on trial" if trial else "enabled", as_json=as_json)
+
+
+@speaks
+def promote(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
+    """Bring monitors that are on trial into force, with the state that they have.
+
+    One that was not given all messages on trial begins in its initial state, and that is said.
+
+    Example: rosrv monitor promote safeTrigger
+    """
+    _switch(appliance, admin.MonitorTrial(names, False), "enabled", as_json=as_json)
 
 
 @speaks
@@ -70,7 +94,7 @@ def disable(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
 
     Example: rosrv monitor disable safeTrigger
     """
-    _switch(appliance, names, False, as_json=as_json)
+    _switch(appliance, admin.MonitorSwitch(names, False), "disabled", as_json=as_json)
 
 
 @speaks
@@ -169,16 +193,19 @@ def rv_state(appliance: Appliance, as_json: Json = False) -> None:
         say(f"{name} {topic} XML-RPC port {xmlrpc} TCP port {tcp}")
 
 
-def _switch(appliance: Appliance, names: list[str], enabled: bool, *, as_json: bool) -> None:
-    body = appliance.ask_or_exit(admin.MonitorSwitch(names, enabled), as_json=as_json)
+def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str, *, as_json: bool) -> None:
+    body = appliance.ask_or_exit(order, as_json=as_json)
     if as_json:
-        say_json({**asdict(body), "enabled": enabled})
+        say_json({**asdict(body), "enabled": word == "enabled", "trial": word == "on trial"})
         return
-    word = "enabled" if enabled else "disabled"
     say(f"{word}: {', '.join(body.names) or 'nothing, it was so already'}")
+    if body.began:
+        say(f"{', '.join(body.began)} began in the initial state", "yellow")
 
 
 def _state(row: MonitorState) -> str:
+    if row.trial:
+        return f"on trial, {row.missed} missed" if row.missed else "on trial"
     if row.held:
         return "holds its topics"
     if row.failing:
@@ -208,6 +235,6 @@ def say_replaced(body: Replaced) -> None:
 def _say_disabled(appliance: Appliance, files: Collection[str]) -> None:
     """Who loads a monitor expects it to stand guard; with `--enable none` it does not yet."""
     rows = appliance.ask_or_exit(admin.MonitorsWanted(), as_json=False).monitors
-    names = [row.name for row in rows if row.file in files and not row.enabled]
+    names = [row.name for row in rows if row.file in files and not row.enabled and not row.trial]
     if names:
         say(f"disabled (--enable): {', '.join(names)}; rosrv monitor enable {' '.join(names)}", "yellow")

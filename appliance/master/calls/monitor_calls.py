@@ -7,6 +7,7 @@ from appliance.master.caller import Answer, Caller
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.reach.relays import RelayControl
 from appliance.ros.xmlrpc import Value
+from appliance.specifications.files import SpecificationsRefusedError
 from appliance.specifications.monitors import Monitors, UnknownMonitorError
 
 _WORDS = {"enable": True, "disable": False}
@@ -35,7 +36,7 @@ class MonitorCalls:
             changed = await self.monitors.switch(
                 names, _WORDS[word], who=f"{caller.caller_id} ({caller.peer.text})"
             )
-        except UnknownMonitorError as error:
+        except (UnknownMonitorError, SpecificationsRefusedError) as error:
             return [-1, str(error), []]
         return [
             1,

@@ -63,6 +63,8 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("DELETE", "/v1/monitors?name=a&name=b", None),
     ("PATCH", "/v1/monitors/safeZone", {"enabled": False}),
     ("PATCH", "/v1/monitors/safeZone", {"held": False}),
+    ("PATCH", "/v1/monitors/safeZone", {"trial": True}),
+    ("PATCH", "/v1/monitors", {"names": ["a"], "trial": False}),
     ("PATCH", "/v1/monitors", {"names": ["a", "b"], "enabled": True}),
     ("PATCH", "/v1/monitors", {"names": ["a"], "held": False}),
     ("POST", "/v1/recordings", {}),

@@ -39,7 +39,7 @@ class Both:
     """Specifications up to one with that enabled, all of them with that on trial, and all others."""
 
     def __init__(self, texts: dict[str, str], tried: str, on_fault: OnFault = "drop") -> None:
-        self.tried = tried
+        self.tried, self.on_fault = tried, on_fault
         place = next(at for at, text in enumerate(texts.values()) if text.startswith(tried))
         others = {file: text for file, text in texts.items() if not text.startswith(tried)}
         self.enabled = MonitorSet.load(dict(list(texts.items())[: place + 1]), definitions(), on_fault)
@@ -74,7 +74,7 @@ class Both:
         """The one on trial comes into force, with its state."""
         self.check(time)
         following = MonitorSet.load(
-            {file.name: file.text for file in self.enabled.files}, definitions(), self.enabled._on_fault
+            {file.name: file.text for file in self.enabled.files}, definitions(), self.on_fault
         )
         following.succeed(self.with_trial, time)
         assert not following.began

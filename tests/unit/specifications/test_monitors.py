@@ -522,3 +522,114 @@ async def test_a_signature_that_changes_is_a_change(desk: Desk) -> None:
     await monitors.reload(who="adam")
     assert [*differs, monitors.differs_from_folder] == [False, True, False]
     assert desk.monitors(restarted=True, site_keys=[OTHER_LINE]).names() == ["a"]
+
+
+async def test_a_trial_is_told_kept_and_promoted(desk: Desk) -> None:
+    """It is not enabled; it survives a restart; the relays compile anew when it begins and when it ends."""
+    monitors = desk.monitors()
+    assert await monitors.try_out(["a"], who="eve") == ["a"]
+    assert await monitors.try_out(["a"], who="eve") == []
+    assert (monitors.enabled("a"), monitors.on_trial("a")) == (False, True)
+    stated = desk.sent[-1]
+    assert isinstance(stated, messages.SpecificationsStated)
+    assert (stated.enabled, stated.trials, stated.revision) == ({"a": True}, ("a",), 1)
+    for restarted in (False, True):
+        again = desk.monitors(restarted=restarted)
+        assert again.on_trial("a")
+        assert again.statement().trials == ("a",)
+    with pytest.raises(SpecificationsRefusedError, match="rosrv monitor promote"):
+        await monitors.switch(["a"], True, who="eve")
+    assert await monitors.promote(["a"], who="adam") == ["a"]
+    assert monitors.enabled("a")
+    assert monitors.statement().trials == ()
+    assert await monitors.promote(["a"], who="adam") == []
+    await monitors.switch(["a"], False, who="eve")
+    with pytest.raises(SpecificationsRefusedError, match="a is disabled, not on trial"):
+        await monitors.promote(["a"], who="eve")
+    said = [(event, fields["who"]) for event, fields in desk.events if event.startswith("monitor ")]
+    assert said == [("monitor on trial", "eve"), ("monitor enabled", "adam"), ("monitor disabled", "eve")]
+
+
+async def test_a_trial_that_is_disabled_is_over(desk: Desk) -> None:
+    """It is as any disabled monitor; and a switch goes with its monitor."""
+    monitors = desk.monitors()
+    await monitors.try_out(["a"], who="eve")
+    assert await monitors.switch(["a"], False, who="eve") == ["a"]
+    assert (monitors.enabled("a"), monitors.on_trial("a")) == (False, False)
+    assert monitors.statement().trials == ()
+    assert monitors.statement().enabled == {"a": False}
+    await monitors.try_out(["a"], who="eve")
+    await monitors.remove(["a"], who="eve")
+    await monitors.load(Sources({"a.rv": A}), who="eve", note="")
+    assert monitors.enabled("a")
+    await monitors.rollback(1, who="eve")
+    assert monitors.enabled("a")
+
+
+async def test_a_relay_that_does_not_take_a_trial_leaves_everything(desk: Desk) -> None:
+    """What is in force stays in force, and no switch is kept."""
+    monitors = desk.monitors()
+    desk.findings = ["no"]
+    with pytest.raises(SpecificationsRefusedError, match="no"):
+        await monitors.try_out(["a"], who="eve")
+    desk.findings = []
+    assert monitors.enabled("a")
+    assert monitors.statement().trials == ()
+    assert desk.monitors(restarted=True).enabled("a")
+
+
+USER = "u() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
+
+
+async def test_what_shares_variables_is_on_trial_together(desk: Desk) -> None:
+    """All are named, by who puts them there and by who promotes them; what is loaded joins, what is in force never."""
+    (desk.folder / "u.rv").write_text(USER)
+    monitors = desk.monitors()
+    with pytest.raises(SpecificationsRefusedError, match="u on trial and a in force do not go together"):
+        await monitors.try_out(["u"], who="eve")
+    assert await monitors.try_out(["u", "a"], who="eve") == ["u", "a"]
+    with pytest.raises(SpecificationsRefusedError, match="share variables"):
+        await monitors.promote(["a"], who="eve")
+    await monitors.load(Sources({"v.rv": USER.replace("u()", "v()")}), who="eve", note="")
+    assert monitors.statement().trials == ("a", "u", "v")
+    assert desk.monitors(restarted=True).on_trial("v")
+    await monitors.load(Sources({"c.rv": C}), who="eve", note="")
+    uses_both = C.replace("{ }", "{ shared = 2; }")
+    with pytest.raises(SpecificationsRefusedError, match="a, u, v on trial and c in force"):
+        await monitors.load(Sources({"c.rv": uses_both}), who="eve", note="")
+    assert monitors.enabled("c")
+    assert await monitors.switch(["v"], False, who="eve") == ["v"]
+    assert monitors.statement().trials == ("a", "u")
+    assert await monitors.promote(["a", "u"], who="eve") == ["a", "u"]
+
+
+async def test_a_rollback_brings_a_trial_back(desk: Desk) -> None:
+    """A monitor that comes back is on trial as it was when it went."""
+    monitors = desk.monitors()
+    await monitors.load(Sources({"c.rv": C}), who="eve", note="")
+    await monitors.try_out(["c"], who="eve")
+    await monitors.remove(["c"], who="eve")
+    assert not monitors.on_trial("c")
+    await monitors.rollback(2, who="eve")
+    assert monitors.on_trial("c")
+
+
+async def test_what_a_trial_would_have_done_is_no_drop(desk: Desk) -> None:
+    """Neither in the events nor in the counts of drops; `detail` says what it would have been."""
+    monitors = desk.monitors()
+    told = [
+        messages.MonitorEvent(
+            "trial drop", "a", "k", "/chatter", 1, "a.said dropped it", {}, b"\x01", size=1
+        ),
+        messages.MonitorEvent(
+            "trial fault", "a", "k", "/chatter", 2, "a.rv:1:2: division by zero", {"line": 1}
+        ),
+    ]
+    monitors.received(messages.MonitorsReported(told, 0))
+    observed = [fields for event, fields in desk.events if event == "trial observed"]
+    assert [(fields["trial"], fields["would"]) for fields in observed] == [(True, "drop"), (True, "fault")]
+    assert {str(fields["severity"]) for fields in observed} == {str(observed[0]["severity"])}
+    assert not {"message dropped", "monitor fault"} & {event for event, _ in desk.events}
+    assert monitors.records.counts["trial drop", "a"] == 1
+    assert not monitors.records.counts["drop", "a"]
+    assert not monitors.records.at

@@ -40,7 +40,9 @@ class Fleet:
     """Two relays and what was done with them, in order; `answer(relay, statement)` is what one says to it."""
 
     def __init__(self, trail: AuditTrail) -> None:
-        self.stating = Stating(Allocation(2), trail, "drop", lambda _name: True, self)
+        self.stating = Stating(
+            Allocation(2), trail, "drop", lambda checked: dict.fromkeys(checked.monitors, True), self
+        )
         self.story: list[tuple[Any, ...]] = []
         self.stated: list[tuple[int, messages.SpecificationsStated]] = []
         self.carried: set[Resource] = set()

@@ -44,6 +44,7 @@ PRIVATE = {
     "unit/relay/monitors/test_middle.py": "whether a topic goes through the middle does not show from outside",
     "unit/relay/monitors/test_passage.py": "the generated code is compared with the engine, message by message",
     "unit/relay/monitors/test_telling.py": _TURN,
+    "unit/relay/monitors/test_trials.py": "when a trial has its turn, and a defect in it, are made by hand",
     "unit/relay/test_engine.py": _LET_GO,
     "unit/relay/test_shares.py": _LET_GO,
     "unit/relay/world.py": _LET_GO,

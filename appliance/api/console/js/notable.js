@@ -59,7 +59,7 @@ export function isDenial(record) {
 
 /** Whether a monitor did something, and not somebody something to it. @param {AuditRecord} record */
 function isDoing(record) {
-  return record.category === "monitor" && record.detail?.monitor !== undefined && record.event !== "monitor log";
+  return record.category === "monitor" && record.detail?.monitor !== undefined && !["monitor log", "trial observed"].includes(record.event);
 }
 
 function added(/** @type {AuditRecord[] | null} */ list, /** @type {AuditRecord} */ record) {
