@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any, Callable, Iterator
 
 FORMAT = "rosrv evidence 1"
+FIELDS = {"format", "log", "since", "until", "recording", "runs", "missing", "members"}
 OWN = ("manifest.json", "proof.json")
 COLUMNS = (
     "sequence", "id", "time", "version", "event", "severity", "decision", "host", "caller_id", "category", "resource",
@@ -118,7 +119,7 @@ class Verifier:
         """Rule 1."""
         self.manifest = json.loads(self.read("manifest.json"))
         members = self.manifest["members"]
-        if self.manifest["format"] != FORMAT:
+        if self.manifest["format"] != FORMAT or {*self.manifest} != FIELDS:
             self.findings.append(f"manifest.json: is not of the format {FORMAT!r}")
         for name in sorted(set(self.names)):
             if name not in members and name not in OWN:
