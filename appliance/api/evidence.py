@@ -1,4 +1,4 @@
-"""`/v1/evidence`: what happened in a span of time, in one file that proves itself elsewhere."""
+"""`/v1/evidence` and `/v1/recordings/{id}/evidence`: what happened, in one file that proves itself elsewhere."""
 
 import asyncio
 import time
@@ -8,61 +8,82 @@ from typing import Annotated, Any
 from fastapi import Query, Request, Response
 from starlette.responses import StreamingResponse
 
+from appliance.api.access import Bearer, Role
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Operator, problem_of
+from appliance.api.recordings import OneId
+from appliance.api.roles import Investigator, Viewer, problem_of
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.api.streams import Held, peer_of
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.moment import MomentError, parse_moment
 from appliance.channel.admin import AdminAnswer, AdminRequest
-from appliance.evidence.bundle import BundleError, Span, export
+from appliance.evidence.bundle import BundleError, Kept, Span, export
 
 _ZIP: Responses = {
     200: {
         "description": "A ZIP file.",
         "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
     },
-    404: {"description": "The log has no record of that time."},
+    404: {"description": "There is no such recording, or the log has no record of that time."},
 }
 _Moment = Annotated[str, Query(max_length=64, description="1h (ago), a date, or RFC 3339")]
 
 
 def routes(services: Services) -> Routes:
-    """The route."""
-    router = Routes(prefix="/v1", tags=["audit"])
+    """The routes."""
+    router = Routes(prefix="/v1", tags=["evidence"])
 
-    @router.get("/evidence", operation_id="export_evidence", responses=_ZIP)
+    @router.get("/evidence", operation_id="export_evidence", responses=_ZIP, response_class=Response)
     async def export_evidence(
-        request: Request, bearer: Operator, since: _Moment, until: _Moment = "0s"
+        request: Request, bearer: Viewer, since: _Moment, until: _Moment = "0s"
     ) -> Response:
         """The audit records of a time, and the policies and specifications in force, as a bundle that proves itself.
 
-        For operators. It is on record who exported what.
+        For investigators, operators and admins. It is on record who exported what.
         """
-        now, loop = time.time_ns(), asyncio.get_running_loop()
+        if bearer.role < Role.INVESTIGATOR:
+            text = f"this is for investigators, operators and admins; the token {bearer.name} is a viewer's"
+            raise ProblemError(403, "not-for-this-role", text)
+        now = time.time_ns()
         try:
             span = Span(parse_moment(since, now), parse_moment(until, now))
         except (MomentError, OverflowError, ValueError) as error:
             raise ProblemError(422, "bad-input", str(error)) from error
+        return await _bundle(services, request, bearer, span)
 
-        def ask(asked: AdminRequest[Any]) -> AdminAnswer[Any]:
-            return asyncio.run_coroutine_threadsafe(services.control.ask(asked, bearer), loop).result()
-
-        give_back = services.exports.take(bearer, peer_of(request), "exports")
-        try:
-            pieces = await asyncio.to_thread(export, services.audit_log, span, ask)
-        except BaseException as error:
-            give_back()
-            if isinstance(error, BundleError):
-                raise problem_of(error.trouble, str(error)) from error
-            if isinstance(error, LogUnreadableError):
-                raise ProblemError(503, "log-unreadable", str(error)) from error
-            raise
-        name = {"Content-Disposition": 'attachment; filename="rosrv-evidence.zip"'}
-        return Held(StreamingResponse(_given(pieces), headers=name, media_type="application/zip"), give_back)
+    @router.get(
+        "/recordings/{recording_id}/evidence",
+        operation_id="recording_evidence",
+        responses=_ZIP,
+        response_class=Response,
+    )
+    async def recording_evidence(recording_id: OneId, request: Request, bearer: Investigator) -> Response:
+        """The same of the time of a recording, with its messages. For investigators."""
+        kept = Kept(recording_id, services.settings.state / "recordings")
+        return await _bundle(services, request, bearer, kept)
 
     return router
+
+
+async def _bundle(services: Services, request: Request, bearer: Bearer, wanted: Span | Kept) -> Response:
+    loop = asyncio.get_running_loop()
+
+    def ask(asked: AdminRequest[Any]) -> AdminAnswer[Any]:
+        return asyncio.run_coroutine_threadsafe(services.control.ask(asked, bearer), loop).result()
+
+    give_back = services.exports.take(bearer, peer_of(request), "exports")
+    try:
+        pieces = await asyncio.to_thread(export, services.audit_log, wanted, ask)
+    except BaseException as error:
+        give_back()
+        if isinstance(error, BundleError):
+            raise problem_of(error.trouble, str(error)) from error
+        if isinstance(error, LogUnreadableError):
+            raise ProblemError(503, "log-unreadable", str(error)) from error
+        raise
+    name = {"Content-Disposition": 'attachment; filename="rosrv-evidence.zip"'}
+    return Held(StreamingResponse(_given(pieces), headers=name, media_type="application/zip"), give_back)
 
 
 async def _given(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:

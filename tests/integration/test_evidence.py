@@ -86,7 +86,7 @@ def test_over_the_command_line(appliance: Appliance, tmp_path: Path) -> None:
     assert (again.returncode, again.stderr) == (2, f"rosrv: {bundle}: File exists\n")
 
 
-def test_over_rest_it_is_for_operators(appliance: Appliance, tmp_path: Path) -> None:
+def test_over_rest_it_is_not_for_viewers(appliance: Appliance, tmp_path: Path) -> None:
     """The same bundle as over the socket; a viewer is told so, and what makes no sense is refused in words."""
     rest = appliance.rest()
     viewer = appliance.rest(
@@ -123,11 +123,20 @@ def test_of_a_recording(appliance: Appliance, tmp_path: Path) -> None:
     bundle = tmp_path / "recording.zip"
     appliance.rosrv("evidence", "export", recording, "-o", str(bundle))
     assert "unproven  recording" not in proved(bundle, appliance.state / "control/audit.pub")
+    made = appliance.rosrv("token", "add", "carol", "--role", "investigator", "--json").stdout
+    investigator, path = appliance.rest(json.loads(made)["token"]), f"/v1/recordings/{recording}/evidence"
+    assert appliance.rest().get(path).status == 403
+    answer = investigator.get(path)
+    (tmp_path / "rest.zip").write_bytes(answer.body)
+    proved(tmp_path / "rest.zip", appliance.state / "control/audit.pub")
+    assert investigator.get(path.replace(recording, "0" * 20)).status == 404
+    assert investigator.get("/v1/evidence?since=1h").status == 200
     with zipfile.ZipFile(bundle) as archive:
         assert archive.read("recording/recording.bag").startswith(b"#ROSBAG V2.0")
         assert json.loads(archive.read("recording/recording.json"))["id"] == recording
         assert "the arm hit the door" in archive.read("index.html").decode()
-    assert appliance.recorded("--event", "recording fetched")[0]["detail"]["who"] == "operator"
+    fetched = appliance.recorded("--event", "recording fetched", "--oldest-first", count=2)
+    assert [record["detail"]["who"] for record in fetched] == ["operator", "carol"]
     refused = appliance.rosrv("evidence", "export", "../x", "-o", str(tmp_path / "x.zip"), check=False)
     assert (refused.returncode, refused.stderr) == (1, "rosrv: there is no recording ../x\n")
     both = ("evidence", "export", recording, "--since", "1h", "-o", str(tmp_path / "x.zip"))

@@ -2,6 +2,7 @@
 
 import json
 import re
+import zipfile
 from collections.abc import Callable
 from typing import Any
 
@@ -107,6 +108,19 @@ def test_the_log_is_proven_and_exported(opened: Callable[..., Reader], attempt: 
     assert download.value.suggested_filename.endswith(".ndjson")
     page.get_by_role("button", name="Verify").click()
     expect(page.get_by_role("dialog")).to_contain_text("The chain is whole")
+
+
+def test_evidence_of_a_time_is_exported(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
+    """Once a time is chosen; the file is a bundle."""
+    refuse(attempt, "/evident")
+    reader = opened()
+    page = reader.go("audit")
+    expect(page.get_by_role("button", name="Evidence")).to_have_attribute("title", "Choose first since when")
+    page = reader.go("audit?since=1h")
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Evidence").click()
+    with zipfile.ZipFile(download.value.path()) as bundle:
+        assert b"/evident" in bundle.read("records.ndjson")
 
 
 def test_a_record_that_is_not_there_is_said(opened: Callable[..., Reader]) -> None:

@@ -46,6 +46,20 @@ export function Export({ filter }) {
   return html`<${Button} onClick=${run} title="All records that match, one JSON object a line"><${Icon} name="down" size=${16} />Export</${Button}>`;
 }
 
+/** What happened in the time that the filters name, with what was in force. @param {{filter: Record<string, string>}} given */
+export function Evidence({ filter: { since, until } }) {
+  const run = async () => {
+    try {
+      const response = await send("GET", `/v1/evidence${queryText({ since, until })}`);
+      save(await response.blob(), `rosrv-evidence-${new Date().toISOString().slice(0, 19).replaceAll(":", "")}.zip`);
+    } catch (error) {
+      failed(error);
+    }
+  };
+  return html`<${Button} role="operator" disabled=${!since} why="Choose first since when" onClick=${run}
+    title="All of this time, and what was in force, as a bundle that proves itself"><${Icon} name="down" size=${16} />Evidence</${Button}>`;
+}
+
 /** Give the reader a file. @param {Blob} blob @param {string} name */
 export function save(blob, name) {
   const url = URL.createObjectURL(blob);

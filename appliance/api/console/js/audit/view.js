@@ -9,7 +9,7 @@ import { typing } from "../shortcuts.js";
 import { useStore } from "../store.js";
 import { auditPath, filterOf, Filters } from "./filters.js";
 import { Presets } from "./presets.js";
-import { Export, Verify } from "./proof.js";
+import { Evidence, Export, Verify } from "./proof.js";
 import { RecordPanel } from "./record.js";
 import { useRecords } from "./records.js";
 import { RecordTable } from "./table.js";
@@ -24,7 +24,7 @@ export function Audit() {
   return html`<div class="head"><h1>Audit</h1><span class="head-sub" role="status">${records === null ? "" : `${counted(records.length, "record")} shown${cursor ? ", more below" : ""}`}</span>
       <div class="head-actions">
         <button class="button" aria-pressed=${String(following)} onClick=${() => setFollowing(!following)}><${Icon} name=${following ? "pause" : "play"} size=${16} />${following ? "Following" : "Follow live"}</button>
-        <${Verify} /><${Export} filter=${filter} /></div></div>
+        <${Verify} /><${Export} filter=${filter} /><${Evidence} filter=${filter} /></div></div>
     <${Presets} filter=${filter} />
     <${Filters} filter=${filter} record=${chosen} />
     ${following && standing && standing.state !== "live" && standing.reason && html`<div class="banner" role="status"><${Icon} name="warn" />Not following now: ${standing.reason} It is tried again by itself.</div>`}
