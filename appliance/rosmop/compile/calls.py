@@ -304,7 +304,7 @@ def _vector(
         )
     count = number(values[0].form, kinds.ULONG)
     if len(values) == 1:
-        width = form.Literal(kinds.ULONG, scope.codecs.width(kind.element))
+        width = form.Literal(kinds.ULONG, scope.values.width(kind.element))
         return form.Call(kind, "l_filled", (count, form.OfType("zero", kind.element), width), site)
     value = convert(scope, values[1], kind.element, site)
     copy, measure = form.OfType("copy", kind.element, site), form.OfType("measure", kind.element)

@@ -60,7 +60,7 @@ def insert(scope: Scope, base: Value, arguments: Sequence[Value], at: tuple[Posi
     """`v.insert(place, value)`."""
     kind = _vector(base, at[0])
     value = convert(scope, arguments[1], kind.element, at[1])
-    width = form.Literal(kinds.ULONG, scope.codecs.width(kind.element))
+    width = form.Literal(kinds.ULONG, scope.values.width(kind.element))
     handed = (base.form, _index(base, arguments[0]), value, width)
     return _changed(scope, base, form.Call(kinds.VOID, "k_insert", handed, at[1]), at[0])
 

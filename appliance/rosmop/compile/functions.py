@@ -29,7 +29,7 @@ def declare_variables(shared: Shared, names: SpecificationNames, specification: 
                 names.misdeclared.add(declarator.name)
                 continue
             names.variables[declarator.name] = variable
-            shared.measures[variable.code] = shared.codecs.measure(variable.type)
+            shared.measures[variable.code] = shared.values.measure(variable.type)
 
 
 def _shared_variable(

@@ -4,12 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from appliance.rosmop.compile.codecs import Codecs
 from appliance.rosmop.compile.module import Lines, Module
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.functions import CHARGING, FAULTING, FUNCTIONS
 from appliance.rosmop.ir.interpreter import CHARGED, SHORT
-from appliance.rosmop.ir.values import struct_code, struct_size
+from appliance.rosmop.ir.values import BILLION, Values, struct_code, struct_size, zero_of
 from appliance.rosmop.runtime import numbers, output, times, vectors, wire
 from appliance.rosmop.runtime.context import MAX_CALLS, FaultError
 from appliance.rosmop.types import kinds
@@ -50,10 +49,15 @@ NAMESPACE: Mapping[str, object] = MappingProxyType(
         "p_join": output.join_all,
         "p_formatted": output.formatted,
         "t_bytes": bytes,
+        "w_count": wire.count,
+        "w_len": len,
+        "w_skip": wire.skip,
+        "w_skip_inner": wire.skip_inner,
+        "w_text_end": wire.text_end,
         "x_whole": wire.whole,
     }
 )
-"""What the text may use, besides what `Codecs` makes."""
+"""What the text may use, besides what `Values` makes."""
 
 
 _TEMPLATES: Mapping[str, str] = MappingProxyType(
@@ -78,9 +82,9 @@ _TEMPLATES: Mapping[str, str] = MappingProxyType(
 class Printer:
     """Writes functions of one specification; `context` is the code's name for that of it."""
 
-    def __init__(self, module: Module, codecs: Codecs, context: str) -> None:
+    def __init__(self, module: Module, values: Values, context: str) -> None:
         self._module = module
-        self._codecs = codecs
+        self._values = values
         self._context = context
 
     def function(self, function: form.Function) -> int:
@@ -186,7 +190,8 @@ class Printer:
 
     def _publish(self, lines: Lines, node: form.Publish) -> None:
         lines.add(f"{node.name} = e_bytearray()")
-        lines.add(f"{self._codecs.encoder(node.kind)}({self.text(node.value)}, {node.name})")
+        encoder = self._module.use(self._values.encoder(node.kind))
+        lines.add(f"{encoder}({self.text(node.value)}, {node.name})")
         arguments = f"{node.topic!r}, {node.kind.name!r}, e_bytes({node.name}), {node.site}"
         lines.add(f"{self._context}.publish({arguments})")
 
@@ -237,7 +242,8 @@ class Printer:
         lines.extend(moments)
 
     def _read_value(self, lines: Lines, node: form.ReadValue) -> None:
-        lines.add(f"{node.name}, {node.end} = {self._codecs.decode_text(node.type, 'b', spot(node.at))}")
+        decoder = self._module.use(self._values.decoder(node.type))
+        lines.add(f"{node.name}, {node.end} = {decoder}(b, {spot(node.at)})")
 
     def _require(self, lines: Lines, node: form.Require) -> None:
         lines.add(f"if not {self.text(node.test)}: return False")
@@ -256,11 +262,14 @@ class Printer:
         for write in spliced:
             lines.add(f"if {write.flag}:")
             lines.add("    o = e_bytearray()")
-            lines.add(f"    {self._codecs.encoder(write.value.type)}({self.text(write.value)}, o)")
+            encoder = self._module.use(self._values.encoder(write.value.type))
+            lines.add(f"    {encoder}({self.text(write.value)}, o)")
             lines.add(f"    {node.name}.append(({spot(write.at)}, {write.end}, e_bytes(o)))")
         for write in node.writes:
             if write.end is None:
-                packed = self._codecs.pack([(write.value.type, self.text(write.value))])
+                codes, value = struct_code(write.value.type) or "", self.text(write.value)
+                parts = f"{value} // {BILLION}, {value} % {BILLION}" if len(codes) == 2 else value
+                packed = f"{self._module.struct('<' + codes, 'pack')}({parts})"
                 lines.add(f"if {write.flag}: m.patch({spot(write.at)}, {packed})")
         if spliced:
             lines.add(f"if {node.name}: m.splice({node.name})")
@@ -344,7 +353,7 @@ class Printer:
     def _compare(self, node: form.Compare) -> str:
         left, right = self._compared(node.left), self._compared(node.right)
         if isinstance(node.left.type, kinds.Vector | kinds.Record):
-            measure = self._module.use(self._codecs.measure(node.left.type))
+            measure = self._module.use(self._values.measure(node.left.type))
             left = f"o_weighed({self._context}, {left}, {measure}, {node.site})"
         return f"({left} {node.operator} {right})"
 
@@ -387,15 +396,25 @@ class Printer:
     def _vector(self, node: form.Vector) -> str:
         code = f"[{', '.join(map(self.text, node.items))}]"
         if node.zeros:
-            rest = self._codecs.maker(kinds.Vector(node.type.element, node.zeros))
+            rest = self._module.use(self._values.maker(kinds.Vector(node.type.element, node.zeros)))
             code = f"({code} + {rest}())"
         return code
 
     def _zero(self, node: form.Zero) -> str:
-        return self._codecs.zero_text(node.type)
+        zero = zero_of(node.type)
+        if zero is not None:
+            return repr(zero)
+        if isinstance(node.type, kinds.Vector) and node.type.length is None:
+            return "[]"
+        return f"{self._module.use(self._values.maker(node.type))}()"
 
     def _copy(self, node: form.Copy) -> str:
-        return self._codecs.copy_text(node.type, self._context, self.text(node.value), node.site)
+        return self._copied(node.type, self.text(node.value), node.site)
+
+    def _copied(self, kind: Type, code: str, site: int) -> str:
+        if kinds.is_scalar(kind):
+            return code
+        return f"{self._module.use(self._values.copier(kind))}({self._context}, {code}, {site})"
 
     def _recast(self, node: form.Recast) -> str:
         source = node.value.type
@@ -415,10 +434,10 @@ class Printer:
 
     def _of_type(self, node: form.OfType) -> str:
         if node.what == "zero":
-            return self._codecs.maker(node.of)
+            return self._module.use(self._values.maker(node.of))
         if node.what == "measure":
-            return self._module.use(self._codecs.measure(node.of))
-        return f"lambda e: {self._codecs.copy_text(node.of, self._context, 'e', node.site)}"
+            return self._module.use(self._values.measure(node.of))
+        return f"lambda e: {self._copied(node.of, 'e', node.site)}"
 
     def _call(self, node: form.Call) -> str:
         arguments = [self.text(argument) for argument in node.arguments]
@@ -465,7 +484,7 @@ class Printer:
         return f"{self._context}.turn.now"
 
     def _whole(self, node: form.Whole) -> str:
-        decoder = self._codecs.decoder(node.type)
+        decoder = self._module.use(self._values.decoder(node.type))
         return f"x_whole(m, {self._context}, {decoder}, {node.pending}(), {node.site})"
 
 

@@ -5,11 +5,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from appliance.rosmop.compile.codecs import Codecs
 from appliance.rosmop.compile.module import Module, Site
 from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.compile.python import Printer
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.values import Values
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -90,7 +90,7 @@ class Shared:
     def __init__(self, module: Module, messages: Messages) -> None:
         self.module = module
         self.messages = messages
-        self.codecs = Codecs(module, messages)
+        self.values = Values(messages)
         self.functions: dict[str, form.Function] = {}
         self.specifications: list[SpecificationNames] = []
         self.measures: dict[str, Callable[[Any], int]] = {}
@@ -102,7 +102,7 @@ class Shared:
     def define(self, function: form.Function) -> int:
         """Add a function; returns the line of the code at which its event happens."""
         self.functions[function.name] = function
-        return Printer(self.module, self.codecs, function.context).function(function)
+        return Printer(self.module, self.values, function.context).function(function)
 
     def foreign(self, own: SpecificationNames, name: str, position: Position) -> Variable | None:
         """A variable of another specification."""
@@ -126,7 +126,7 @@ class Scope:
         self.names = names
         self.role: Role = role
         self.module = shared.module
-        self.codecs = shared.codecs
+        self.values = shared.values
         self.messages = shared.messages
         self.context = names.context
         self.lines = Statements()
@@ -180,7 +180,7 @@ class Scope:
             )
         block[variable.name] = variable
         if variable.alias is None:
-            self.shared.measures[variable.code] = self.codecs.measure(variable.type)
+            self.shared.measures[variable.code] = self.values.measure(variable.type)
 
     def local(self, name: str, kind: Type, position: Position, *, constant: bool = False) -> Variable:
         """A new local variable."""

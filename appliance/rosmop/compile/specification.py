@@ -148,7 +148,7 @@ def _declare(
     shared.specifications.append(names)
     declare_variables(shared, names, specification)
     declare_functions(shared, names, specification)
-    size = sum(shared.codecs.width(variable.type) for variable in names.variables.values())
+    size = sum(shared.values.width(variable.type) for variable in names.variables.values())
     if size > MAX_BYTES:
         shared.findings.append(
             Finding(

@@ -56,8 +56,8 @@ def _declare(scope: Scope, node: tree.Declaration) -> None:
         )
     for declarator in node.declarators:
         kind, value = initial(scope, node.type, declarator)
-        if scope.codecs.width(kind) > LARGE:
-            size = scope.codecs.width(kind)
+        if scope.values.width(kind) > LARGE:
+            size = scope.values.width(kind)
             scope.add(form.Allocate(scope.lines.site, size))
         variable = scope.local(declarator.name, kind, declarator.position, constant=node.type.constant)
         variable.copied = _is_copy(scope, declarator, kind)

@@ -55,7 +55,7 @@ def _push_back(call: Invocation) -> Value:
     call.count(1)
     kind = _vector(call)
     value = convert(call.scope, call.arguments[0], kind.element, call.site)
-    width = form.Literal(kinds.ULONG, call.scope.codecs.width(kind.element))
+    width = form.Literal(kinds.ULONG, call.scope.values.width(kind.element))
     function = "l_append_text" if isinstance(kind.element, kinds.String) else "l_append"
     return call.changes_in_place(function, value, width)
 
@@ -73,7 +73,7 @@ def _vector_clear(call: Invocation) -> Value:
 def _vector_resize(call: Invocation) -> Value:
     call.count(1)
     element = _vector(call).element
-    width = form.Literal(kinds.ULONG, call.scope.codecs.width(element))
+    width = form.Literal(kinds.ULONG, call.scope.values.width(element))
     return call.changes_in_place("l_resized", call.index(0), form.OfType("zero", element), width)
 
 

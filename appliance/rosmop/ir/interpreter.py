@@ -236,7 +236,7 @@ class Interpreter:
 
     def _publish(self, node: form.Publish, frame: Frame) -> None:
         out = bytearray()
-        self._encode(node.kind, self.value(node.value, frame), out)
+        self._values.encoder(node.kind)(self.value(node.value, frame), out)
         frame.context.publish(node.topic, node.kind.name, bytes(out), node.site)
 
     # Fields of the message
@@ -283,25 +283,11 @@ class Interpreter:
         end = max(offset + struct_size(struct_code(kind) or "") for _, kind, offset in node.fields)
         struct.unpack_from(f"{end}x", frame.buffer, start)  # all of them are there, or none is read
         for name, kind, offset in node.fields:
-            frame.variables[name] = self._values.decode(kind, frame.buffer, start + offset)[0]
+            frame.variables[name] = self._values.decoder(kind)(frame.buffer, start + offset)[0]
 
     def _read_value(self, node: form.ReadValue, frame: Frame) -> None:
-        value, end = self._decode(node.type, frame.buffer, frame.position(node.at))
+        value, end = self._values.decoder(node.type)(frame.buffer, frame.position(node.at))
         frame.variables[node.name], frame.variables[node.end] = value, end
-
-    def _decode(self, kind: Type, buffer: wire.Buffer, start: int) -> tuple[Any, int]:
-        if isinstance(kind, kinds.String):
-            return self._values.decode(kind, buffer, start)
-        try:
-            return self._values.decode(kind, buffer, start)
-        except Exception as error:  # noqa: BLE001  whatever it is, it is within a value, which has no place in the text
-            raise Stopped(error, -1, {}) from None
-
-    def _encode(self, kind: Type, value: Any, out: bytearray) -> None:
-        try:
-            self._values.encode(kind, value, out)
-        except Exception as error:  # noqa: BLE001  as above
-            raise Stopped(error, -1, {}) from None
 
     def _require(self, node: form.Require, frame: Frame) -> str | None:
         if self.value(node.test, frame):
@@ -322,11 +308,10 @@ class Interpreter:
             if not frame.variables[write.flag]:
                 continue
             out, value, start = bytearray(), self.value(write.value, frame), frame.position(write.at)
+            self._values.encoder(write.value.type)(value, out)
             if write.end is None:
-                self._values.encode(write.value.type, value, out)
                 patched.append((start, bytes(out)))
             else:
-                self._encode(write.value.type, value, out)
                 spliced.append((start, frame.variables[write.end], bytes(out)))
         for start, new in patched:
             message.patch(start, new)
@@ -420,25 +405,25 @@ class Interpreter:
         return self.value(node.base, frame)[node.number]
 
     def _vector(self, node: form.Vector, frame: Frame) -> list[Any]:
-        zeros = [self._values.zero(node.type.element) for _ in range(node.zeros)]
+        zeros: list[Any] = self._values.maker(kinds.Vector(node.type.element, node.zeros))()
         return [self.value(item, frame) for item in node.items] + zeros
 
     def _zero(self, node: form.Zero, frame: Frame) -> Any:
         del frame
-        return self._values.zero(node.type)
+        return self._values.maker(node.type)()
 
     def _copy(self, node: form.Copy, frame: Frame) -> Any:
-        return self._values.copy(frame.context, node.type, self.value(node.value, frame), node.site)
+        return self._values.copier(node.type)(frame.context, self.value(node.value, frame), node.site)
 
     def _recast(self, node: form.Recast, frame: Frame) -> list[Any]:
         return _recast(frame.context, self.value(node.value, frame), node.type.element, node.site)
 
     def _of_type(self, node: form.OfType, frame: Frame) -> Callable[..., Any]:
         if node.what == "zero":
-            return partial(self._values.zero, node.of)
+            return self._values.maker(node.of)
         if node.what == "measure":
             return self._values.measure(node.of)
-        return lambda value: self._values.copy(frame.context, node.of, value, node.site)
+        return lambda value: self._values.copier(node.of)(frame.context, value, node.site)
 
     def _call_function(self, node: form.Call, frame: Frame) -> Any:
         before = (frame.context,) if node.function in CHARGING else ()
@@ -497,7 +482,7 @@ class Interpreter:
             (frame.variables[write.flag], write.path, self.value(write.value, frame))
             for write in frame.variables[node.pending]
         )
-        decode = partial(self._decode, node.type)
+        decode = self._values.decoder(node.type)
         return wire.whole(self._message(frame), frame.context, decode, pending, node.site)
 
 

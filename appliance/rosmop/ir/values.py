@@ -4,7 +4,8 @@ A message is the list of its fields.
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 from typing import Any
 
 from appliance.rosmop.runtime import vectors, wire
@@ -44,11 +45,16 @@ def struct_size(codes: str) -> int:
 
 
 class Values:
-    """The values of the types of a set of message definitions."""
+    """The values of the types of a set of message definitions. What deals with those of a type is made once."""
 
     def __init__(self, messages: Messages) -> None:
         self._messages = messages
-        self._measures: dict[Type, Callable[[Any], int]] = {}
+        self._made: dict[tuple[Callable[[Type], Any], Type], Callable[..., Any]] = {}
+
+    def _once(self, make: Callable[[Any], Callable[..., Any]], kind: Type) -> Callable[..., Any]:
+        if (make, kind) not in self._made:
+            self._made[make, kind] = make(kind)
+        return self._made[make, kind]
 
     def fields(self, kind: kinds.Record) -> list[Type]:
         """The types of a message's fields, in order."""
@@ -79,9 +85,7 @@ class Values:
 
     def measure(self, kind: Type) -> Callable[[Any], int]:
         """A function that says how many bytes a value holds."""
-        if kind not in self._measures:
-            self._measures[kind] = self._measure(kind)
-        return self._measures[kind]
+        return self._once(self._measure, kind)
 
     def _measure(self, kind: Type) -> Callable[[Any], int]:
         if isinstance(kind, kinds.String | kinds.Characters):
@@ -103,74 +107,180 @@ class Values:
 
     # Zeros and copies
 
-    def zero(self, kind: Type) -> Any:
-        """A zero value, newly made; None of void."""
-        if isinstance(kind, kinds.Bool):
-            return False
-        if isinstance(kind, kinds.Floating):
-            return 0.0
-        if isinstance(kind, kinds.Integer | kinds.Time | kinds.Duration):
-            return 0
-        if isinstance(kind, kinds.String | kinds.Characters):
-            return b""
-        if isinstance(kind, kinds.Vector):
-            return [self.zero(kind.element) for _ in range(kind.length or 0)]
-        return [self.zero(field) for field in self.fields(kind)] if isinstance(kind, kinds.Record) else None
+    def maker(self, kind: Type) -> Callable[[], Any]:
+        """A function that makes a zero value (of void: None)."""
+        return self._once(self._maker, kind)
 
-    def copy(self, context: Context, kind: Type, value: Any, site: int) -> Any:
-        """A copy with all that is in it, charged."""
+    def _maker(self, kind: Type) -> Callable[[], Any]:
+        if isinstance(kind, kinds.Vector):
+            make, length, element = self.maker(kind.element), kind.length or 0, zero_of(kind.element)
+            return lambda: [make() for _ in range(length)] if element is None else [element] * length
         if isinstance(kind, kinds.Record):
-            pairs = zip(self.fields(kind), value, strict=True)
-            return [self.copy(context, field, part, site) for field, part in pairs]
+            makers = [self.maker(field) for field in self.fields(kind)]
+            return lambda: [make() for make in makers]
+        zero = zero_of(kind)
+        return lambda: zero
+
+    def copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
+        """A function that copies a value with all that is in it, charged: from context, value and site."""
+        return self._once(self._copier, kind)
+
+    def _copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
+        if isinstance(kind, kinds.Record):
+            copies = [None if kinds.is_scalar(field) else self.copier(field) for field in self.fields(kind)]
+            return lambda context, record, site: [
+                part if copy is None else copy(context, part, site)
+                for copy, part in zip(copies, record, strict=True)
+            ]
         if not isinstance(kind, kinds.Vector):
-            return value
-        context.allocate(len(value) * self.width(kind.element), site)
-        return [self.copy(context, kind.element, element, site) for element in value]
+            return lambda _context, value, _site: value
+        width, element = self.width(kind.element), self.copier(kind.element)
+        if kinds.is_scalar(kind.element):
+            return lambda context, values, site: vectors.copied(context, values, width, site)
+        return lambda context, values, site: vectors.copied_deep(context, values, width, element, site)
 
     # In a message
 
-    def decode(self, kind: Type, buffer: wire.Buffer, start: int) -> tuple[Any, int]:
-        """The value at `start`, and where it ends."""
-        if isinstance(kind, kinds.String):
-            return wire.text(buffer, start)
-        if isinstance(kind, kinds.Record):
-            record = []
-            for field in self.fields(kind):
-                value, start = self.decode(field, buffer, start)
-                record.append(value)
-            return record, start
+    def decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
+        """A function that finds the value at a position, and where it ends."""
+        return wire.text if isinstance(kind, kinds.String) else self._once(self._decoder, kind)
+
+    def _decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
         if isinstance(kind, kinds.Vector):
-            return self._decode_vector(kind, buffer, start)
-        code = struct_code(kind) or ""
-        parts, end = struct.unpack_from(f"<{code}", buffer, start), start + struct_size(code)
-        return (parts[0] * BILLION + parts[1] if len(parts) == 2 else parts[0]), end
+            return self._decoder_of_vectors(kind)
+        if not isinstance(kind, kinds.Record):
+            numbers = _unpacker([struct_code(kind) or ""])
 
-    def _decode_vector(self, kind: kinds.Vector, buffer: wire.Buffer, start: int) -> tuple[list[Any], int]:
-        number = kind.length
-        if number is None:
-            number = wire.count(buffer, start, self.least(kind.element))
-            start += 4
-        code = struct_code(kind.element)
+            def number(buffer: wire.Buffer, start: int) -> tuple[Any, int]:
+                (value,), end = numbers(buffer, start)
+                return value, end
+
+            return number
+        parts = [
+            (True, _unpacker([struct_code(field) or "" for field in run]))
+            if fixed
+            else (False, self.decoder(run[0]))
+            for fixed, run in self._runs(kind)
+        ]
+
+        def record(buffer: wire.Buffer, start: int) -> tuple[list[Any], int]:
+            values: list[Any] = []
+            for several, decode in parts:
+                found, start = decode(buffer, start)
+                if several:
+                    values += found
+                else:
+                    values.append(found)
+            return values, start
+
+        return record
+
+    def _decoder_of_vectors(self, kind: kinds.Vector) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
+        code, least, element = struct_code(kind.element), self.least(kind.element), kind.element
+        decode: Callable[[wire.Buffer, int, int], tuple[Any, int]]
         if code is None:
-            return wire.elements(buffer, start, number, lambda b, p: self.decode(kind.element, b, p))
-        if len(code) == 2:
-            return wire.moments(buffer, start, number, code[0])
-        return wire.numbers(buffer, start, number, code, struct_size(code))
-
-    def encode(self, kind: Type, value: Any, out: bytearray) -> None:
-        """Append the bytes of a value."""
-        if isinstance(kind, kinds.String):
-            wire.put_text(value, out)
-        elif isinstance(kind, kinds.Record):
-            for field, part in zip(self.fields(kind), value, strict=True):
-                self.encode(field, part, out)
-        elif isinstance(kind, kinds.Vector):
-            if kind.length is None:
-                out += struct.pack("<I", len(value))
-            else:
-                vectors.fixed(value, kind.length, -1)
-            for element in value:
-                self.encode(kind.element, element, out)
+            one = self.decoder(element)
+            decode = lambda buffer, start, number: wire.elements(buffer, start, number, one)  # noqa: E731
+        elif len(code) == 2:
+            decode = lambda buffer, start, number: wire.moments(buffer, start, number, code[0])  # noqa: E731
         else:
-            code = struct_code(kind) or ""
-            out += struct.pack(f"<{code}", *(divmod(value, BILLION) if len(code) == 2 else (value,)))
+            decode = lambda buffer, start, number: wire.numbers(buffer, start, number, code, least)  # noqa: E731
+        length = kind.length
+        if length is not None:
+            return lambda buffer, start: decode(buffer, start, length)
+        return lambda buffer, start: decode(buffer, start + 4, wire.count(buffer, start, least))
+
+    def encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
+        """A function that appends the bytes of a value."""
+        return wire.put_text if isinstance(kind, kinds.String) else self._once(self._encoder, kind)
+
+    def _encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
+        if isinstance(kind, kinds.Vector):
+            return self._encoder_of_vectors(kind)
+        if not isinstance(kind, kinds.Record):
+            pack_one = _packer([struct_code(kind) or ""])
+            return lambda value, out: out.extend(pack_one((value,)))
+        parts: list[tuple[int, int, Any, Any]] = []
+        at = 0
+        for fixed, run in self._runs(kind):
+            pack = _packer([struct_code(field) or "" for field in run]) if fixed else None
+            parts.append((at, at + len(run), pack, None if fixed else self.encoder(run[0])))
+            at += len(run)
+
+        def record(value: Any, out: bytearray) -> None:
+            for first, end, pack, encode in parts:
+                if pack is not None:
+                    out += pack(value[first:end])
+                else:
+                    encode(value[first], out)
+
+        return record
+
+    def _encoder_of_vectors(self, kind: kinds.Vector) -> Callable[[Any, bytearray], None]:
+        code, length = struct_code(kind.element) or "", kind.length
+        one = None if code else self.encoder(kind.element)
+
+        def vector(values: Any, out: bytearray) -> None:
+            if length is None:
+                out += struct.pack("<I", len(values))
+            else:
+                vectors.fixed(values, length, -1)
+            if one is not None:
+                for value in values:
+                    one(value, out)
+            elif len(code) == 2:
+                wire.put_moments(values, code[0], out)
+            else:
+                wire.put_numbers(values, code, out)
+
+        return vector
+
+    def _runs(self, kind: kinds.Record) -> Iterator[tuple[bool, list[Type]]]:
+        """The fields in groups: numbers that follow each other, or one field of another kind."""
+        for fixed, run in groupby(self.fields(kind), lambda field: struct_code(field) is not None):
+            if fixed:
+                yield True, list(run)
+            else:
+                yield from ((False, [field]) for field in run)
+
+
+def zero_of(kind: Type) -> bool | float | bytes | None:
+    """The zero of a type whose values do not change; None of void."""
+    if isinstance(kind, kinds.Bool):
+        return False
+    if isinstance(kind, kinds.Floating):
+        return 0.0
+    if isinstance(kind, kinds.Integer | kinds.Time | kinds.Duration):
+        return 0
+    return b"" if isinstance(kind, kinds.String | kinds.Characters) else None
+
+
+def _unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[Any], int]]:
+    """Numbers with these `struct` codes, one after the other, and where they end; of two parts, nanoseconds."""
+    plain = struct.Struct("<" + "".join(codes))
+    unpack, size = plain.unpack_from, plain.size
+    if all(len(code) == 1 for code in codes):
+        return lambda buffer, start: (unpack(buffer, start), start + size)
+
+    def numbers(buffer: wire.Buffer, start: int) -> tuple[Sequence[Any], int]:
+        parts = iter(unpack(buffer, start))
+        return [
+            next(parts) * BILLION + next(parts) if len(code) == 2 else next(parts) for code in codes
+        ], start + size
+
+    return numbers
+
+
+def _packer(codes: Sequence[str]) -> Callable[[Sequence[Any]], bytes]:
+    """The bytes of such numbers."""
+    pack = struct.Struct("<" + "".join(codes)).pack
+    if all(len(code) == 1 for code in codes):
+        return lambda values: pack(*values)
+
+    def packed(values: Sequence[Any]) -> bytes:
+        parts: list[Any] = []
+        for code, value in zip(codes, values, strict=True):
+            parts += divmod(value, BILLION) if len(code) == 2 else (value,)
+        return pack(*parts)
+
+    return packed

@@ -96,7 +96,7 @@ def test_shipped_specifications(data: st.DataObject) -> None:
     for topic in data.draw(st.lists(st.sampled_from(sorted(monitors.topics)), min_size=1, max_size=12)):
         kind = kinds.Record(monitors.topics[topic])
         body = bytearray()
-        values.encode(kind, data.draw(a_value(values, kind)), body)
+        values.encoder(kind)(data.draw(a_value(values, kind)), body)
         end = data.draw(st.just(len(body)) | st.integers(0, len(body)))
         traffic.append((topic, bytes(body[:end])))
     check(monitors, traffic, 50_000_000)
