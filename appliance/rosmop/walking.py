@@ -20,7 +20,7 @@ from appliance.rosmop.compile.program import groups
 from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, POSITION, Feed, FeedModule, module_of
 from appliance.rosmop.ir.module import UNDO, Cells
-from appliance.rosmop.ir.values import struct_code
+from appliance.rosmop.ir.values import Values, struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
 from appliance.rosmop.runtime.context import Context
@@ -294,7 +294,8 @@ class Walks(NamedTuple):
 def walks_of(compiled: Compiled, monitors: Sequence[Monitor]) -> Walks:
     """The walkers of all topics that can have one; their monitors are told where their state is."""
     found = list(groups(compiled.specifications))
-    module = module_of(compiled.functions, [group.component for group in found])
+    components = [group.component for group in found]
+    module = module_of(compiled.functions, components, Values(compiled.messages))
     if not module.feeds:
         return Walks()
     machine = Machine(module.code, module.memory)

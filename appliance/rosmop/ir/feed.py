@@ -30,6 +30,7 @@ from appliance.rosmop.ir.module import (
     NotScalarError,
     Writer,
 )
+from appliance.rosmop.ir.values import Values
 from appliance.rosmop.ir.wasm import (
     ELSE,
     END,
@@ -101,10 +102,12 @@ class FeedModule:
     throttles: Mapping[tuple[str, int], int]
 
 
-def module_of(functions: Mapping[str, form.Function], components: Sequence[form.Component]) -> FeedModule:
+def module_of(
+    functions: Mapping[str, form.Function], components: Sequence[form.Component], values: Values
+) -> FeedModule:
     """The module of all topics that can have a walk."""
     shared: dict[str, Cells] = {}
-    writer = Writer(functions, shared)
+    writer = Writer(functions, shared, values)
     cells = []
     for component in components:
         room = component.properties + len(component.variables)

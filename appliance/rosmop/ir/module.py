@@ -1,7 +1,7 @@
 """The scalar part of the form as WebAssembly: numbers, conditions, loops, fields that are numbers, drops.
 
-Strings of the message, and its vectors of numbers and times, are looked at where they stand: in a local variable is the
-address of the first element, and how many there are.
+Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
+has a fixed size: in a local variable is the address, and how many elements there are.
 
 `Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
 
@@ -9,8 +9,8 @@ address of the first element, and how many there are.
   `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`.
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
   it is taken back. Within a helper function it is a trap. Beyond are strings and vectors that are made, changed or
-  kept, vectors of strings and of messages, whole messages, what is put out or published, recursion, `sin` and its
-  like. An event of which no message can come past such a place has no module: `NotScalarError` names what is beyond.
+  kept, vectors of strings, whole messages, what is put out or published, recursion, `sin` and its like. An event of
+  which no message can come past such a place has no module: `NotScalarError` names what is beyond.
 - A variable of the set stands at its address, in 8 bytes. Before a field is written, what stood there is noted in the
   log (address, size, bytes; 16 bytes each) that `UNDO` points behind.
 - What the form charges is taken from the budget of its specification, as everywhere.
@@ -24,7 +24,7 @@ from typing import Any
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.interpreter import CHARGED, SHORT
-from appliance.rosmop.ir.values import struct_code, struct_size
+from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.ir.wasm import (
     ABS,
     CALCULATE,
@@ -76,16 +76,6 @@ def machine_type(kind: Type) -> int:
     raise NotScalarError(str(kind))
 
 
-def _element(kind: Type) -> tuple[Type, int]:
-    """The type of the elements of a string or vector, and the bytes of each. Raises `NotScalarError`."""
-    if isinstance(kind, kinds.String):
-        return kinds.UINT8, 1
-    code = struct_code(kind.element) if isinstance(kind, kinds.Vector) else None
-    if code is None or not isinstance(kind, kinds.Vector):
-        raise NotScalarError(str(kind))
-    return kind.element, struct_size(code)
-
-
 def _is_signed(kind: Type) -> bool:
     return not isinstance(kind, kinds.Integer) or kind.signed
 
@@ -129,7 +119,10 @@ class Written:
 class Writer:
     """The functions that are needed, in the order of their numbers, and who has which place in the memory."""
 
-    def __init__(self, functions: Mapping[str, form.Function], shared: Mapping[str, Cells]) -> None:
+    def __init__(
+        self, functions: Mapping[str, form.Function], shared: Mapping[str, Cells], values: Values
+    ) -> None:
+        self._values = values
         self.functions = functions
         self.shared = shared
         self.written: list[Written] = []
@@ -138,6 +131,40 @@ class Writer:
         self.throttles: dict[tuple[str, int], int] = {}
         """Where it stands when output at a site of a specification was last due."""
         self._used = FIRST
+
+    def size(self, kind: Type) -> int:
+        """The bytes of every value of a type in a message. Raises `NotScalarError` where they differ."""
+        code = struct_code(kind)
+        if code is not None:
+            return struct_size(code)
+        if isinstance(kind, kinds.Record):
+            return sum(map(self.size, self._values.fields(kind)))
+        if isinstance(kind, kinds.Vector) and kind.length is not None:
+            return kind.length * self.size(kind.element)
+        raise NotScalarError(str(kind))
+
+    def offset(self, kind: Type, number: int) -> int:
+        """Where a field of a message begins in it. Raises `NotScalarError` where that differs."""
+        if not isinstance(kind, kinds.Record):
+            raise NotScalarError(str(kind))
+        return sum(map(self.size, self._values.fields(kind)[:number]))
+
+    def element(self, kind: Type) -> tuple[Type, int]:
+        """The type of the elements of a string or vector, and the bytes of each. Raises `NotScalarError`."""
+        if isinstance(kind, kinds.String):
+            return kinds.UINT8, 1
+        if not isinstance(kind, kinds.Vector):
+            raise NotScalarError(str(kind))
+        return kind.element, self.size(kind.element)
+
+    def copied(self, kind: Type) -> Type:
+        """A message whose copy costs nothing. Raises `NotScalarError` of another."""
+        if isinstance(kind, kinds.Record):
+            for field in self._values.fields(kind):
+                self.copied(field)
+        elif struct_code(kind) is None:
+            raise NotScalarError(str(kind))
+        return kind
 
     def take(self, size: int) -> int:
         """The address of so many bytes of memory."""
@@ -303,11 +330,14 @@ class _Body:
         return b"\x02\x40\x03\x40" + code + b"\x0c\x00" + END + END
 
     def _for_each(self, node: form.ForEach) -> bytes:
-        kind, size = _element(node.values.type)
+        kind, size = self._writer.element(node.values.type)
         first, place, count = self._elements(node.values)
         at, left = (f"{what} {len(self._locals)}" for what in ("element", "left"))
         over = self._get(left, I64) + b"\x50\x0d\x01"
-        each = self._loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
+        if isinstance(kind, kinds.Record):
+            each = self._get(at) + self._set(f"place of {node.name}")
+        else:
+            each = self._loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
         following = self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
         less = self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
         code = first + place + self._set(at) + count + self._set(left, I64)
@@ -376,8 +406,12 @@ class _Body:
         return constant(I32, 1) + self._set("dropped")
 
     def _read_value(self, node: form.ReadValue) -> bytes:
-        _, size = _element(node.type)
         place, count, start = f"place of {node.name}", f"count of {node.name}", node.at
+        if isinstance(node.type, kinds.Record):
+            size = self._writer.size(node.type)
+            code = self._within(start, size) + self._get("at") + self._position(start) + b"\xa7\x6a"
+            return code + self._set(place) + self._position(start.plus(size)) + self._set(node.end, I64)
+        _, size = self._writer.element(node.type)
         if isinstance(node.type, kinds.Vector) and node.type.length is not None:
             code = self._within(start, node.type.length * size)
             code += constant(I64, node.type.length) + self._set(count, I64)
@@ -390,11 +424,34 @@ class _Body:
         """What comes first; the address of the first element of a string or vector, and how many there are (i64)."""
         if isinstance(node, form.Copy):
             first, place, count = self._elements(node.value)
-            size = count + constant(I64, _element(node.type)[1]) + b"\x7e"
-            return first + self._allocated(size), place, count
+            element, size = self._writer.element(node.type)
+            machine_type(element)
+            return first + self._allocated(count + constant(I64, size) + b"\x7e"), place, count
+        if (
+            isinstance(node, form.Item)
+            and isinstance(node.type, kinds.Vector)
+            and node.type.length is not None
+        ):
+            first, place = self._place(node)
+            return first, place, constant(I64, node.type.length)
         if not isinstance(node, form.Read) or f"place of {node.name}" not in self._locals:
             raise NotScalarError(str(node.type))
         return b"", self._get(f"place of {node.name}"), self._get(f"count of {node.name}", I64)
+
+    def _place(self, node: form.Expression) -> tuple[bytes, bytes]:
+        """What comes first; the address of a message within this one, or of an array of fixed length."""
+        if isinstance(node, form.Copy):
+            self._writer.copied(node.type)
+            return self._place(node.value)
+        if isinstance(node, form.Item):
+            first, place = self._place(node.base)
+            return first, place + constant(I32, self._writer.offset(node.base.type, node.number)) + b"\x6a"
+        if isinstance(node, form.Call) and node.function == "l_element":
+            name, code = f"element {len(self._locals)}", self._address_of(node)
+            return code + self._set(name), self._get(name)
+        if not isinstance(node, form.Read) or f"place of {node.name}" not in self._locals:
+            raise NotScalarError(str(node.type))
+        return b"", self._get(f"place of {node.name}")
 
     def _require(self, node: form.Require) -> bytes:
         test, leave = self._value(node.test) + b"\x45", form.Leave(node.site, False)
@@ -562,6 +619,8 @@ class _Body:
             code, place, count = self._elements(node.value)
             code += place + self._set(f"place of {node.name}")
             return code + count + self._set(f"count of {node.name}", I64)
+        if isinstance(node.type, kinds.Record) and node.name not in self._writer.shared:
+            return b"".join(self._place(node.value)) + self._set(f"place of {node.name}")
         machine, value = machine_type(node.type), self._value(node.value)
         cells = self._writer.shared.get(node.name)
         if cells is None:
@@ -714,7 +773,7 @@ class _Body:
         return self._if(waits + b"\x45", self._elsewhere) + constant(I32, 0)
 
     def _accumulate(self, node: form.Accumulate) -> bytes:
-        kind, size = _element(node.vector.type)
+        kind, size = self._writer.element(node.vector.type)
         code, place, count = self._elements(node.vector)
         number = len(self._locals)
         total, each = (f"{what} {number}" for what in ("sum", "summand"))
@@ -791,14 +850,23 @@ class _Body:
         return code + b"\xa7" if machine_type(node.type) == I32 else code
 
     def _element_at(self, node: form.Call) -> bytes:
+        code = self._address_of(node) + self._set("element")
+        return code + self._loaded(self._get("element"), 0, node.type)
+
+    def _item(self, node: form.Item) -> bytes:
+        machine_type(node.type)
+        first, place = self._place(node.base)
+        return first + self._loaded(place, self._writer.offset(node.base.type, node.number), node.type)
+
+    def _address_of(self, node: form.Call) -> bytes:
+        """The address of an element."""
         values, index = node.arguments
-        kind, size = _element(values.type)
+        _, size = self._writer.element(values.type)
         first, place, count = self._elements(values)
         code = first + self._value(index) + self._set("index", I64)
         past = self._get("index", I64) + count + b"\x5a"
         code += self._if(past, self._elsewhere)
-        at = place + self._get("index", I64) + b"\xa7" + constant(I32, size) + b"\x6c\x6a"
-        return code + at + self._set("element") + self._loaded(self._get("element"), 0, kind)
+        return code + place + self._get("index", I64) + b"\xa7" + constant(I32, size) + b"\x6c\x6a"
 
     def _question(self, argument: form.Expression, operator: str) -> bytes:
         """Compare the size of a number with infinity."""
@@ -887,6 +955,9 @@ class _Body:
             if isinstance(argument.type, kinds.String | kinds.Vector):
                 parameters |= {f"place of {name}": I32, f"count of {name}": I64}
                 code += b"".join(self._elements(argument))
+            elif isinstance(argument.type, kinds.Record):
+                parameters[f"place of {name}"] = I32
+                code += b"".join(self._place(argument))
             else:
                 parameters[name] = machine_type(argument.type)
                 code += self._value(argument)
@@ -980,6 +1051,7 @@ _EXPRESSIONS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = MappingProxyTy
         form.Not: _Body._not,
         form.Conditional: _Body._conditional,
         form.Sequence: _Body._sequence,
+        form.Item: _Body._item,
         form.Accumulate: _Body._accumulate,
         form.Throttle: _Body._throttle,
         form.Call: _Body._call,

@@ -3,6 +3,7 @@
 import struct
 from collections import Counter
 from collections.abc import Iterable
+from random import Random
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -16,6 +17,7 @@ from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walking import BEGINNING, Walker
+from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.interpreted import beside, check_same
 from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
 
@@ -295,6 +297,40 @@ def test_arrays_that_lie_and_arrays_that_end_with_the_message() -> None:
     for length in (1, 3, 2**29, 2**31, 2**32 - 1):
         fed.check([STAMPED[:25] + struct.pack("<I", length) + STAMPED[29:], STAMPED], "/stamped")
     assert fed.came["together"]
+
+
+SHAPES = {
+    "points of a polygon": "double n = 0; double far(const geometry_msgs::Point32& p) { return p.x * p.x - p.y; }"
+    " event e(geometry_msgs::Point32[] points) /s geometry_msgs/PolygonStamped '{polygon.points:points}' {"
+    " for (const auto& p : points) { n += far(p); } for (auto &p : points) { n += p.z; }"
+    " for (geometry_msgs::Point32 p : points) { n = n / 2 + p.x; }"
+    " for (int i = 0; i < points.size(); i++) { n += points[i].y; } n += points[1].x; }",
+    "part of a message": "double n = 0; geometry_msgs::Point last; event e(geometry_msgs::Pose p, double s) /s"
+    " nav_msgs/Odometry '{pose.pose:p, twist.twist.linear.x:s}' {"
+    " const geometry_msgs::Point q = p.position; n += q.x + p.orientation.w; s = p.position.y;"
+    " if (q.z > 1) { last = q; } if (q.z < -1) { p.position.x = 7; } }",
+    "arrays in a message": "double n = 0; event e(geometry_msgs::PoseWithCovariance p, int k) /s nav_msgs/Odometry"
+    " '{pose:p, header.seq:k}' { n += p.covariance[k]; for (double c : p.covariance) { n += c; }"
+    " n += p.covariance.size() + std::accumulate(p.covariance.begin(), p.covariance.end() - k, 0.0); }",
+    "a message whose size differs": "int n = 0; event e(std_msgs::Header h) /s nav_msgs/Odometry '{header:h}' {"
+    " n += h.seq; }",
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_messages_within_messages(name: str) -> None:
+    """Of fixed size they are looked at where they stand: fields, elements, copies; cut after each byte."""
+    fed, random = Fed(f"s() {{ {SHAPES[name]} }}"), Random(7)  # noqa: S311  draws examples, not keys
+    for _ in range(12):
+        points = [{axis: float(random.randint(-3, 3)) for axis in "xyz"} for _ in range(random.randint(0, 4))]
+        body = message("geometry_msgs/PolygonStamped", polygon__points=points)
+        if "Odometry" in SHAPES[name]:
+            values = {f"pose__pose__position__{axis}": float(random.randint(-3, 3)) for axis in "xyz"}
+            body = message("nav_msgs/Odometry", header__seq=random.randint(0, 40),
+                           pose__covariance=[random.random() for _ in range(36)], **values)  # fmt: skip
+        cuts = [body[: random.randrange(len(body))] for _ in range(3)]
+        fed.check([body, body, *cuts, body], "/s")
+    assert bool(fed.came["together"]) == ("differs" not in name)
 
 
 @pytest.mark.parametrize("text", ["", "a", "abc", "map_frame", "a name of thirty bytes exactly", "x" * 64])
