@@ -127,7 +127,7 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
         if settings.monitors is not None:
             more.append(f"Monitors: {settings.monitors} (rosrv monitor list)")
         if rest is not None:
-            more.append(f"REST: {rest}")
+            more += [f"Console: {rest}/console/", f"REST: {rest}"]
         if said.token is not None:
             more.append(f"The first access token (admin) is in {_keep_token(settings.state, said.token)}")
     try:

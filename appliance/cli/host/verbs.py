@@ -153,6 +153,8 @@ def list_hosts(
             say("  ".join(_words(row)))
     if as_json or group is not None:
         return
+    if not body.hosts:
+        say("no host is enrolled, awaited or declared: rosrv host add NAME")
     for machine in body.machines:
         nodes = f"{machine.nodes} nodes in clear text"
         say("  ".join([f"{machine.address:<37} {nodes:<13}", _ports_words(machine.ports)]))

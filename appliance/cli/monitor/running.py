@@ -46,7 +46,10 @@ def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
         done = (f"({row.would_drop})", f"({row.would_change})") if row.trial else (row.drops, row.changes)
         counts = map(str, (row.events, row.verdicts, *done, row.faults))
         table.add_row(row.name, _state(row), "\n".join(row.topics + row.services), *counts)
-    Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE).print(table)
+    if body.monitors:
+        Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE).print(table)
+    else:
+        say("no monitor is loaded: rosrv monitor load FILE…")
     if any(row.trial for row in body.monitors):
         say("(in brackets: what a monitor on trial would have dropped and changed)", "dim")
     source = f" ({body.folder})" if body.folder else ""

@@ -208,6 +208,7 @@ def test_without_json_the_first_token_is_in_a_file(tmp_path: Path) -> None:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert len(process.output().splitlines()) == 1
         url = said("REST: ").partition(" ")[2]
+        assert said("Console: ") == f"Console: {url}/console/"
         rest = Rest(url, path.read_text().strip())
         assert rest.post("/v1/policy/reload", match="*").status == 200
 

@@ -9,8 +9,17 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from appliance.channel.admin import AdminAnswer, AdminRequest, HostEndpoint, HostList, HostRevoke, HostToken
+from appliance.channel.admin import (
+    AdminAnswer,
+    AdminRequest,
+    HostEndpoint,
+    HostList,
+    HostRevoke,
+    HostToken,
+    MonitorsWanted,
+)
 from appliance.channel.answers.hosts import Endpoint, EnrolmentToken, Hosts, KitParts, Revoked
+from appliance.channel.answers.monitors import Monitors
 from appliance.cli.admin_socket import AdminSocket
 from appliance.cli.main import app
 from tests.support.answers import example
@@ -84,6 +93,18 @@ def test_the_list_says_all_of_it(asked: list[AdminRequest[Any]]) -> None:
     ):  # fmt: skip
         assert words in text, words
     assert asked == [HostList()]
+
+
+def test_lists_of_nothing_say_what_to_do_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who has no host, or no monitor, is told how to get one; `--json` has no lines then."""
+    nothing: dict[type, Any] = {
+        HostList: example(Hosts, hosts=[]),
+        MonitorsWanted: example(Monitors, monitors=[]),
+    }
+    monkeypatch.setattr(AdminSocket, "ask", lambda _self, request: AdminAnswer(True, nothing[type(request)]))
+    for noun, words in (("host", "rosrv host add NAME"), ("monitor", "rosrv monitor load FILE")):
+        assert words in CliRunner().invoke(app, [noun, "list"]).stdout
+        assert CliRunner().invoke(app, [noun, "list", "--json"]).stdout == ""
 
 
 def test_a_group_of_hosts(asked: list[AdminRequest[Any]]) -> None:
