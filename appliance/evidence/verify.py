@@ -199,11 +199,8 @@ class Verifier:
 
     def records(self, name: str) -> Iterator[dict[str, Any]]:
         """The records of a member, each after it was held against the chain."""
-        place, digest, begin = (
-            0,
-            b"",
-            0,
-        )  # how far the chain leads; the first record that no checkpoint seals yet
+        # How far the chain leads, its hash there, and the first record that no checkpoint seals yet.
+        place, digest, begin = 0, b"", 0
         with self.open(name) as lines:
             for line in lines:
                 record = json.loads(line)
@@ -223,10 +220,14 @@ class Verifier:
                 begin, place, digest = begin or sequence, sequence, own
                 for content in chain["then"] or ():
                     place, digest = place + 1, sha256(digest + b"2" + unhexed(content))
-                checkpoint = chain.get("checkpoint")
-                if checkpoint:
+                if chain["then"] is None:
+                    runs = [run for run in self.manifest["runs"] if begin <= run[1] and run[0] <= sequence]
+                    text = f"records {begin} to {sequence}: lead to no checkpoint; version 0.1.0 wrote what follows"
+                    (self.findings if runs else self.notes).append(text)
                     begin = 0
-                    self.look_at_checkpoint(checkpoint, place, digest.hex())
+                elif chain.get("checkpoint"):
+                    self.look_at_checkpoint(chain["checkpoint"], place, digest.hex())
+                    begin = 0
                 yield record
         if begin or not place:
             self.findings.append(f"{name}: no signed checkpoint seals what begins with record {begin}")

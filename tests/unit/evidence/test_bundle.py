@@ -1,5 +1,6 @@
 """A bundle has what happened and what was in force, and proves itself with Python and openssl alone."""
 
+import hashlib
 import itertools
 import json
 import random
@@ -349,6 +350,35 @@ def test_what_is_not_proven_is_said(control: Control, tmp_path: Path, reviewer: 
     assert "unproven  policies/8.ini: it was loaded by a version that recorded no hash" in reviewer.said
     assert "unproven  policies/9.ini: the appliance does not have it" in reviewer.said
     assert "unproven  that record" in reviewer.said
+
+
+def _as_before(previous: bytes, columns: tuple[object, ...]) -> bytes:
+    """The hash that version 0.1.0 made of a record."""
+    return hashlib.sha256(previous + msgspec.msgpack.encode(columns)).digest()
+
+
+def test_a_load_before_the_upgrade(make_log: MakeLog, tmp_path: Path, reviewer: Reviewer) -> None:
+    """What version 0.1.0 wrote is right as it is; that nothing leads from its load to a checkpoint is said."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("appliance.audit.writer.record_hash", _as_before)
+        before = Control(make_log(checkpoint_seconds=3600))
+        before.load_policy(7, OPEN)
+        before.work(5)
+        before.log.close()
+    control = Control(make_log(checkpoint_seconds=3600))
+    control.trail.revision, control.policies, control.worked = 7, before.policies, before.worked
+    control.work(5)
+    bundle = control.exported(tmp_path / "a.zip")
+    assert reviewer.status(bundle) == 0, reviewer.said
+    assert re.search(r"unproven  records \d+ to \d+: lead to no checkpoint; version 0\.1\.0", reviewer.said)
+    assert reviewer.status(control.exported(tmp_path / "b.zip", since=before.begun)) == 0, reviewer.said
+
+    def loosen(records: list[dict[str, Any]]) -> None:
+        for record in records:
+            record["chain"] = {**record["chain"], "then": None, "checkpoint": None}
+
+    assert reviewer.status(written(lines(members_of(bundle), loosen), tmp_path / "x.zip")) == 1
+    assert re.search(r"WRONG +records \d+ to \d+: lead to no checkpoint", reviewer.said)
 
 
 def test_what_retention_removed_is_said(
