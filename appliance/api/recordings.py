@@ -4,12 +4,12 @@ No change here needs `If-Match`: a recording never changes, it only ends.
 """
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path as FilePath
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
-from fastapi import Path, Request, Response
+from fastapi import Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 
 from appliance.api.access import Bearer
@@ -21,6 +21,7 @@ from appliance.api.streams import Held, Streams, peer_of
 from appliance.channel import admin
 from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.recordings import Recording, RecordingBegun, Recordings
+from appliance.recorder.mcap import as_mcap
 from appliance.shares.table import REST_EXPORTS
 
 _PIECE = 1 << 20
@@ -28,7 +29,7 @@ _SLOW_SECONDS = 15.0  # longer than control waits for the recorder
 _UNKNOWN: Responses = {404: {"description": "There is no such recording, or the flight recorder is off."}}
 _BAG: Responses = {
     200: {
-        "description": "The bag (rosbag, format 2.0)",
+        "description": "The bag (rosbag, format 2.0), or MCAP (profile ros1)",
         "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
     }
 }
@@ -74,11 +75,16 @@ def routes(services: Services) -> Routes:
         responses=_BAG | _UNKNOWN,
         response_class=Response,
     )
-    async def bag(recording_id: OneId, request: Request, bearer: Investigator) -> Response:
+    async def bag(
+        recording_id: OneId,
+        request: Request,
+        bearer: Investigator,
+        format: Annotated[Literal["bag", "mcap"], Query(description="mcap: made of the bag")] = "bag",  # noqa: A002
+    ) -> Response:
         """The messages of a recording, for investigators; it is recorded who fetched them."""
         give_back = fetches.take(bearer, peer_of(request), "fetches")
         try:
-            return Held(await _bag(services, recording_id, bearer), give_back)
+            return Held(await _bag(services, recording_id, bearer, mcap=format == "mcap"), give_back)
         except BaseException:
             give_back()
             raise
@@ -92,20 +98,27 @@ def routes(services: Services) -> Routes:
     return router
 
 
-async def _bag(services: Services, recording_id: str, bearer: Bearer) -> Response:
+async def _bag(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:
     """The file, once it is on record who fetches it."""
     found = answered(await services.control.ask(admin.RecordingFetch(recording_id), bearer, _SLOW_SECONDS))
     path = services.settings.state / "recordings" / found.id / "recording.bag"
     if not await asyncio.to_thread(path.is_file):
         raise ProblemError(503, "not-available", f"the bag of {found.id} is not there any more")
-    headers = {
-        "Content-Length": str(found.size),
-        "Content-Disposition": f'attachment; filename="rosrv-{found.id}.bag"',
-    }
-    return StreamingResponse(_pieces(path), media_type="application/octet-stream", headers=headers)
+    pieces = as_mcap(path) if mcap else _pieces_of(path)
+    name = f"rosrv-{found.id}.{'mcap' if mcap else 'bag'}"
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    if not mcap:
+        headers["Content-Length"] = str(found.size)
+    return StreamingResponse(_in_thread(pieces), media_type="application/octet-stream", headers=headers)
 
 
-async def _pieces(path: FilePath) -> AsyncIterator[bytes]:
-    with await asyncio.to_thread(path.open, "rb") as file:
-        while piece := await asyncio.to_thread(file.read, _PIECE):
+def _pieces_of(path: FilePath) -> Iterator[bytes]:
+    with path.open("rb") as file:
+        while piece := file.read(_PIECE):
+            yield piece
+
+
+async def _in_thread(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
+    while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
+        if piece:
             yield piece

@@ -80,13 +80,16 @@ def fetch(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The file (default: rosrv-ID.bag)", show_default=False)
     ] = None,
+    mcap: Annotated[
+        bool, typer.Option("--mcap", help="As MCAP (rosrv-ID.mcap), for Foxglove and others")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Write a recording's bag to a file; it is recorded who fetched it.
 
     Example: rosrv record fetch 1879f3c2a4b5d6e7f012 && rosbag info rosrv-1879f3c2a4b5d6e7f012.bag
     """
-    target = out or Path(f"rosrv-{recording}.bag")
+    target = out or Path(f"rosrv-{recording}.{'mcap' if mcap else 'bag'}")
     if target.exists():
         raise usage_error(f"{target} is there already")
     part = target.with_name(f"{target.name}.part")
@@ -94,7 +97,9 @@ def fetch(
         body = _fetched(appliance, recording, part, as_json=as_json)
         with part.open("rb") as file:
             whole = hashlib.file_digest(file, "sha256").hexdigest() == body.sha256
-        if whole:
+        if whole and mcap:
+            _convert(part, target)
+        elif whole:
             part.replace(target)
     except OSError as error:
         raise usage_error(f"{error.filename}: {error.strerror}") from None
@@ -106,7 +111,7 @@ def fetch(
         )
         raise typer.Exit(1)
     if as_json:
-        say_json({"file": str(target), "sha256": body.sha256})
+        say_json({"file": str(target), "sha256": body.sha256, "format": "mcap" if mcap else "bag"})
     else:
         say(f"{target}: {_summary(body)}")
 
@@ -138,6 +143,22 @@ def _fetched(appliance: Appliance, recording: str, part: Path, *, as_json: bool)
     except (ProblemError, NotRunningError) as error:
         raise usage_error(str(error)) from None
     return body
+
+
+def _convert(bag: Path, target: Path) -> None:
+    """Write the bag as MCAP. Raises `OSError`; ends the program with 1 where a message type makes no sense."""
+    from rosbags.rosbag1 import ReaderError  # noqa: PLC0415  slow to import
+
+    from appliance.recorder.mcap import as_mcap  # noqa: PLC0415
+
+    try:
+        with target.open("xb") as file:
+            for piece in as_mcap(bag):
+                file.write(piece)
+    except (ReaderError, ValueError) as error:
+        target.unlink()
+        typer.echo(f"rosrv: it cannot be made MCAP, fetch the bag: {error}", err=True)
+        raise typer.Exit(1) from None
 
 
 def _seconds(option: str, given: str | None) -> float | None:

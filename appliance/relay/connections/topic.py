@@ -99,9 +99,6 @@ class Recorder(Protocol):
         """A publisher is connected; None: what it says is not recorded."""
 
 
-_RECORDED_FIRST = 16 << 10
-"""What is longer is given to the flight recorder when subscribers have it, unless monitors may change it in place."""
-
 Through = Callable[[Batch], Batch | None]
 """Monitors: the frames that go on, as they leave them; None when none does."""
 
@@ -268,16 +265,16 @@ class RelayedTopic:
         self._reported = False
         batch.first = self._next
         self._next += batch.messages
-        if self._recording is None:
+        recording = self._recording
+        if recording is None:
             self._pass(batch, since)
-        elif self._through is not None or len(batch.view) <= _RECORDED_FIRST:
-            self._recording.write(batch.view, batch.messages, batch.first)
-            self._pass(batch, since)
-        else:
-            recording, view, messages, first = self._recording, batch.view, batch.messages, batch.first
-            self._pass(batch, since)
-            if recording is self._recording:
-                recording.write(view, messages, first)
+            return
+        # Recorded when subscribers have it, so that nothing is later; monitors may change it in place meanwhile.
+        view = batch.view if self._through is None else memoryview(bytes(batch.view))
+        messages, first = batch.messages, batch.first
+        self._pass(batch, since)
+        if recording is self._recording:
+            recording.write(view, messages, first)
 
     def _pass(self, batch: Batch, since: float) -> None:
         """What a limit lets pass goes on."""

@@ -1,0 +1,140 @@
+"""A bag as MCAP, piece by piece, for tools that read no bags. Format: https://mcap.dev/spec.
+
+`rosbags` writes MCAP of ROS 2 only. Messages stay the bytes that they are (profile `ros1`), in the order of their
+times, in chunks that are not compressed; each has its index, and the summary at the end has them all.
+"""
+
+import struct
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from rosbags.interfaces import Connection, ConnectionExtRosbag1
+from rosbags.rosbag1 import Reader
+
+_MAGIC = b"\x89MCAP0\r\n"
+_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)
+_STATISTICS, _DATA_END = 0x0B, 0x0F
+_CHUNK_BYTES = 1 << 20
+
+
+def as_mcap(bag: Path) -> Iterator[bytes]:
+    """The pieces of the MCAP file. Raises `OSError`, `rosbags.rosbag1.ReaderError` and `ValueError` for no good bag."""
+    with Reader(bag) as reader:
+        writer = _Writer()
+        head = _MAGIC + _record(_HEADER, _text("ros1"), _text("rosrv"))
+        yield head
+        writer.position = len(head)
+        for connection, time, data in reader.messages():
+            writer.add(connection, time, data)
+            if len(writer.chunk) >= _CHUNK_BYTES:
+                yield writer.close_chunk()
+        yield writer.close_chunk()
+        yield writer.summary()
+
+
+class _Writer:
+    """Collects a chunk, and what the summary says; `position` is where the next piece begins."""
+
+    def __init__(self) -> None:
+        self.position = 0
+        self.chunk = bytearray()
+        self._index: dict[int, list[tuple[int, int]]] = {}
+        self._schemas: dict[tuple[str, str], bytes] = {}
+        self._channels: dict[int, bytes] = {}
+        self._numbers: dict[int, int] = {}
+        self._chunks: list[bytes] = []
+        self._counts: Counter[int] = Counter()
+        self._times: tuple[int, int] = (0, 0)
+
+    def add(self, connection: Connection, time: int, data: bytes | memoryview) -> None:
+        """A message; before the first of its connection comes what describes it."""
+        channel = self._numbers.get(connection.id) or self._describe(connection)
+        self._index.setdefault(channel, []).append((time, len(self.chunk)))
+        head = struct.pack("<HIQQ", channel, self._counts[channel] & 0xFFFFFFFF, time, time)
+        self.chunk += _record(_MESSAGE, head, bytes(data))
+        first, last = self._times
+        self._times = (min(first, time), max(last, time)) if self._counts else (time, time)
+        self._counts[channel] += 1
+
+    def _describe(self, connection: Connection) -> int:
+        package, _, kind = connection.msgtype.partition("/")
+        name, text = f"{package}/{kind.rpartition('/')[2]}", connection.msgdef.data
+        if (name, text) not in self._schemas:
+            number = len(self._schemas) + 1
+            self._schemas[name, text] = _record(
+                _SCHEMA, struct.pack("<H", number), _text(name), _text("ros1msg"), _text(text)
+            )
+            self.chunk += self._schemas[name, text]
+        schema = list(self._schemas).index((name, text)) + 1
+        channel = self._numbers[connection.id] = len(self._numbers) + 1
+        of_publisher = {"md5sum": connection.digest}
+        if isinstance(connection.ext, ConnectionExtRosbag1):
+            said = {"callerid": connection.ext.callerid, "latching": str(connection.ext.latching or 0)}
+            of_publisher |= {key: value for key, value in said.items() if value is not None}
+        self._channels[channel] = _record(
+            _CHANNEL,
+            struct.pack("<HH", channel, schema),
+            _text(connection.topic),
+            _text("ros1"),
+            _map(b"".join(_text(key) + _text(value) for key, value in of_publisher.items())),
+        )
+        self.chunk += self._channels[channel]
+        return channel
+
+    def close_chunk(self) -> bytes:
+        """The chunk and its indexes; empty where there is no message."""
+        if not self._index:
+            return b""
+        times = [time for entries in self._index.values() for time, _offset in entries]
+        size = len(self.chunk)
+        head = struct.pack("<QQQI", min(times), max(times), size, 0) + _text("") + struct.pack("<Q", size)
+        chunk = _record(_CHUNK, head, self.chunk)
+        indexes, offsets = bytearray(), {}
+        for channel, entries in self._index.items():
+            offsets[channel] = self.position + len(chunk) + len(indexes)
+            packed = b"".join(struct.pack("<QQ", *entry) for entry in entries)
+            indexes += _record(_MESSAGE_INDEX, struct.pack("<H", channel), _map(packed))
+        self._chunks.append(
+            _record(
+                _CHUNK_INDEX,
+                struct.pack("<QQQQ", min(times), max(times), self.position, len(chunk)),
+                _numbers(offsets),
+                struct.pack("<Q", len(indexes)),
+                _text(""),
+                struct.pack("<QQ", size, size),
+            )
+        )
+        self.position += len(chunk) + len(indexes)
+        self.chunk, self._index = bytearray(), {}
+        return chunk + bytes(indexes)
+
+    def summary(self) -> bytes:
+        """The end of the file."""
+        end = _record(_DATA_END, struct.pack("<I", 0))
+        start = self.position + len(end)
+        statistics = struct.pack(
+            "<QHIIIIQQ",
+            self._counts.total(), len(self._schemas), len(self._channels), 0, 0, len(self._chunks), *self._times,
+        )  # fmt: skip
+        described = b"".join((*self._schemas.values(), *self._channels.values()))
+        footer = _record(_FOOTER, struct.pack("<QQI", start, 0, 0))
+        return b"".join((
+            end, described, _record(_STATISTICS, statistics, _numbers(self._counts)), *self._chunks, footer, _MAGIC
+        ))  # fmt: skip
+
+
+def _record(op: int, *parts: bytes | bytearray) -> bytes:
+    return struct.pack("<BQ", op, sum(map(len, parts))) + b"".join(parts)
+
+
+def _text(text: str) -> bytes:
+    return _map(text.encode("utf-8", "replace"))
+
+
+def _map(content: bytes) -> bytes:
+    return struct.pack("<I", len(content)) + content
+
+
+def _numbers(numbers: Mapping[int, int]) -> bytes:
+    return _map(b"".join(struct.pack("<HQ", *row) for row in numbers.items()))

@@ -1,0 +1,64 @@
+"""MCAP: another library reads what was written, with types, senders and times."""
+
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag1 import ReaderError
+from rosbags.rosbag2.storage_mcap import McapReader
+
+from appliance.recorder.bag import BagWriter, Message
+from appliance.recorder.mcap import as_mcap
+from tests.unit.recorder.test_bag import HEADER, SECOND, body
+
+
+def read(path: Path, bag: Path) -> tuple[list[tuple[str, str, int]], list[tuple[str, int, bytes]]]:
+    """Connections (topic, type, messages) and messages, as `rosbags` finds them.
+
+    It takes files that say they are of ROS 2 only; all else is the same for both.
+    """
+    path.write_bytes(b"".join(as_mcap(bag)).replace(b"ros1", b"ros2"))
+    reader = McapReader(path)
+    reader.open()
+    try:
+        connections = [(one.topic, one.msgtype, one.msgcount) for one in reader.connections]
+        found = [(one.topic, time, bytes(data)) for one, time, data in reader.messages(reader.connections)]
+        assert all(schema.encoding == "ros2msg" for schema in reader.schemas.values())
+        assert all(channel.message_encoding == "ros2" for channel in reader.channels.values())
+        return connections, found
+    finally:
+        reader.close()
+
+
+@pytest.mark.parametrize("size", [5, 600_000])
+def test_another_library_reads_it(tmp_path: Path, size: int) -> None:
+    """In the order of times, however many chunks it takes; two publishers of a topic are two channels."""
+    bag = BagWriter(tmp_path / "a.bag", {})
+    first, second = bag.connect(HEADER), bag.connect(HEADER | {"callerid": "/other"})
+    third = bag.connect(HEADER | {"topic": "/quiet", "type": "std_msgs/Empty", "message_definition": "\n"})
+    messages = [
+        Message([first, second, third][number % 3], number * SECOND + 7, body(bytes([number]) * size))
+        for number in range(9)
+    ]
+    bag.write(reversed(messages))
+    bag.close()
+    connections, found = read(tmp_path / "a.mcap", tmp_path / "a.bag")
+    assert [(topic, kind.replace("/msg/", "/"), count) for topic, kind, count in connections] == [
+        ("/chatter", "std_msgs/String", 3),
+        ("/chatter", "std_msgs/String", 3),
+        ("/quiet", "std_msgs/Empty", 3),
+    ]
+    topics = ["/chatter", "/chatter", "/quiet"]
+    assert found == [(topics[number % 3], one.time, one.body) for number, one in enumerate(messages)]
+
+
+def test_a_bag_without_messages_is_a_file(tmp_path: Path) -> None:
+    """That says so."""
+    BagWriter(tmp_path / "a.bag", {}).close()
+    assert read(tmp_path / "a.mcap", tmp_path / "a.bag") == ([], [])
+
+
+def test_what_is_no_bag_is_an_error(tmp_path: Path) -> None:
+    """Before the first byte."""
+    (tmp_path / "a.bag").write_text("no bag")
+    with pytest.raises(ReaderError):
+        next(as_mcap(tmp_path / "a.bag"))
