@@ -62,6 +62,10 @@ VERBS: dict[str, Verb | Group] = {
                 "appliance.cli.monitor.learning:learn_monitors",
                 "Propose specifications out of recordings of a robot that behaves, for a person to edit.",
             ),
+            "replay": Verb(
+                "appliance.cli.monitor.replaying:replay_monitor",
+                "Say what a monitor would have dropped and changed of recordings, where, and how often.",
+            ),
             "coverage": Verb(
                 "appliance.cli.monitor.coverage:coverage",
                 "Say which events, branches, handlers, states and transitions recordings exercised, and what never"

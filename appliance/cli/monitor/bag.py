@@ -89,7 +89,7 @@ class Recorded:
                 raise usage_error(f"the bag {path} has no messages")
             self.definitions = definitions_of(reader)
             for connection in reader.connections:
-                if not any(fnmatchcase(connection.topic, pattern) for pattern in patterns):
+                if not _fits(connection, patterns):
                     continue
                 kind = ros_type(connection.msgtype)
                 other = self.topics.setdefault(connection.topic, kind)
@@ -166,17 +166,26 @@ class Recording:
         self._writer.write(self._connections[header], time_ns, data)
 
 
-def replay(monitors: MonitorSet, reader: Reader, output: Recording | None) -> Iterator[Replayed]:
-    """Give every message of a bag to the monitors, in the order of the bag, with its clock."""
+def replay(
+    monitors: MonitorSet, reader: Reader, output: Recording | None, topics: Sequence[str] = ("*",)
+) -> Iterator[Replayed]:
+    """Give the messages of a bag on these topics (patterns) to the monitors, in its order and with its clock."""
     started: Outcome | None = None
-    refusals = {connection.id: _refusal(monitors, connection) for connection in reader.connections}
+    refusals = {
+        connection.id: _refusal(monitors, connection)
+        for connection in reader.connections
+        if _fits(connection, topics)
+    }
     expected = frozenset(
-        connection.topic for connection in reader.connections if refusals[connection.id] is None
+        connection.topic for connection in reader.connections if refusals.get(connection.id, "") is None
     )
+    begun = False
     try:
         for index, (connection, time_ns, data) in enumerate(reader.messages()):
-            if not index:
-                started = monitors.start(time_ns, expected)
+            if connection.id not in refusals:
+                continue
+            if not begun:
+                started, begun = monitors.start(time_ns, expected), True
             outcome = _outcome(monitors, connection, time_ns, data, refusals[connection.id])
             if started is not None:
                 outcome = _after(started, outcome)
@@ -225,7 +234,11 @@ def _refusal(monitors: MonitorSet, connection: Connection) -> str | None:
     return None
 
 
-def refusals(monitors: MonitorSet, reader: Reader) -> list[str]:
-    """What to tell about topics that are refused."""
-    found = [_refusal(monitors, connection) for connection in reader.connections]
+def _fits(connection: Connection, topics: Sequence[str]) -> bool:
+    return any(fnmatchcase(connection.topic, pattern) for pattern in topics)
+
+
+def refusals(monitors: MonitorSet, reader: Reader, topics: Sequence[str] = ("*",)) -> list[str]:
+    """What to tell about topics that are refused, of those that fit one of the patterns."""
+    found = [_refusal(monitors, connection) for connection in reader.connections if _fits(connection, topics)]
     return sorted({text for text in found if text is not None})

@@ -18,7 +18,8 @@ from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.running import Appliance, body_or_exit, speaks
 from appliance.cli.trials import ConfirmWithin, say_deadline, seconds_within
 
-_WIDE = 200  # columns where nobody looks at them through a window
+WIDE = 200
+"""Columns where nobody looks at them through a window."""
 
 _Names = Annotated[
     list[str], typer.Argument(metavar="MONITOR…", show_default=False, autocompletion=completion.monitors)
@@ -47,7 +48,7 @@ def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
         counts = map(str, (row.events, row.verdicts, *done, row.faults))
         table.add_row(row.name, _state(row), "\n".join(row.topics + row.services), *counts)
     if body.monitors:
-        Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE).print(table)
+        Console(highlight=False, width=None if sys.stdout.isatty() else WIDE).print(table)
     else:
         say("no monitor is loaded: rosrv monitor load FILE…")
     if any(row.trial for row in body.monitors):

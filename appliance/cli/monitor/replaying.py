@@ -1,0 +1,184 @@
+"""`rosrv monitor replay`: what a monitor would have dropped and changed of recordings, where, and how often."""
+
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import typer
+from rich.console import Console
+from rich.table import Column, Table
+from rosbags.rosbag1 import Reader
+
+from appliance.channel import admin
+from appliance.cli.monitor.bag import Replayed, definitions_of, open_bag, refusals, replay
+from appliance.cli.monitor.input import read_definitions, read_specifications, usage_error
+from appliance.cli.monitor.output import BILLION
+from appliance.cli.monitor.running import WIDE
+from appliance.cli.output import Json, counted, printable, say, say_json
+from appliance.cli.progress import progress
+from appliance.cli.running import Appliance, speaks
+from appliance.ros.definitions import Definitions
+from appliance.ros.standard import standard_definitions
+from appliance.rosmop.engine import MonitorSet, sharing
+from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.syntax.errors import SpecificationError
+
+_KINDS = ("drop", "change", "verdict", "warning", "fault")
+_WOULD = {"drop": "would drop it", "change": "would change it"}
+_TOLD_EVERY = 1000
+
+
+class _Found(NamedTuple):
+    """Something that a monitor would have done."""
+
+    monitor: str
+    kind: str
+    text: str
+
+
+@speaks
+def replay_monitor(
+    appliance: Appliance,
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="MONITOR|FILE",
+            help="A monitor of the running appliance, or a file (.rv)",
+            show_default=False,
+        ),
+    ],
+    *,
+    bags: Annotated[
+        list[Path], typer.Option("--bag", metavar="FILE", help="A recording (repeatable)", show_default=False)
+    ],
+    topics: Annotated[
+        list[str] | None,
+        typer.Option("--topic", metavar="PATTERN", help="Only these topics; `*` fits anything (repeatable)"),
+    ] = None,
+    most: Annotated[
+        int, typer.Option("--most", min=0, metavar="N", help="Places shown of each monitor, topic and kind")
+    ] = 10,
+    msg: Annotated[
+        list[Path] | None,
+        typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Say what a monitor would have dropped and changed of recordings, where, and how often.
+
+    Each recording begins in the monitor's initial state. With --json all places, one object each.
+
+    Example: rosrv monitor replay safeTrigger --bag monday.bag --bag tuesday.bag
+    """
+    report = _Report(most, as_json)
+    messages = 0
+    try:
+        texts, definitions, chosen = _specifications(appliance, what, msg or [], as_json=as_json)
+        for bag in bags:
+            with closing(open_bag(bag)) as reader:
+                monitors = MonitorSet.load(texts, definitions_of(reader).extended(definitions))
+                if chosen is not None:
+                    uses = {one.name: one.code.uses for one in monitors.monitors}
+                    together = next(group for group in sharing(uses) if chosen in group)
+                    monitors.switch({name: name in together for name in uses}, 0)
+                for text in refusals(monitors, reader, topics or ["*"]):
+                    raise usage_error(f"{bag}: {text}")
+                monitors.write_module()
+                messages += report.of(monitors, reader, bag, topics or ["*"])
+    except SpecificationError as error:
+        for finding in error.findings:
+            typer.echo(printable(str(finding)), err=True)
+        raise typer.Exit(1) from None
+    if not as_json:
+        report.show()
+        say(f"{counted(messages, 'message')} of {counted(len(bags), 'recording')}")
+
+
+def _specifications(
+    appliance: Appliance, what: str, folders: Sequence[Path], *, as_json: bool
+) -> tuple[dict[str, str], Definitions, str | None]:
+    """Texts and definitions; of the running appliance all, and whose they are that were asked for."""
+    path = Path(what)
+    if path.suffix == ".rv" or path.is_file():
+        return read_specifications([path]), read_definitions([path], folders), None
+    loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True), as_json=as_json)
+    names = [row.name for row in loaded.monitors]
+    if what not in names:
+        known = ", ".join(names) or "none is loaded"
+        raise usage_error(f"{what} is no file (.rv), and no monitor: there are: {known}")
+    own = Definitions.from_files(loaded.definitions or {})
+    definitions = standard_definitions().extended(own)
+    return loaded.files or {}, definitions, what
+
+
+class _Report:
+    """Says what is found in recordings, the first of each monitor, topic and kind, and counts it."""
+
+    def __init__(self, most: int, as_json: bool) -> None:
+        self._most = most
+        self._as_json = as_json
+        self._counts: Counter[tuple[str, str, str]] = Counter()
+
+    def of(self, monitors: MonitorSet, reader: Reader, bag: Path, topics: Sequence[str]) -> int:
+        """A recording; how many messages there were."""
+        given = 0
+        with progress("replaying", lambda: reader.message_count, shares_screen=True) as told:
+            for number, replayed in enumerate(replay(monitors, reader, None, topics)):
+                given += replayed.topic is not None
+                for found in _found(replayed.outcome):
+                    self._say(bag, replayed, found)
+                if not number % _TOLD_EVERY:
+                    told(given)
+        return given
+
+    def _say(self, bag: Path, replayed: Replayed, found: _Found) -> None:
+        where, outcome = replayed.topic or replayed.outcome.timer or "", replayed.outcome
+        self._counts[found.monitor, where, found.kind] += 1
+        if self._as_json:
+            say_json({
+                "bag": str(bag), "monitor": found.monitor, "kind": found.kind, "topic": replayed.topic,
+                "index": replayed.index, "timer": outcome.timer, "time": outcome.time / BILLION,
+                "text": found.text,
+            })  # fmt: skip
+        elif self._counts[found.monitor, where, found.kind] <= self._most:
+            place = where if replayed.index is None else f"#{replayed.index} {where}"
+            words = _WOULD.get(found.kind, found.kind)
+            say(f"{bag} {outcome.time / BILLION:.3f} {place}: {found.monitor} {words}: {found.text}")
+
+    def show(self) -> None:
+        """How often, by monitor and topic."""
+        counts = self._counts
+        if not counts:
+            say(
+                "nothing: not a message would have been dropped or changed, and there was no verdict", "green"
+            )
+            return
+        heads = ("would drop", "would change", "verdicts", "warnings", "faults")
+        table = Table(
+            "monitor", Column("topic", overflow="fold"), *(Column(head, justify="right") for head in heads),
+            box=None, padding=(0, 2, 0, 0), header_style="dim",
+        )  # fmt: skip
+        for monitor, where in dict.fromkeys((monitor, where) for monitor, where, _kind in counts):
+            table.add_row(monitor, where, *(str(counts[monitor, where, kind]) for kind in _KINDS))
+        Console(highlight=False, width=None if sys.stdout.isatty() else WIDE).print(table)
+
+
+def _found(outcome: Outcome) -> Iterator[_Found]:
+    said = {line.monitor: line.text for line in outcome.log}
+    if outcome.result == "dropped":
+        why = outcome.reason or (outcome.fatal.text if outcome.fatal is not None else "")
+        yield _Found(outcome.dropped_by, "drop", why or said.get(outcome.dropped_by) or outcome.events[-1])
+    for monitor in dict.fromkeys(event.partition(".")[0] for event in outcome.changed_by):
+        own = [event for event in outcome.changed_by if event.startswith(f"{monitor}.")]
+        yield _Found(monitor, "change", ", ".join(own))
+    for verdict in outcome.verdicts:
+        text = f"{verdict.category} of property {verdict.property + 1} ({verdict.logic})"
+        yield _Found(verdict.monitor, "verdict", text)
+    for line in outcome.log:
+        if line.level not in ("DEBUG", "INFO"):
+            yield _Found(line.monitor, "warning", line.text)
+    for fault in outcome.faults:
+        yield _Found(fault.monitor, "fault", f"{fault.position}: {fault.text}")
