@@ -243,6 +243,30 @@ def test_monitors_are_switched_together_or_not_at_all(appliance: Appliance) -> N
         assert send(rest, "PATCH", "/v1/monitors/speed", wrong, "*").status == 422, wrong
 
 
+def test_a_monitor_is_tried_and_promoted(appliance: Appliance) -> None:
+    """By operators; it is not enabled meanwhile, over a restart, and enabling it is not what promotes it."""
+    rest = appliance.rest()
+    load(rest, {"speed.rv": LIMIT})
+    made = appliance.rosrv("token", "add", "olga", "--role", "operator", "--json").stdout
+    operator = rest.with_token(json.loads(made)["token"])
+    tried = send(operator, "PATCH", "/v1/monitors/speed", {"trial": True}, rest.get("/v1/monitors").etag)
+    assert (tried.status, tried.json["names"], tried.json["began"]) == (200, ["speed"], [])
+    assert send(operator, "PATCH", "/v1/monitors/speed", {"trial": False, "enabled": True}, "*").status == 422
+    appliance.stop()
+    appliance.start()
+    rest = appliance.rest(rest.token)
+    row = rest.get("/v1/monitors/speed").json
+    assert (row["trial"], row["enabled"], row["would_drop"], row["missed"]) == (True, False, 0, 0)
+    refused = send(rest, "PATCH", "/v1/monitors/speed", {"enabled": True}, "*")
+    assert refused.status == 422
+    assert "rosrv monitor promote" in str(refused.json)
+    assert rest.get("/v1/status").json["monitors"]["trials"] == ["speed"]
+    assert send(rest, "PATCH", "/v1/monitors", {"names": ["speed"], "trial": False}, "*").status == 200
+    assert rest.get("/v1/monitors/speed").json["enabled"]
+    for event in ("monitor on trial", "monitor enabled"):
+        assert appliance.recorded("--event", event, resource="speed")
+
+
 def test_each_role_may_what_it_is_for(appliance: Appliance) -> None:
     """A viewer looks; an operator tries, switches and goes back to the folder; an admin loads and removes."""
     rest = appliance.rest()

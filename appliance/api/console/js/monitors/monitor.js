@@ -24,7 +24,7 @@ import { useStore } from "../store.js";
 import { useSpecification } from "./draft.js";
 import { Outcome } from "./report.js";
 import { counters, stateOf } from "./state.js";
-import { MonitorSwitch, Resume } from "./view.js";
+import { MonitorSwitch, Promote, Resume } from "./view.js";
 
 /** @param {{name: string, row: any, monitors: any}} given `row` is undefined for a monitor that is not loaded */
 export function MonitorPage({ name, row, monitors }) {
@@ -33,7 +33,7 @@ export function MonitorPage({ name, row, monitors }) {
   const [removing, setRemoving] = useState(false);
   const head = html`<div class="head"><${Link} to="/console/monitors" class="button plain" aria-label="All monitors"><${Icon} name="back" /></${Link}><h1><${Given} value=${name} most=${80} /></h1>
     ${row && html`<${Badge} word=${stateOf(row)} /><span class="head-sub"><${Given} value=${row.file} mono most=${80} /></span>
-      <div class="head-actions">${row.held && html`<${Resume} row=${row} monitors=${monitors} />`}<span class="row"><span class="small muted">Enabled</span><${MonitorSwitch} row=${row} monitors=${monitors} /></span>
+      <div class="head-actions">${row.held && html`<${Resume} row=${row} monitors=${monitors} />`}${(row.trial || !row.enabled) && html`<${Promote} row=${row} monitors=${monitors} />`}<span class="row"><span class="small muted">Enabled</span><${MonitorSwitch} row=${row} monitors=${monitors} /></span>
         <${Button} role="admin" tone="danger" onClick=${() => setRemoving(true)}>Remove</${Button}></div>`}</div>`;
   if (!row) return html`${head}<section class="panel"><${Empty} icon="monitors" title="This monitor is not loaded">It may have been removed. What it did is still in the <${Link} to=${`/console/audit?category=monitor&text=${encodeURIComponent(name)}`}>audit log</${Link}>.</${Empty}></section>`;
   return html`${head}
@@ -47,7 +47,7 @@ function Verdicts(/** @type {{name: string, row: any}} */ { name, row }) {
   const [span, setSpan] = useState(900);
   const series = /** @type {any[]} */ ([["verdicts", "c1", 0], ["dropped", "c2", 1], ["changed", "c3", 2], ["faults", "c4", 3]]).map(([word, colour, place]) => ({ name: word, colour, points: counters(samples, name, place) }));
   return html`<section class="panel" aria-labelledby="verdicts"><div class="panel-head"><h2 id="verdicts">What it does</h2><span class="end">${[[900, "15 min"], [3600, "1 h"]].map(([seconds, word]) => html`<button key=${word} class="button small" aria-pressed=${String(span === seconds)} onClick=${() => setSpan(Number(seconds))}>${word}</button>`)}</span></div>
-    <div class="panel-body stack"><dl class="figures">${[["Events", row.events], ["Verdicts", row.verdicts], ["Dropped", row.drops], ["Changed", row.changes], ["Faults", row.faults]].map(([word, value]) => html`<div key=${word}><dt>${word}</dt><dd>${count(value)}</dd></div>`)}</dl>
+    <div class="panel-body stack"><dl class="figures">${[["Events", row.events], ["Verdicts", row.verdicts], ...(row.trial ? [["Would have dropped", row.would_drop], ["Would have changed", row.would_change], ["Missed", row.missed]] : [["Dropped", row.drops], ["Changed", row.changes]]), ["Faults", row.faults]].map(([word, value]) => html`<div key=${word}><dt>${word}</dt><dd>${count(value)}</dd></div>`)}</dl>
       <${Plot} label=${`What ${name} does`} series=${series} span=${span} /></div></section>`;
 }
 
@@ -97,11 +97,11 @@ function Picture(/** @type {{path: string, name: string}} */ { path, name }) {
 }
 
 function History(/** @type {{path: string, row: any}} */ { path, row }) {
-  const mark = [row.verdicts, row.drops, row.changes, row.faults, row.enabled].join();
+  const mark = [row.verdicts, row.drops, row.changes, row.faults, row.enabled, row.trial, row.would_drop, row.would_change].join();
   const { value, error, again } = useResource((signal) => get(`${path}/history`, { limit: 200 }, signal), [path, mark]);
   return html`<section class="panel" aria-labelledby="history"><div class="panel-head"><h2 id="history">What it did last</h2><span class="end"><${Link} class="small" to=${`/console/audit?category=monitor&text=${encodeURIComponent(row.name)}`}>In the audit log</${Link}></span></div>
     ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : !value ? html`<${Loading} /> ` : !value.happened.length ? html`<${Empty} icon="monitors" title="Nothing yet">Verdicts, dropped and changed messages appear here.</${Empty}>`
-      : html`<ul class="event-list tall">${value.happened.slice(0, 40).map((/** @type {any} */ one) => html`<li key=${one.sequence} class="event"><span class="event-time"><${Link} to=${`/console/audit/${one.sequence}`}><${Moment} at=${one.time} /></${Link}></span><span class="event-badge"><${Badge} word=${one.category ?? one.event.replace(/^(monitor|message) /, "")} tone=${tone(one)} /></span>
+      : html`<ul class="event-list tall">${value.happened.slice(0, 40).map((/** @type {any} */ one) => html`<li key=${one.sequence} class="event"><span class="event-time"><${Link} to=${`/console/audit/${one.sequence}`}><${Moment} at=${one.time} /></${Link}></span><span class="event-badge"><${Badge} word=${one.category ?? one.event.replace(/^(monitor|message|trial) /, "")} tone=${tone(one)} /></span>
         <div class="event-body"><${Given} value=${one.resource} mono most=${60} />${one.count ? html` <span class="muted">${counted(one.count, "more", "more")}</span>` : ""}<div class="event-reason"><${Given} value=${one.reason} most=${200} none="" /></div></div></li>`)}</ul>`}</section>`;
 }
 
