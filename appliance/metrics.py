@@ -73,7 +73,8 @@ METRICS = (
         "rosrv_monitor_events_total",
         "counter",
         ("kind", "monitor"),
-        "what monitors did: verdict, drop, change, fault, log, publish; what several changed counts for each",
+        "what monitors did: verdict, drop, change, fault, log, publish; what several changed counts for each;"
+        " `trial drop`, … of those on trial",
     ),
     Metric("rosrv_monitors", "gauge", ("state",), "monitors: enabled, trial, disabled, holding, failing"),
     Metric("rosrv_nodes", "gauge", ("state",), "nodes: live, or lost and awaited"),

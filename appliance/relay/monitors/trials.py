@@ -4,8 +4,8 @@ Invariants:
 - Nothing that they do reaches a message, a subscriber or a monitor in force; what they would have done is told.
 - They take at most `SHARE` of the processor's time, in slices between which the loop goes on, and at most `_MOST_BYTES`
   wait for them.
-- What is beyond that they are not given, and that is told: they are incomplete then, and so is one that was given a
-  message on which it spent more than it may.
+- What is beyond that they are not given, and that is told: they are incomplete then. So is one that spent more on a
+  message or a tick than it may, or met a defect; it rests until the second is over, so it delays others once in it.
 - Ticks and deadlines happen after the messages that came before them.
 """
 
@@ -30,7 +30,7 @@ _MOST_BYTES = 8 << 20
 
 _TOO_SLOW = f"monitors on trial take more than {SHARE:.0%} of a processor; this one did not see all messages"
 _TOO_MANY = "more messages wait for monitors on trial than can be kept; this one did not see all"
-_TOO_LONG = f"more than {TRIAL_BUDGET} instructions for one message, which a monitor on trial may not take"
+_TOO_LONG = f"more than {TRIAL_BUDGET} instructions at once, which one on trial may not take: it rests for this second"
 
 
 class _Waiting(NamedTuple):
@@ -52,7 +52,7 @@ class Trials:
         self._spent = 0.0
         self._foreign: set[str] = set()
         self._timer: Timer | None = None
-        self._stopped = False
+        self._resting: set[MonitorSet] = set()
 
     # --- which there are ---
 
@@ -103,7 +103,8 @@ class Trials:
 
     def tick(self) -> None:
         """A second is over."""
-        self._spent, self._stopped = 0.0, False
+        self._spent = 0.0
+        self._resting.clear()
         self._telling.tick(self._now())
         self.schedule()
 
@@ -117,15 +118,16 @@ class Trials:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        due = self._due()
+        due = min((trial.next_due for trial in self._awake() if trial.next_due is not None), default=None)
         if self._waiting:
             self._timer = self._loop.after(0, self._have_turn)
-        elif due is not None and self._spent <= SHARE and not self._stopped:
+        elif due is not None:
             self._timer = self._loop.after(max(0, due - self._now()) / 1e9, self._have_turn)
 
-    def _due(self) -> int | None:
-        trials = self._monitors.trials if self._monitors is not None else ()
-        return min((trial.next_due for trial in trials if trial.next_due is not None), default=None)
+    def _awake(self) -> list[MonitorSet]:
+        """Those that may have a turn in this second."""
+        trials = self._monitors.trials if self._monitors is not None and self._spent <= SHARE else ()
+        return [trial for trial in trials if trial not in self._resting]
 
     def _have_turn(self) -> None:
         self._timer = None
@@ -137,14 +139,14 @@ class Trials:
         while self._waiting and last - began < longest:
             waiting = self._waiting.popleft()
             self._bytes -= len(waiting.tapped.data)
-            if self._spent > SHARE:
+            if self._spent > SHARE or waiting.tapped.trial in self._resting:
                 self._miss(waiting.tapped.trial, waiting.place, _TOO_SLOW, waiting.sighting)
             else:
                 self._give(waiting)
             now = time.thread_time()
             self._spent += now - last
             last = now
-        if not self._waiting and self._spent <= SHARE and not self._stopped:
+        if not self._waiting:
             self._advance()
             self._spent += time.thread_time() - last
 
@@ -154,10 +156,11 @@ class Trials:
         try:
             outcome = waiting.tapped.give()
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
+            self._resting.add(trial)
             self._miss(trial, place, telling.defect(error, place, self._now(), sighting), sighting)
             return
         telling.told(outcome, place, sighting)
-        if outcome.faults and any(monitor.context.budget < 0 for monitor in trial.monitors):
+        if self._rests(trial):
             self._miss(trial, place, _TOO_LONG, sighting)
         elif outcome.result == "dropped":
             telling.dropped(outcome, place, view, sighting)
@@ -166,13 +169,26 @@ class Trials:
 
     def _advance(self) -> None:
         now = self._now()
-        try:
-            for trial in self._monitors.trials if self._monitors is not None else ():
-                for outcome in trial.advance(now):
-                    self._telling.told(outcome, NOWHERE)
-        except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-            self._telling.defect(error, NOWHERE, now)
-            self._stopped = True  # for this second
+        for trial in self._awake():
+            if trial.next_due is None or trial.next_due > now:
+                continue
+            try:
+                outcomes = trial.advance(now)
+            except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
+                self._resting.add(trial)
+                self._miss(trial, NOWHERE, self._telling.defect(error, NOWHERE, now))
+                continue
+            for outcome in outcomes:
+                self._telling.told(outcome, NOWHERE)
+            if self._rests(trial):
+                self._miss(trial, NOWHERE, _TOO_LONG)
+
+    def _rests(self, trial: MonitorSet) -> bool:
+        """Whether it has spent more than it may, and has to wait for the next second."""
+        spent = any(monitor.context.budget < 0 for monitor in trial.monitors)
+        if spent:
+            self._resting.add(trial)
+        return spent
 
     def _miss(self, trial: MonitorSet, place: Place, text: str, sighting: Sighting | None = None) -> None:
         for monitor in trial.monitors:

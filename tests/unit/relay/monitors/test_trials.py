@@ -119,19 +119,39 @@ def test_messages_that_wait_are_given_before_it_is_promoted(world: Trying) -> No
     world.gets(subscriber, string("4"))
 
 
-def test_a_loop_without_end_delays_and_drops_nothing(world: Trying) -> None:
-    """It ends at a tenth of what others may take, and what it saw is not complete: it begins anew when promoted."""
+def test_a_loop_without_end_delays_and_drops_nothing(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ends at a tenth of what others may take, once in a second; what it saw is not complete: it begins anew."""
     world.state_trials(GUARD, tried=("guard",))
     publisher, subscriber = world.typed()
+    monkeypatch.setattr(trials.Trials, "tick", lambda _self: None)  # the second is not over
     for _ in range(20):
         publisher.send(string("loop") + string("bad"))
     world.gets(subscriber, (string("loop") + string("bad")) * 20)
     assert "more than 100000 instructions" in world.event("trial fault", monitor="guard", count=0).text
-    assert "may not take" in world.event("trial missed", monitor="guard", count=0).text
-    assert world.row("guard").missed
+    assert "one on trial may not take" in world.event("trial missed", monitor="guard", count=0).text
+    world.until(lambda: not world.engine._middle.trials._waiting)
+    monkeypatch.undo()
+    world.engine._middle.trials.tick()
+    row = world.row("guard")
+    assert (row.events, row.missed, row.drops) == (1, 40, 0)
     assert world.state_trials(GUARD, revision=2) == ["guard"]
     publisher.send(string("count"))
     world.gets(subscriber, string("1"))
+
+
+def test_ticks_without_end_rest_for_the_second(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One is tried, and the loop goes on; another when the second is over."""
+    monkeypatch.setattr(trials.Trials, "tick", lambda _self: None)
+    text = "s() { int n = 0; event tick() every 1ms { while (true) { n = n; } } }"
+    world.state_trials(text, tried=("s",))
+    assert "one on trial may not take" in world.event("trial missed", monitor="s").text
+    turned: list[bool] = []
+    world.loop.after(0.1, lambda: turned.append(True))
+    world.until(lambda: turned)
+    assert world.row("s").missed == 1
+    monkeypatch.undo()
+    world.engine._middle.trials.tick()
+    world.until(lambda: world.row("s").missed > 1)
 
 
 def test_trials_have_a_share_of_the_processor_and_no_more(
