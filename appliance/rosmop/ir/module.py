@@ -1,7 +1,8 @@
 """The scalar part of the form as WebAssembly: numbers, conditions, loops, fields that are numbers, drops.
 
 Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
-has a fixed size: in a local variable is the address, and how many elements there are.
+has a fixed size: in a local variable is the address, and how many elements there are. Of an array of strings it is the
+address of a table that says where each begins.
 
 `Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
 
@@ -9,8 +10,8 @@ has a fixed size: in a local variable is the address, and how many elements ther
   `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`.
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
   it is taken back. Within a helper function it is a trap. Beyond are strings and vectors that are made, changed or
-  kept, vectors of strings, whole messages, what is put out or published, recursion, `sin` and its like. An event of
-  which no message can come past such a place has no module: `NotScalarError` names what is beyond.
+  kept, whole messages, what is put out or published, recursion, `sin` and its like. An event of which no message can
+  come past such a place has no module: `NotScalarError` names what is beyond.
 - A variable of the set stands at its address, in 8 bytes. Before a field is written, what stood there is noted in the
   log (address, size, bytes; 16 bytes each) that `UNDO` points behind.
 - What the form charges is taken from the budget of its specification, as everywhere.
@@ -59,6 +60,10 @@ HAPPENED, DROPPED, CHANGED, ELSEWHERE = 1, 2, 4, 8
 
 UNDO, NOW, FIRST = 8, 16, 24
 """Where the end of the log and the time stand, and what is given out begins."""
+
+
+MOST_TEXTS = 256
+"""Strings of an array that is read; one of more is left."""
 
 
 class NotScalarError(Exception):
@@ -150,12 +155,15 @@ class Writer:
         return sum(map(self.size, self._values.fields(kind)[:number]))
 
     def element(self, kind: Type) -> tuple[Type, int]:
-        """The type of the elements of a string or vector, and the bytes of each. Raises `NotScalarError`."""
+        """The type of the elements of a string or vector, and the bytes from one to the next (strings: in the table).
+
+        Raises `NotScalarError`.
+        """
         if isinstance(kind, kinds.String):
             return kinds.UINT8, 1
         if not isinstance(kind, kinds.Vector):
             raise NotScalarError(str(kind))
-        return kind.element, self.size(kind.element)
+        return kind.element, 4 if isinstance(kind.element, kinds.String) else self.size(kind.element)
 
     def copied(self, kind: Type) -> Type:
         """A message whose copy costs nothing. Raises `NotScalarError` of another."""
@@ -334,7 +342,11 @@ class _Body:
         first, place, count = self._elements(node.values)
         at, left = (f"{what} {len(self._locals)}" for what in ("element", "left"))
         over = self._get(left, I64) + b"\x50\x0d\x01"
-        if isinstance(kind, kinds.Record):
+        if isinstance(kind, kinds.String):
+            each, begin, length = self._text_at(self._get(at))
+            each += begin + self._set(f"place of {node.name}") + length
+            each += self._set(f"count of {node.name}", I64)
+        elif isinstance(kind, kinds.Record):
             each = self._get(at) + self._set(f"place of {node.name}")
         else:
             each = self._loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
@@ -411,7 +423,9 @@ class _Body:
             size = self._writer.size(node.type)
             code = self._within(start, size) + self._get("at") + self._position(start) + b"\xa7\x6a"
             return code + self._set(place) + self._position(start.plus(size)) + self._set(node.end, I64)
-        _, size = self._writer.element(node.type)
+        element, size = self._writer.element(node.type)
+        if isinstance(element, kinds.String):
+            return self._read_texts(node)
         if isinstance(node.type, kinds.Vector) and node.type.length is not None:
             code = self._within(start, node.type.length * size)
             code += constant(I64, node.type.length) + self._set(count, I64)
@@ -420,6 +434,34 @@ class _Body:
         code += self._get("at") + self._position(start) + b"\xa7\x6a" + self._set(place)
         return code + self._after_elements(form.AfterElements(node.site, node.end, start, count, size))
 
+    def _read_texts(self, node: form.ReadValue) -> bytes:
+        """Note where each string of an array begins."""
+        if isinstance(node.type, kinds.Vector) and node.type.length is not None:
+            raise NotScalarError(str(node.type))
+        count, left, entry = (
+            f"count of {node.name}",
+            f"left {len(self._locals)}",
+            f"entry {len(self._locals)}",
+        )
+        table = constant(I32, self._writer.take(4 * MOST_TEXTS))
+        code = self._count(form.Count(node.site, count, node.at, 4))
+        many = self._get(count, I64) + constant(I64, MOST_TEXTS) + b"\x56"
+        code += self._if(many, self._elsewhere) + self._get(count, I64) + self._set(left, I64)
+        code += self._position(node.at.plus(4)) + self._set(node.end, I64) + table + self._set(entry)
+        over = self._get(left, I64) + b"\x50\x0d\x01"
+        over += self._get(entry) + self._get("at") + self._get(node.end, I64) + b"\xa7\x6a\x36\x00\x00"
+        over += self._after_text(form.AfterText(node.site, node.end, form.Spot(node.end, 0)))
+        beyond = self._get(node.end, I64) + self._get("size") + b"\xad\x56"
+        over += self._if(beyond, self._elsewhere) + self._get(entry) + constant(I32, 4) + b"\x6a"
+        over += self._set(entry) + self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
+        return code + self._repeated(over, ()) + table + self._set(f"place of {node.name}")
+
+    def _text_at(self, entry: bytes) -> tuple[bytes, bytes, bytes]:
+        """The string that begins where an entry of a table says, as `_elements`."""
+        name = f"text {len(self._locals)}"
+        first = entry + b"\x28\x00\x00" + self._set(name)
+        return first, self._get(name) + constant(I32, 4) + b"\x6a", self._get(name) + b"\x28\x00\x00\xad"
+
     def _elements(self, node: form.Expression) -> tuple[bytes, bytes, bytes]:
         """What comes first; the address of the first element of a string or vector, and how many there are (i64)."""
         if isinstance(node, form.Copy):
@@ -427,6 +469,12 @@ class _Body:
             element, size = self._writer.element(node.type)
             machine_type(element)
             return first + self._allocated(count + constant(I64, size) + b"\x7e"), place, count
+        if (
+            isinstance(node.type, kinds.String)
+            and isinstance(node, form.Call)
+            and node.function == "l_element"
+        ):
+            return self._text_at(self._address_of(node))
         if (
             isinstance(node, form.Item)
             and isinstance(node.type, kinds.Vector)

@@ -20,7 +20,7 @@ TOPICS = {"/plain": "own/Plain", "/stamped": "own/Stamped"}
 _PLAIN = {"kind": "int", "count": "int", "x": "double", "y": "float", "on": "bool", "when": "ros::Time",
           "three[1]": "long", "x ": "int", "three": "std::vector<long>", "rest": "uint8_t[]"}  # fmt: skip
 _STAMPED = {"frame": "std::string", "x": "double", "count": "int", "values[1]": "double", "kind": "int",
-            "when.sec": "unsigned int", "values": "std::vector<double>"}  # fmt: skip
+            "when.sec": "unsigned int", "values": "std::vector<double>", "names": "std::string[]"}  # fmt: skip
 _LOGICS = (
     "fsm: here [ e0 -> there, default here ] there [ e0 -> here, default there ]{here}{there}{fail}",
     "fsm: one [ e0 -> two, default one ] two [ e0 -> three ] three [ default three ]{three}{fail}",
@@ -146,7 +146,9 @@ class Specifications:
             *(f"{name} = {value};" for name in assigned),
             *(f'if ({name} == "abc") {{ last = {name}; }}' for name in texts),
         ]  # fmt: skip
-        for name in (name for name, (_, kind) in names.items() if kind.endswith((">", "]"))):
+        choices += [f'for (int i = 0; i < {name}.size(); i++) {{ if ({name}[i] == "nnnn") {{ total += i; }} }}'
+                    for name, (_, kind) in names.items() if kind == "std::string[]"]  # fmt: skip
+        for name in (name for name, (_, kind) in names.items() if kind.endswith(("g>", "e>", "t[]"))):
             choices += [f"for (double each : {name}) {{ level += each; }}", f"total += {name}.size();",
                         f"if (!{name}.empty()) {{ level = {name}[0]; }}", f"level = {name}[total];",
                         f"level = std::accumulate({name}.begin(), {name}.end(), level);",

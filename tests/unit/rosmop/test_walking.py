@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from appliance.rosmop import walking
 from appliance.rosmop.engine import MonitorSet, OnFault
 from appliance.rosmop.ir.feed import AREA, MAX_EFFECTS
+from appliance.rosmop.ir.module import MOST_TEXTS
 from appliance.rosmop.logics.interface import FiniteRun
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.wire import Buffer
@@ -139,7 +140,7 @@ def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> Non
 def test_most_of_that_is_taken_together_and_everything_comes_up() -> None:
     """What the comparison above compares is not nothing."""
     came: Counter[str] = Counter()
-    for seed in range(12):
+    for seed in range(24):
         try:
             fed = Fed(*Specifications(seed).texts())
         except SpecificationError:
@@ -331,6 +332,27 @@ def test_messages_within_messages(name: str) -> None:
         cuts = [body[: random.randrange(len(body))] for _ in range(3)]
         fed.check([body, body, *cuts, body], "/s")
     assert bool(fed.came["together"]) == ("differs" not in name)
+
+
+def test_arrays_of_strings() -> None:
+    """Compared, measured, looped over, handed on; cut after each byte, with lengths that lie; more than are noted."""
+    fed = Fed("""s() { double n = 0; bool is(const std::string& s) { return s == "b"; }
+        int count(const std::vector<std::string>& all) { int m = 0; for (auto s : all) { m += s.size(); } return m; }
+        event e(std::vector<std::string> names, double[] at) /s sensor_msgs/JointState '{name:names, position:at}' {
+            for (int i = 0; i < names.size(); i++) { if (names[i] == "arm" || is(names[i])) { n += at[i]; } }
+            for (char c : names[0]) { n += c; } n = n * 2 + count(names);
+            if (names.back().empty()) { at[0] = 3; } } }""")
+    wrist = message("sensor_msgs/JointState", name=["arm", "wrist", "b"], position=[1.5, 2.5, -0.25])
+    many = message("sensor_msgs/JointState", name=["b"] * (MOST_TEXTS + 1), position=[0.5] * (MOST_TEXTS + 1))
+    fed.check([wrist, wrist, message("sensor_msgs/JointState"), many, wrist], "/s")
+    assert fed.came["together"]
+    fed.check([message("sensor_msgs/JointState", name=["b", ""], position=[0.0, 1.0]), wrist], "/s")
+    for end in range(len(wrist) + 1):
+        fed.check([wrist, wrist[:end], wrist], "/s")
+    place = wrist.index(b"arm") - 4
+    for length in (0, 1, 4, 200, 2**31 - 1, 2**31, 2**32 - 5, 2**32 - 1):
+        for at in (place - 4, place, place + 7):
+            fed.check([wrist[:at] + struct.pack("<I", length) + wrist[at + 4 :], wrist], "/s")
 
 
 @pytest.mark.parametrize("text", ["", "a", "abc", "map_frame", "a name of thirty bytes exactly", "x" * 64])
