@@ -6,6 +6,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
 from appliance.api.audit import RECORD
+from appliance.api.field_words import WORDS
 from appliance.api.problems import MEDIA_TYPE, Problem
 from appliance.api.routing import CONTRACT
 
@@ -48,6 +49,8 @@ def _made(app: FastAPI) -> dict[str, Any]:
         components.pop(name, None)
     components |= _plain(CONTRACT.components())
     components["AuditRecord"] = RECORD
+    for kind, schema in components.items():
+        _described(kind, schema)
     for path in document["paths"].values():
         for method, operation in path.items():
             _complete(operation)
@@ -63,6 +66,19 @@ def _plain(schema: Any) -> Any:
     if not isinstance(schema, dict):
         return schema
     return {name: _plain(part) for name, part in schema.items() if not (name == "items" and part is False)}
+
+
+def _described(kind: str, schema: dict[str, Any]) -> None:
+    """Words for the fields that have none; a field that is of a kind has the words of that."""
+    for name, field in schema.get("properties", {}).items():
+        words = WORDS.get(f"{kind}.{name}", WORDS.get(name))
+        if words is not None and "$ref" not in field and not is_described(field):
+            field["description"] = words
+
+
+def is_described(field: dict[str, Any]) -> bool:
+    """Whether something is said of a field: of itself, or of one of the things that it can be."""
+    return "description" in field or any(map(is_described, field.get("anyOf", ())))
 
 
 def _tagged(responses: dict[str, Any]) -> None:

@@ -7,7 +7,9 @@ import pytest
 
 from appliance.api.access import Doorkeeper
 from appliance.api.app import build_app
+from appliance.api.contract import is_described
 from appliance.api.control import ControlLink
+from appliance.api.field_words import WORDS
 from appliance.api.history import History
 from appliance.api.journal import Journal
 from appliance.api.services import Services
@@ -58,6 +60,23 @@ def test_times_have_units(contract: dict[str, Any]) -> None:
                 without.append(f"{kind}.{name}")
     assert without == []
     assert seen > 30
+
+
+def test_every_field_is_described(contract: dict[str, Any]) -> None:
+    """In words of its own, or in those of what it is of; and no words are left over."""
+    fields = {
+        (kind, name): field
+        for kind, schema in contract["components"]["schemas"].items()
+        for name, field in schema.get("properties", {}).items()
+    }
+    assert [key for key, field in fields.items() if not is_described(field) and "$ref" not in field] == []
+    said = {
+        (place, field.get("description"))
+        for key, field in fields.items()
+        for place in (key[1], ".".join(key))
+    }
+    assert [place for place, words in WORDS.items() if (place, words) not in said] == []
+    assert len(fields) > 500
 
 
 def test_what_can_be_asked_for_when_it_changed(contract: dict[str, Any]) -> None:
