@@ -1,4 +1,4 @@
-"""The scalar part of the form as WebAssembly: numbers, conditions, loops, fields that are numbers, drops.
+"""A part of the form as WebAssembly: numbers, conditions, loops, what stands in the message, numbers put there, drops.
 
 Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
 has a fixed size: in a local variable is the address, and how many elements there are. Of an array of strings it is the

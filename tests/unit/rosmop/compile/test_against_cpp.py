@@ -12,7 +12,7 @@ import pytest
 
 from appliance.rosmop.runtime.numbers import MATH
 from tests.support.requirements import need_program
-from tests.unit.rosmop.acting import act
+from tests.unit.rosmop.acting import act, load, message
 
 TYPES = (
     "int8_t", "uint8_t", "int16_t", "uint16_t", "int", "unsigned int", "long", "unsigned long", "float", "double",
@@ -109,9 +109,31 @@ def test_functions_on_floats_are_the_compilers(tmp_path: Path) -> None:
     ).split()
 
 
+def in_module(body: str) -> list[str]:
+    """What a program prints if it keeps its values in variables and the module takes the message."""
+    begins = 'printf("%.9g\\n", '
+    lines: list[str] = []
+    names: list[str] = []
+    for line in body.splitlines():
+        if line.startswith(begins):
+            names.append(f"o{len(names)}")
+            lines.append(f"{names[-1]} = {line.removeprefix(begins).removesuffix(');')};")
+        else:
+            lines.append(line)
+    variables = " ".join(f"double {name} = 0;" for name in names)
+    text = "\n".join((f"s() {{ {variables} {FUNCTIONS} event e() /t std_msgs/Int32 '{{}}' {{", *lines, "} }"))
+    monitors = load(text)
+    monitors.write_module()
+    monitors.monitor("s").seen = True
+    walker = monitors.walker("/t")
+    assert walker is not None
+    assert walker.take(message("std_msgs/Int32", data=0), 1) == ("s.e",)
+    return [f"{monitors.value('s', name):.9g}" for name in names]
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_the_language_agrees_with_a_compiler(seed: int, tmp_path: Path) -> None:
-    """A hundred values of each random program are the compiler's."""
+    """A hundred values of each random program are the compiler's: by engine, interpreter and module."""
     compiler = need_program("g++", "g++")
     body = program(Random(seed))  # noqa: S311  draws examples, not keys
     source = tmp_path / "program.cpp"
@@ -123,3 +145,4 @@ def test_the_language_agrees_with_a_compiler(seed: int, tmp_path: Path) -> None:
     outcome = act(body, before=FUNCTIONS)
     assert not outcome.faults
     assert [line.text for line in outcome.log] == expected.replace("-nan", "nan").split()
+    assert in_module(body) == expected.replace("-nan", "nan").split()
