@@ -8,7 +8,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := appliance tests examples benchmarks distribution
 
-.PHONY: help setup demo check test test-system test-package prove wheel package image site release bench clean
+.PHONY: help setup demo check static unit test test-system test-package prove wheel package image site release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -21,10 +21,15 @@ demo: ## the appliance at work: a simulated robot, its operator and an attacker,
 	@$(BIN)/rosrv demo $(ARGS)
 
 check: setup ## format, lint, types, dependency directions, unit tests
+	$(MAKE) --jobs=2 --output-sync=target static unit
+
+static:
 	$(BIN)/ruff format --check $(CHECKED)
 	$(BIN)/ruff check $(CHECKED)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+unit:
 	$(PYTEST) tests/unit -n auto --quiet
 
 test: check ## check, and the tests with real ROS nodes (root: they make network namespaces)

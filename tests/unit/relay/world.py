@@ -3,7 +3,6 @@
 The engine runs in the test's own thread; every step lets the loop turn until what is awaited has happened.
 """
 
-import contextlib
 import socket
 import struct
 import time
@@ -175,8 +174,12 @@ class World:
         """The peer sends all of this, as fast as the relay takes it."""
         rest = memoryview(data)
         while rest:
-            with contextlib.suppress(BlockingIOError):
+            try:
                 rest = rest[peer.sock.send(rest[:MIB]) :]
+            except BlockingIOError:
+                pass
+            except ConnectionError as error:
+                raise AssertionError(f"the relay closed it, and said {self.told[-5:]}") from error
             self.loop.turn(0)
 
     def accept(self, listening: socket.socket) -> Peer:

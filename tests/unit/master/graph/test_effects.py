@@ -27,9 +27,8 @@ def verbs() -> set[tuple[str, str]]:
     }
 
 
-def dropped(tree: ast.Module) -> Iterator[str]:
+def dropped(tree: ast.Module, known: set[tuple[str, str]]) -> Iterator[str]:
     """Calls of these verbs whose result nobody takes."""
-    known = verbs()
     for node in ast.walk(tree):
         match node:
             case ast.Expr(value=ast.Call(func=ast.Attribute(value=part, attr=verb))):
@@ -41,7 +40,10 @@ def dropped(tree: ast.Module) -> Iterator[str]:
 def test_no_effect_falls() -> None:
     """Nowhere in RVMaster and control."""
     files = [*(ROOT / "master").rglob("*.py"), *(ROOT / "control").rglob("*.py")]
-    assert [call for file in files for call in dropped(ast.parse(file.read_text(encoding="utf-8")))] == []
+    known = verbs()
+    assert [
+        call for file in files for call in dropped(ast.parse(file.read_text(encoding="utf-8")), known)
+    ] == []
 
 
 def test_the_rule_finds_what_it_forbids() -> None:
@@ -52,5 +54,5 @@ def test_the_rule_finds_what_it_forbids() -> None:
         ("grants", "give"),
         ("revocation", "expel"),
     } <= verbs()
-    assert list(dropped(ast.parse("self._graph.registered(a)")))
-    assert not list(dropped(ast.parse("self._enactor.carry_out(self._graph.registered(a))")))
+    assert list(dropped(ast.parse("self._graph.registered(a)"), verbs()))
+    assert not list(dropped(ast.parse("self._enactor.carry_out(self._graph.registered(a))"), verbs()))
