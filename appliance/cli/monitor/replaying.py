@@ -20,6 +20,7 @@ from appliance.cli.monitor.running import WIDE
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.progress import progress
 from appliance.cli.running import Appliance, speaks
+from appliance.learning.margins import Compared, Comparison
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.engine import MonitorSet, sharing
@@ -61,6 +62,9 @@ def replay_monitor(
     most: Annotated[
         int, typer.Option("--most", min=0, metavar="N", help="Places shown of each monitor, topic and kind")
     ] = 10,
+    margins: Annotated[
+        bool, typer.Option("--margins", help="Also how close each comparison of numbers came (takes longer)")
+    ] = False,
     msg: Annotated[
         list[Path] | None,
         typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
@@ -79,21 +83,24 @@ def replay_monitor(
         texts, definitions, chosen = _specifications(appliance, what, msg or [], as_json=as_json)
         for bag in bags:
             with closing(open_bag(bag)) as reader:
-                monitors = MonitorSet.load(texts, definitions_of(reader).extended(definitions))
-                if chosen is not None:
-                    uses = {one.name: one.code.uses for one in monitors.monitors}
-                    together = next(group for group in sharing(uses) if chosen in group)
-                    monitors.switch({name: name in together for name in uses}, 0)
+                known = definitions_of(reader).extended(definitions)
+                monitors = _only(chosen, MonitorSet.load(texts, known))
                 for text in refusals(monitors, reader, topics or ["*"]):
                     raise usage_error(f"{bag}: {text}")
                 monitors.write_module()
                 messages += report.of(monitors, reader, bag, topics or ["*"])
+                if margins:
+                    compared = Compared(texts, known)
+                    watched = _only(chosen, compared.monitors())
+                    report.measure(compared, watched, replay(watched, reader, None, topics or ["*"]), bag)
     except SpecificationError as error:
         for finding in error.findings:
             typer.echo(printable(str(finding)), err=True)
         raise typer.Exit(1) from None
     if not as_json:
         report.show()
+    report.show_margins()
+    if not as_json:
         say(f"{counted(messages, 'message')} of {counted(len(bags), 'recording')}")
 
 
@@ -114,6 +121,24 @@ def _specifications(
     return loaded.files or {}, definitions, what
 
 
+def _only(chosen: str | None, monitors: MonitorSet) -> MonitorSet:
+    """A set in which only this one, with those that it shares variables with, is enabled (None: all are)."""
+    if chosen is not None:
+        uses = {one.name: one.code.uses for one in monitors.monitors}
+        together = next(group for group in sharing(uses) if chosen in group)
+        monitors.switch({name: name in together for name in uses}, 0)
+    return monitors
+
+
+class _Closest(NamedTuple):
+    """How close a comparison came, and when."""
+
+    distance: float
+    bag: Path
+    time: int
+    number: int | None
+
+
 class _Report:
     """Says what is found in recordings, the first of each monitor, topic and kind, and counts it."""
 
@@ -121,6 +146,7 @@ class _Report:
         self._most = most
         self._as_json = as_json
         self._counts: Counter[tuple[str, str, str]] = Counter()
+        self._closest: dict[tuple[Comparison, bool], _Closest] = {}
 
     def of(self, monitors: MonitorSet, reader: Reader, bag: Path, topics: Sequence[str]) -> int:
         """A recording; how many messages there were."""
@@ -133,6 +159,31 @@ class _Report:
                 if not number % _TOLD_EVERY:
                     told(given)
         return given
+
+    def measure(
+        self, compared: Compared, monitors: MonitorSet, messages: Iterator[Replayed], bag: Path
+    ) -> None:
+        """How close the comparisons come in a recording."""
+        for replayed in messages:
+            for key, distance in compared.distances(monitors).items():
+                if key not in self._closest or distance < self._closest[key].distance:
+                    self._closest[key] = _Closest(distance, bag, replayed.outcome.time, replayed.index)
+
+    def show_margins(self) -> None:
+        """How close each comparison came, while it was true and while it was not."""
+        for one, truth in sorted(self._closest, key=lambda key: (key[0].position, not key[1])):
+            distance, bag, time, number = self._closest[one, truth]
+            if self._as_json:
+                say_json({
+                    "kind": "margin", "monitor": one.specification, "file": one.position.file,
+                    "line": one.position.line, "column": one.position.column, "holds": truth,
+                    "distance": distance, "bag": str(bag), "time": time / BILLION, "index": number,
+                })  # fmt: skip
+            else:
+                place = "" if number is None else f" #{number}"
+                word = "true" if truth else "false"
+                where = f"{bag} {time / BILLION:.3f}{place}"
+                say(f"{one.position}: {one.line}: {word} by {distance:.6g} at the closest ({where})")
 
     def _say(self, bag: Path, replayed: Replayed, found: _Found) -> None:
         where, outcome = replayed.topic or replayed.outcome.timer or "", replayed.outcome

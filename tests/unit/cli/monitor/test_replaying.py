@@ -78,6 +78,44 @@ def test_what_is_wrong_is_said(tmp_path: Path) -> None:
     assert nobody.exit_code == 2
 
 
+def test_how_close_conditions_came(tmp_path: Path) -> None:
+    """Of each comparison of numbers, on both sides of it, over all recordings; not of loops and of what `when` says."""
+    text = """near() {
+        bool high(int n) { return n > 7; }
+        event e(int x) /t std_msgs/Int32 '{data:x}' when (x >= 3) {
+            for (int i = 0; i < 3; i++) { }
+            if (high(x) || x < 5) { ROS_WARN("x"); }
+        }
+    }
+    """
+    path = write(tmp_path, "near.rv", text)
+    bags = [recorded(tmp_path, "one.bag", 1, 9, 5), recorded(tmp_path, "two.bag", 6, 20)]
+    plain = invoke("replay", path, "--bag", bags[0], "--bag", bags[1])
+    shown = invoke("replay", path, "--bag", bags[0], "--bag", bags[1], "--margins")
+    assert shown.output.startswith(plain.output.rsplit("\n", 2)[0])
+    assert f"{path}:2:35: bool high(int n) {{ return n > 7; }}: true by 2 at the closest" in shown.output
+    found = [
+        (one["line"], one["holds"], one["distance"], Path(one["bag"]).name, one["index"])
+        for one in records(invoke("replay", path, "--bag", bags[0], "--bag", bags[1], "--margins", "--json"))
+        if one["kind"] == "margin"
+    ]
+    assert sorted(found) == [
+        (2, False, 1.0, "two.bag", 0),
+        (2, True, 2.0, "one.bag", 1),
+        (5, False, 0.0, "one.bag", 2),
+    ]
+
+
+def test_margins_of_what_is_no_number_are_left_out(tmp_path: Path) -> None:
+    """Texts and times are compared, too; what the monitor does is the same with margins."""
+    text = """s() { ros::Time t; std::string a; event e(int x) /t std_msgs/Int32 '{data:x}' {
+        if (t < ros::Time::now() && a < "b") { return; } } }"""
+    path = write(tmp_path, "s.rv", text)
+    bag = recorded(tmp_path, "one.bag", 1)
+    found = records(invoke("replay", path, "--bag", bag, "--margins", "--json"))
+    assert [one["kind"] for one in found] == ["drop"]
+
+
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
     """A state directory at which an appliance with monitors answers once."""
