@@ -188,6 +188,7 @@ def test_short_names_stand_in_one_line(opened: Callable[..., Reader], attempt: C
 def test_it_opens_on_what_matters(opened: Callable[..., Reader], attempt: Callable[..., Any]) -> None:
     """A refusal is in sight and a lookup is not; one press shows all, one what people changed; a search is kept."""
     refuse(attempt, "/matters")
+    refuse(attempt, "/matters_too")  # the time line has marks from the first to the last
     attempt("getParam", "/matters_not", "/nothing")
     reader = opened()
     page = reader.go("audit")

@@ -98,10 +98,10 @@ export function kept() {
   }
 }
 
-/** Whether who reads may do what this role may. @param {"viewer" | "operator" | "admin"} role */
+/** Whether who reads may do what this role may; what is for investigators nobody else may. @param {keyof typeof RANK} role */
 export function may(role) {
   const held = session.get().current?.role;
-  return held !== undefined && RANK[held] >= RANK[role];
+  return held !== undefined && (role === "investigator" ? held === role : RANK[held] >= RANK[role]);
 }
 
 // A timer may be late (a computer that slept): what is done then is no use of a page that should be locked.

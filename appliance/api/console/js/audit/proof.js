@@ -9,6 +9,7 @@ import { Icon } from "../parts/icon.js";
 import { Failure, Notice } from "../parts/notice.js";
 import { failed } from "../parts/toast.js";
 import { get, queryText, send } from "../rest.js";
+import { may } from "../session.js";
 import { askedOf } from "./records.js";
 
 export function Verify() {
@@ -35,29 +36,36 @@ function Verdict(/** @type {{value: any}} */ { value }) {
 
 /** @param {{filter: Record<string, string>}} given */
 export function Export({ filter }) {
-  const run = async () => {
-    try {
-      const response = await send("GET", `/v1/audit/export${queryText(askedOf(filter))}`);
-      save(await response.blob(), `rosrv-audit-${new Date().toISOString().slice(0, 19).replaceAll(":", "")}.ndjson`);
-    } catch (error) {
-      failed(error);
-    }
-  };
-  return html`<${Button} onClick=${run} title="All records that match, one JSON object a line"><${Icon} name="down" size=${16} />Export</${Button}>`;
+  return html`<${Button} onClick=${() => take(`/v1/audit/export${queryText(askedOf(filter))}`, `rosrv-audit-${now()}.ndjson`)}
+    title="All records that match, one JSON object a line"><${Icon} name="down" size=${16} />Export</${Button}>`;
 }
 
 /** What happened in the time that the filters name, with what was in force. @param {{filter: Record<string, string>}} given */
 export function Evidence({ filter: { since, until } }) {
-  const run = async () => {
-    try {
-      const response = await send("GET", `/v1/evidence${queryText({ since, until })}`);
-      save(await response.blob(), `rosrv-evidence-${new Date().toISOString().slice(0, 19).replaceAll(":", "")}.zip`);
-    } catch (error) {
-      failed(error);
-    }
-  };
-  return html`<${Button} role="operator" disabled=${!since} why="Choose first since when" onClick=${run}
+  return html`<${Button} role=${may("investigator") ? "investigator" : "operator"} disabled=${!since} why="Choose first since when"
+    onClick=${() => take(`/v1/evidence${queryText({ since, until })}`, `rosrv-evidence-${now()}.zip`)}
     title="All of this time, and what was in force, as a bundle that proves itself"><${Icon} name="down" size=${16} />Evidence</${Button}>`;
+}
+
+/** What was said while a recording was made. @param {{id: string}} given */
+export function Recording({ id }) {
+  const path = `/v1/recordings/${encodeURIComponent(id)}`;
+  return html`<div class="row"><${Button} role="investigator" onClick=${() => take(`${path}/bag`, `rosrv-${id}.bag`)}><${Icon} name="down" size=${16} />Messages</${Button}>
+    <${Button} role="investigator" onClick=${() => take(`${path}/evidence`, `rosrv-evidence-${id}.zip`)}><${Icon} name="down" size=${16} />Evidence</${Button}>
+    <span class="muted small">A bag; or a bundle with all of its time that proves itself. It is recorded who takes it.</span></div>`;
+}
+
+function now() {
+  return new Date().toISOString().slice(0, 19).replaceAll(":", "");
+}
+
+async function take(/** @type {string} */ path, /** @type {string} */ name) {
+  try {
+    const response = await send("GET", path);
+    save(await response.blob(), name);
+  } catch (error) {
+    failed(error);
+  }
 }
 
 /** Give the reader a file. @param {Blob} blob @param {string} name */

@@ -5,7 +5,7 @@ import { may, session } from "../session.js";
 import { useStore } from "../store.js";
 
 /**
- * @param {{role?: "viewer" | "operator" | "admin", tone?: string, small?: boolean, disabled?: boolean, why?: string,
+ * @param {{role?: "viewer" | "investigator" | "operator" | "admin", tone?: string, small?: boolean, disabled?: boolean, why?: string,
  *   onClick: () => any, children?: any, [more: string]: any}} given
  * `why`: the reason it is disabled. While a click's promise is open it cannot be clicked again.
  */
@@ -13,7 +13,7 @@ export function Button({ role = "viewer", tone = "", small = false, disabled = f
   useStore(session);
   const [busy, setBusy] = useState(false);
   const allowed = may(role);
-  const reason = allowed ? (disabled ? why : undefined) : `For the role ${role}${role === "admin" ? "" : " or admin"}; yours is ${session.get().current?.role ?? "none"}`;
+  const reason = allowed ? (disabled ? why : undefined) : `For the role ${role}${role === "operator" ? " or admin" : ""}; yours is ${session.get().current?.role ?? "none"}`;
   const off = !allowed || disabled || busy;
   const click = async () => {
     if (off) return;

@@ -1,0 +1,50 @@
+"""Recordings in the console: from their record an investigator takes the messages, and a bundle that proves itself."""
+
+import json
+import zipfile
+from collections.abc import Callable, Iterator
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.support.appliance import Appliance
+from tests.system.console.reader import Reader
+
+CONFIG = """
+api: 127.0.0.1:0
+api_tls: off
+audit: {reserve_bytes: 1MiB}
+recorder: {enabled: true, memory: 16MiB, disk: 512MiB, triggers: []}
+"""
+
+
+@pytest.fixture(scope="module")
+def appliance(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
+    """An appliance with a flight recorder."""
+    config = tmp_path_factory.mktemp("console") / "appliance.yaml"
+    config.write_text(CONFIG)
+    with Appliance(options=("--config", str(config))) as running:
+        yield running
+
+
+def test_an_investigator_takes_a_recording_from_its_record(
+    appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str]
+) -> None:
+    """The bag and the bundle come as files; an admin is told whom they are for."""
+    order = appliance.rosrv("record", "now", "--before", "1s", "--after", "1s", "--json")
+    recording = json.loads(order.stdout)["id"]
+    [record] = appliance.recorded("--event", "recording closed")
+    page = opened(token("investigator")).go(f"audit/{record['id']}")
+    panel = page.get_by_role("region", name="Record")
+    with page.expect_download() as bag:
+        panel.get_by_role("button", name="Messages").click()
+    assert bag.value.suggested_filename == f"rosrv-{recording}.bag"
+    assert bag.value.path().read_bytes().startswith(b"#ROSBAG V2.0")
+    with page.expect_download() as bundle:
+        panel.get_by_role("button", name="Evidence").click()
+    with zipfile.ZipFile(bundle.value.path()) as archive:
+        assert archive.read("recording/recording.bag") == bag.value.path().read_bytes()
+    page = opened().go(f"audit/{record['id']}")
+    expect(page.get_by_role("button", name="Messages")).to_have_attribute(
+        "title", "For the role investigator; yours is admin"
+    )
