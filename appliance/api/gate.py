@@ -200,7 +200,7 @@ class _Answer:
 
     def _report(self, status: int) -> None:
         path = self._scope["path"]
-        if (path in _NOT_RECORDED and status in (200, 503)) or (is_console(path) and status < 400):
+        if (path in _NOT_RECORDED and status in (200, 304, 503)) or (is_console(path) and status < 400):
             return
         self._journal.answered(
             host=self._scope["client"][0],

@@ -255,7 +255,7 @@ def test_slow_clients_are_cut_off_and_others_served(rest: Rest) -> None:
         assert rest.with_token(None).get("/healthz").status == 200
 
 
-def test_who_polls_is_not_sent_again_what_he_has(rest: Rest) -> None:
+def test_who_polls_is_not_sent_again_what_he_has(running: Appliance, rest: Rest) -> None:
     """The hash of what came is all that is sent the second time; a revision's ETag stays for changes alone."""
     for path in ("/v1/inventory", "/v1/policy/revisions", "/v1/tokens", "/v1/openapi.json"):
         first = rest.get(path)
@@ -266,3 +266,9 @@ def test_who_polls_is_not_sent_again_what_he_has(rest: Rest) -> None:
         first = rest.get(path)
         assert rest.get(path, If_None_Match=first.etag).json.keys() == first.json.keys(), path
     assert rest.with_token(None).get("/v1/inventory", If_None_Match="*").status == 401
+    assert rest.get("/healthz", If_None_Match="*").status == 304
+    rest.get("/v1/whoami", If_None_Match="*")  # recorded after what came before it
+    running.recorded("--event", "rest call", "--topic", "/v1/whoami")
+    assert [
+        one["detail"]["status"] for one in running.audit("--event", "rest call", "--topic", "*healthz")
+    ] == []
