@@ -15,6 +15,10 @@
  *
  * `tests/proofs/test_insertion.py` has the bounds that are checked, and mutants: each is this text with one thing wrong (a
  * name that begins with `MUTANT` is defined), and Spin finds what comes of it.
+ *
+ * With TRACE the steps that leave a record are only taken in the order of a trace of the running appliance (`kind`,
+ * `first`, `second`, LENGTH), and all others when they like: a trace is one of the model's when its end can be reached
+ * (`accepted`). `tests/integration/test_insertion_traces.py` has such traces, and tampered ones.
  */
 
 #ifndef PUBLISHERS
@@ -107,6 +111,28 @@ byte asked[PUBLISHERS];                                          /* control, whe
 #define ASKING 1
 #define ANSWERED 2
 
+/* A step is the next of the trace, and has happened. */
+#ifdef TRACE
+byte at;
+mtype = { publication, subscription, decided_call, loaded, revoked, opened, closed, heard };
+hidden mtype kind[LENGTH];
+hidden byte first[LENGTH], second[LENGTH];
+chan reports = [6] of { mtype };                                 /* what the relay has said of connections */
+#define NEXT_IS(what, a, b) (at < LENGTH && kind[at] == what && first[at] == (a) && second[at] == (b))
+/* It is the next, or this way comes to an end here: nothing takes a step any more. */
+#define HAPPENS(what, a, b) \
+    if \
+    :: NEXT_IS(what, a, b) -> at++ \
+    :: else -> at = LENGTH + 1 \
+    fi
+#define POSSIBLE provided (at <= LENGTH)
+#define REPORT(what) reports!what
+#else
+#define HAPPENS(what, a, b) skip
+#define POSSIBLE
+#define REPORT(what) skip
+#endif
+
 /* Only for what is asserted. */
 byte answered;                                                   /* the revision that operators were last told of */
 bool barred[PAIRS];                                              /* taken, and operators were told so */
@@ -176,6 +202,7 @@ inline take_grant(p, s) {
 
 /* = appliance/specifications/stating.py Stating._settle */
 inline settle() {
+    HAPPENS(loaded, trying, monitored[trying]);
     in_force = trying;
     trying = 0;
     waiting = false;
@@ -210,7 +237,9 @@ inline answer_policy() {
 inline revoke_publication(p) {
     may_publish[p] = false;
     if
-    :: published[p] -> published[p] = false; shelved_p[p] = true; TELL(withdraw, p, 0); tell_all()
+    :: published[p] ->
+        HAPPENS(revoked, 0, 0);
+        published[p] = false; shelved_p[p] = true; TELL(withdraw, p, 0); tell_all()
     :: else
     fi
 }
@@ -223,6 +252,7 @@ inline revoke_subscription(s) {
     for (i : 0 .. PUBLISHERS - 1) { take_grant(i, s) }
     if
     :: subscribed[s] ->
+        HAPPENS(revoked, 0, 0);
         subscribed[s] = false; shelved_s[s] = true;
         assert(nfull(news[s]));
         news[s]!0
@@ -236,7 +266,7 @@ inline give_publication(p) {
     may_publish[p] = true;
     for (j : 0 .. SUBSCRIBERS - 1) { barred[PAIR(p, j)] = barred[PAIR(p, j)] && !may_subscribe[j] }
     if
-    :: shelved_p[p] -> shelved_p[p] = false; published[p] = true; TELL(place, p, 0); tell_all()
+    :: shelved_p[p] -> HAPPENS(publication, 0, 0); shelved_p[p] = false; published[p] = true; TELL(place, p, 0); tell_all()
     :: else
     fi
 }
@@ -246,7 +276,7 @@ inline give_subscription(s) {
     may_subscribe[s] = true;
     for (j : 0 .. PUBLISHERS - 1) { barred[PAIR(j, s)] = barred[PAIR(j, s)] && !may_publish[j] }
     if
-    :: shelved_s[s] -> shelved_s[s] = false; subscribed[s] = true; tell(s)
+    :: shelved_s[s] -> HAPPENS(subscription, 0, 0); shelved_s[s] = false; subscribed[s] = true; tell(s)
     :: else
     fi
 }
@@ -312,7 +342,8 @@ inline remove_topic(p) {
     od;
     for (j : 0 .. SUBSCRIBERS - 1) {
         if
-        :: connection[PAIR(p, j)] == OPEN -> connection[PAIR(p, j)] = NONE; last[PAIR(p, j)] = UNKNOWN
+        :: connection[PAIR(p, j)] == OPEN ->
+            connection[PAIR(p, j)] = NONE; last[PAIR(p, j)] = UNKNOWN; REPORT(closed)
         :: else
         fi
     }
@@ -383,7 +414,7 @@ inline carry_out() {
 #ifndef MUTANT_REVOKED_NOT_CUT
         if
         :: connection[PAIR(number, flags)] == OPEN ->
-            connection[PAIR(number, flags)] = NONE; last[PAIR(number, flags)] = UNKNOWN
+            connection[PAIR(number, flags)] = NONE; last[PAIR(number, flags)] = UNKNOWN; REPORT(closed)
         :: else
         fi
 #endif
@@ -406,7 +437,7 @@ inline carry_out() {
 
 /* --- the nodes -------------------------------------------------------------------------------------------- */
 
-proctype Publisher(byte me) {
+proctype Publisher(byte me) POSSIBLE {
 end:
     do
     /* It registers, once: a turn of control.
@@ -416,7 +447,7 @@ end:
     :: atomic {
         !came_p[me] -> came_p[me] = true;
         if
-        :: may_publish[me] -> published[me] = true; TELL(place, me, 0); tell_all()
+        :: may_publish[me] -> HAPPENS(publication, 0, 0); published[me] = true; TELL(place, me, 0); tell_all()
         :: else
         fi
        }
@@ -429,7 +460,7 @@ end:
     od
 }
 
-proctype Subscriber(byte me) {
+proctype Subscriber(byte me) POSSIBLE {
 end:
     do
     /* It registers, once: a turn of control; the answer has its list.
@@ -438,7 +469,7 @@ end:
     :: atomic {
         !came_s[me] -> came_s[me] = true;
         if
-        :: may_subscribe[me] -> subscribed[me] = true; tell(me)
+        :: may_subscribe[me] -> HAPPENS(subscription, 0, 0); subscribed[me] = true; tell(me)
         :: else
         fi
        }
@@ -448,6 +479,9 @@ end:
         news[me]?list ->
         for (i : 0 .. PUBLISHERS - 1) {
             if
+#ifdef TRACE
+            :: !(list & (1 << i)) && connection[PAIR(i, me)] == OPEN -> connection[PAIR(i, me)] = NONE; REPORT(closed)
+#endif
             :: !(list & (1 << i)) -> connection[PAIR(i, me)] = NONE; last[PAIR(i, me)] = UNKNOWN
             :: (list & (1 << i)) && connection[PAIR(i, me)] != OPEN && !request[PAIR(i, me)] ->
                 request[PAIR(i, me)] = CALLED
@@ -460,14 +494,15 @@ end:
 }
 
 /* A subscriber's requestTopic to the outer face of a publisher, and its connection to the port of the answer. */
-proctype Request(byte p; byte s) {
+proctype Request(byte p; byte s) POSSIBLE {
 end:
     do
     /* = appliance/master/calls/execution.py Execution._decide */
     :: atomic {
         request[PAIR(p, s)] == CALLED ->
         if
-        :: published[p] && may_subscribe[s] -> request[PAIR(p, s)] = DECIDED
+        :: published[p] && may_subscribe[s] ->
+            HAPPENS(decided_call, 0, 0); request[PAIR(p, s)] = DECIDED
         :: else -> request[PAIR(p, s)] = NOT
         fi
        }
@@ -506,7 +541,8 @@ end:
     :: atomic {
         up && (awaited || len(to_relay) == 0) && listening[p] && connection[PAIR(p, s)] == KNOCKED ->
         if
-        :: placed[p] && allowed[PAIR(p, s)] -> connection[PAIR(p, s)] = OPEN; last[PAIR(p, s)] = UNKNOWN
+        :: placed[p] && allowed[PAIR(p, s)] ->
+            connection[PAIR(p, s)] = OPEN; last[PAIR(p, s)] = UNKNOWN; REPORT(opened)
         :: (!placed[p] || !allowed[PAIR(p, s)]) && !awaited -> connection[PAIR(p, s)] = NONE
         :: else
         fi
@@ -526,7 +562,7 @@ inline find_upstream(p) {
 
 /* What the relay says.
    = appliance/master/reach/relays.py RelayControl._received */
-proctype RVMaster() {
+proctype RVMaster() POSSIBLE {
 end:
     do
     /* = appliance/specifications/stating.py Stating._taken */
@@ -547,6 +583,14 @@ end:
         :: else
         fi
        }
+#ifdef TRACE
+    /* = appliance/master/reach/carried.py Carried.opened
+       = appliance/master/reach/carried.py Carried.closed */
+    :: atomic { reports?[opened] && NEXT_IS(opened, 0, 0) -> reports?opened; at++ }
+    :: atomic { reports?[closed] && NEXT_IS(closed, 0, 0) -> reports?closed; at++ }
+    /* = appliance/master/upkeep/reminders.py Reminders._remind */
+    :: atomic { linked && subscribed[0] && len(news[0]) == 0 && connection[0] == NONE && !request[0] -> tell(0) }
+#endif
     /* The relay does not answer in time.
        = appliance/specifications/stating.py Stating._findings */
     :: atomic { waiting -> take_back_trial() }
@@ -556,7 +600,7 @@ end:
 /* Monitors are loaded, replaced and removed, one change after the other.
    = appliance/specifications/monitors.py Monitors._change
    = appliance/specifications/stating.py Stating._try */
-proctype Specifications() {
+proctype Specifications() POSSIBLE {
 end:
     do
     :: atomic {
@@ -585,7 +629,7 @@ end:
 /* The policy is changed: one node's right is taken or given.
    = appliance/control/policies.py Policies.reload
    = appliance/master/graph/revocation.py Revocation.policy_changed */
-proctype Policy() {
+proctype Policy() POSSIBLE {
     byte who;
 end:
     do
@@ -632,7 +676,7 @@ end:
 #endif
 
 /* = appliance/relay/engine.py Engine.take */
-proctype Relay() {
+proctype Relay() POSSIBLE {
     mtype message;
 end:
     do
@@ -659,7 +703,7 @@ end:
 }
 
 /* A topic of one publisher, in the relay. */
-proctype Topic(byte p) {
+proctype Topic(byte p) POSSIBLE {
     byte sequence, sent_under, judge;
 end:
     do
@@ -694,7 +738,14 @@ end:
         fi;
         if
         :: through[p] && blocked
-        :: else -> pass_on(p, sequence, sent_under, judge)
+        :: else ->
+            pass_on(p, sequence, sent_under, judge);
+#ifdef TRACE
+            if
+            :: true    /* one of which the trace says nothing */
+            :: connection[PAIR(p, 0)] == OPEN && NEXT_IS(heard, judge, sent_under) -> at++
+            fi
+#endif
         fi;
         sequence = 0; sent_under = 0; judge = 0;
         /* Only differences of numbers mean anything: they begin again. */
@@ -715,7 +766,7 @@ end:
 
 /* The relay dies, and is started again; control states everything afresh.
    = appliance/supervisor/life.py Life */
-proctype Supervisor() {
+proctype Supervisor() POSSIBLE {
 #ifdef MUTANT_STATED_LATER
     bool later;
 #endif
@@ -742,6 +793,12 @@ end:
                 fi
             }
         };
+#ifdef TRACE
+        do
+        :: len(reports) > 0 -> reports?_
+        :: else -> break
+        od;
+#endif
         if
         :: ordering -> answer_policy()
         :: else
@@ -781,8 +838,13 @@ end:
     od
 }
 
+#ifdef TRACE
+proctype Rest() POSSIBLE {
+    at == LENGTH -> assert(!true)    /* accepted */
+}
+#else
 /* Nothing is under way any more. */
-proctype Rest() {
+proctype Rest() POSSIBLE {
     timeout ->
     for (i : 0 .. PUBLISHERS - 1) {
         for (j : 0 .. SUBSCRIBERS - 1) {
@@ -792,10 +854,14 @@ proctype Rest() {
     assert(!taken_by_relay[in_force] || has == in_force);
     assert(!trying && !ordering)
 }
+#endif
 
 init {
     atomic {
         in_force = 1; latest = 1; answered = 1;
+#ifdef TRACE
+        fill_trace();
+#endif
         if
         :: monitored[1] = true
         :: monitored[1] = false

@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,13 @@ MODEL = Path(__file__).parents[2] / "proofs" / "insertion.pml"
 
 _MEGABYTES = 2000
 _DEPTH = 1_000_000
-_PROPERTIES = {"barred": "barred", "judge": "judged", "last": "whole", "published": "connected"}
+_PROPERTIES = {
+    "barred": "barred",
+    "judge": "judged",
+    "last": "whole",
+    "published": "connected",
+    "1": "accepted",
+}
 """The first name in an assertion, and what the head of the model calls the property."""
 
 
@@ -58,11 +65,11 @@ class Found:
     states: int
 
 
-def search(folder: Path, bounds: Bounds, mutant: str = "") -> Found:
+def search(folder: Path, bounds: Bounds, mutant: str = "", model: Path = MODEL) -> Found:
     """Look at every state that the model can reach, in `folder`. Fails when they are more than fit into memory."""
     spin, compiler = need_program("spin", "spin"), need_program("gcc", "g++")
     wrong = [f"-DMUTANT_{mutant}"] if mutant else []
-    _run(folder, spin, "-a", *bounds.defined, *wrong, str(MODEL))
+    _run(folder, spin, "-a", *bounds.defined, *wrong, str(model))
     # What is found at once is not worth a program that is made fast.
     _run(
         folder,
@@ -76,7 +83,7 @@ def search(folder: Path, bounds: Bounds, mutant: str = "") -> Found:
         "pan",
         "pan.c",
     )
-    said = _run(folder, "./pan", f"-m{_DEPTH}")
+    said = _run(folder, "./pan", "-E", f"-m{_DEPTH}")
     states = re.search(r"(\d+) states, stored", said)
     assert states is not None, said
     broken = re.search(r"pan:1: assertion violated \W*(\w+)", said)
@@ -86,6 +93,26 @@ def search(folder: Path, bounds: Bounds, mutant: str = "") -> Found:
     assert "not completed" not in said, said
     assert "too small" not in said, said
     return Found("", int(states[1]))
+
+
+Step = tuple[str, int, int]
+"""Of a trace: what happened, and two numbers that it is about."""
+
+
+def accepts(folder: Path, bounds: Bounds, trace: Sequence[Step]) -> bool:
+    """Whether the model has a way that leaves this trace: all are tried."""
+    filled = "".join(
+        f"    kind[{place}] = {what}; first[{place}] = {one}; second[{place}] = {other};\n"
+        for place, (what, one, other) in enumerate(trace)
+    )
+    model = folder / "traced.pml"
+    head = f"#define TRACE\n#define LENGTH {len(trace)}\n"
+    model.write_text(
+        f"{head}{MODEL.read_text()}\n".replace("init {", f"inline fill_trace() {{\n{filled}}}\n\ninit {{")
+    )
+    found = search(folder, bounds, model=model).broken
+    assert found in ("", "accepted"), found
+    return bool(found)
 
 
 def _run(folder: Path, *command: str) -> str:

@@ -1,0 +1,154 @@
+"""What the running appliance did is a way of the model of the insertion (`proofs/insertion.pml`); tampered, it is none.
+
+With rospy nodes: a monitor that stamps its revision on what it judges is replaced and removed, the relay is killed, the
+policy takes the subscription and gives it again. The trace has what the audit log says of the topic, in its order, and
+after each change a message that was sent when the change had been answered.
+"""
+
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.nodes import RosSession, has_ros
+from tests.support.processes import Event
+from tests.support.requirements import needs
+from tests.support.spin import Bounds, Step, accepts
+from tests.support.waiting import eventually
+
+NO_EARS = OPEN_POLICY.replace("[Commands]", "/chatter =\n[Commands]", 1)
+STAMP = """
+stamp() {
+    event said(std::string text) /chatter std_msgs/String '{data:text}' { text = "REVISION " + text; }
+}
+"""
+STEPS = {
+    ("registered", "publication"): "publication",
+    ("registered", "subscription"): "subscription",
+    ("decision", "requestTopic"): "decided_call",
+    ("connection opened", "topic"): "opened",
+    ("connection closed", "topic"): "closed",
+    ("revoked", "subscription"): "revoked",
+}
+Trace = list[Step]
+
+
+def steps(appliance: Appliance) -> Trace:
+    """What the log says of the topic, the oldest first."""
+    found: Trace = []
+    for record in appliance.audit("--limit", "10000", "--oldest-first"):
+        event, detail = record["event"], record["detail"]
+        if event == "specifications loaded" and detail["revision_of_specifications"] > 1:
+            found.append(("loaded", detail["revision_of_specifications"], int(bool(detail["monitors"]))))
+        elif record.get("resource") == "/chatter" and record.get("decision") in (None, "allow", "deny"):
+            step = STEPS.get((event, detail.get("call") or record["category"]))
+            denied = event == "decision" and record["decision"] != "allow"
+            found += [(step, 0, 0)] if step and not denied else []
+    return found
+
+
+def number(event: Event) -> int:
+    """Of a message that was received."""
+    return int(event["data"].split()[-1]) if event["event"] == "received" else 0
+
+
+@pytest.fixture(scope="module")
+def trace() -> Trace:
+    """Of one run."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with tempfile.TemporaryDirectory(prefix="rosrv-stamp-") as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        (folder / "stamp.rv").write_text(STAMP.replace("REVISION", "1"))
+        with (
+            Appliance(options=("--monitors", name, "--api", "off")) as appliance,
+            RosSession(appliance.master_uri, folder) as ros,
+        ):
+            return followed(appliance, ros, folder)
+
+
+def followed(appliance: Appliance, ros: RosSession, folder: Path) -> Trace:
+    """Change one thing after the other, and hear what is sent then."""
+    trace: Trace = []
+    listener = ros.listener("rospy", "/chatter")
+    talker = ros.talker("rospy", "/chatter", "--rate", "20")
+
+    def hear(revision: int, opened: int) -> None:
+        """One that is sent from now on, when the log has the revision and so many connections."""
+        last = max((one["number"] for one in talker.seen(event="sent")), default=0)
+        heard = listener.wait_for(lambda event: number(event) >= last + 2)
+
+        def recorded() -> Trace | None:
+            known = steps(appliance)
+            there = [what for what, _, _ in known]
+            return known if (there.count("opened"), there.count("loaded")) == (opened, revision - 1) else None
+
+        known = eventually(recorded, appliance.story)
+        trace.extend(known[sum(what != "heard" for what, _, _ in trace) :])
+        stamp = re.match(r"\d+", heard["data"])
+        trace.append(("heard", int(stamp[0]) if stamp else revision, revision))
+
+    hear(1, 1)
+    changed = folder / "changed" / "stamp.rv"
+    changed.parent.mkdir()
+    changed.write_text(STAMP.replace("REVISION", "2"))
+    appliance.rosrv("monitor", "load", str(changed))
+    hear(2, 1)
+    appliance.kill("relay")
+    hear(2, 2)
+    appliance.reload(NO_EARS)
+    appliance.reload(OPEN_POLICY)
+    hear(2, 3)
+    appliance.rosrv("monitor", "remove", "stamp")
+    hear(3, 3)
+    return trace
+
+
+def bounds(trace: Trace) -> Bounds:
+    """As many changes as the trace has, and a crash."""
+    happened = [what for what, _, _ in trace]
+    again = max(0, happened.count("subscription") - 1)
+    return Bounds(loads=happened.count("loaded"), policies=happened.count("revoked") + again, crashes=1)
+
+
+def test_a_run_is_one_of_the_models(trace: Trace, tmp_path: Path) -> None:
+    """It has all that was done, and the model has a way that leaves it."""
+    happened = [what for what, _, _ in trace]
+    assert [step for step in trace if step[0] in ("loaded", "heard")] == [
+        ("heard", 1, 1), ("loaded", 2, 1), ("heard", 2, 2), ("heard", 2, 2), ("heard", 2, 2), ("loaded", 3, 0),
+        ("heard", 3, 3),
+    ]  # fmt: skip
+    assert (happened.count("opened"), happened.count("revoked")) == (3, 1)
+    assert accepts(tmp_path, bounds(trace), trace), trace
+
+
+def past_its_monitor(trace: Trace) -> Trace:
+    """A message that was sent after the new revision had been answered is judged by the one before."""
+    place = trace.index(("heard", 2, 2))
+    return [*trace[:place], ("heard", 1, 2)]
+
+
+def undecided(trace: Trace) -> Trace:
+    """A connection that nobody asked for."""
+    place = trace.index(("decided_call", 0, 0))
+    return [*trace[:place], *trace[place + 1 : trace.index(("opened", 0, 0)) + 1]]
+
+
+def after_the_end(trace: Trace) -> Trace:
+    """A message after the connection whose grant was taken is closed."""
+    return [*trace[: trace.index(("closed", 0, 0)) + 1], ("heard", 2, 2)]
+
+
+def twice(trace: Trace) -> Trace:
+    """Two connections, where one was asked for."""
+    return [*trace[: trace.index(("opened", 0, 0)) + 1], ("opened", 0, 0)]
+
+
+@pytest.mark.parametrize("tampered", [past_its_monitor, undecided, after_the_end, twice])
+def test_a_tampered_run_is_none(tampered: Callable[[Trace], Trace], trace: Trace, tmp_path: Path) -> None:
+    """All ways of the model are tried, and none leaves this; what is before the last step was left by one."""
+    wrong = tampered(trace)
+    assert not accepts(tmp_path, bounds(wrong), wrong), wrong
