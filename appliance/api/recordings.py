@@ -17,12 +17,11 @@ from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Investigator, Operator, Viewer, answered, ask
 from appliance.api.routing import Responses, Routes, answer, body, content
 from appliance.api.services import Services
-from appliance.api.streams import Held, Streams, peer_of
+from appliance.api.streams import Held, peer_of
 from appliance.channel import admin
 from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.recordings import Recording, RecordingBegun, Recordings
 from appliance.recorder.mcap import as_mcap
-from appliance.shares.table import REST_EXPORTS
 
 _PIECE = 1 << 20
 _SLOW_SECONDS = 15.0  # longer than control waits for the recorder
@@ -49,7 +48,6 @@ def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1/recordings", tags=["recordings"])
     control = services.control
-    fetches = Streams(REST_EXPORTS, REST_EXPORTS, REST_EXPORTS.bounds.whole)
 
     @router.get("", operation_id="recordings", responses=_UNKNOWN)
     async def recordings(bearer: Viewer) -> Recordings:
@@ -82,7 +80,7 @@ def routes(services: Services) -> Routes:
         format: Annotated[Literal["bag", "mcap"], Query(description="mcap: made of the bag")] = "bag",  # noqa: A002
     ) -> Response:
         """The messages of a recording, for investigators; it is recorded who fetched them."""
-        give_back = fetches.take(bearer, peer_of(request), "fetches")
+        give_back = services.exports.take(bearer, peer_of(request), "exports")
         try:
             return Held(await _bag(services, recording_id, bearer, mcap=format == "mcap"), give_back)
         except BaseException:

@@ -110,6 +110,9 @@ class BagWriter:
                 chunks[-1][1].append((_U32.unpack(fields["conn"])[0], len(times)))
                 chunks[-1][2].extend((min(times), max(times)))
             at = self._file.tell() + size
+        # `rosbag info` takes the beginning from the first and the end from the last.
+        last = max((max(times) for _place, _counts, times in chunks), default=None)
+        chunks.sort(key=lambda chunk: (max(chunk[2]) == last, min(chunk[2])))
         return [
             _record(
                 {

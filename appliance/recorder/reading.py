@@ -17,6 +17,7 @@ from appliance.recorder.ring import (
     birth_at,
     geometry,
     rows,
+    used_at,
     words_of,
 )
 from appliance.ros.errors import ProtocolError
@@ -79,7 +80,10 @@ class RingReader:
         return self._words[MISSED], self._words[REFUSED]
 
     def read(self, since: int, until: int) -> Iterator[Found]:
-        """What has come since the last call, of the time between these two (nanoseconds since the epoch)."""
+        """What has come since the last call, of the time between these two (nanoseconds since the epoch).
+
+        What is later is for a later call: it may have come while this one reads.
+        """
         headers: dict[int, _Blocks] = {}
         data: dict[int, _Blocks] = {}
         for block, row in rows(self._memory):
@@ -108,9 +112,13 @@ class RingReader:
         return header if header.keys() >= _NEEDED else None
 
     def _copy(self, block: int, row: Row) -> bytes | None:
-        """The part of a block that counts; None if it has been taken for something else meanwhile."""
+        """The part of a block that counts; None if it has been taken for something else meanwhile.
+
+        As it is now, not as it was when the table was copied: where the next block was there already, this one may have
+        been copied before it was full.
+        """
         start = self._geometry.data + block * self._geometry.block
-        part = bytes(self._memory[start : start + min(row.used, self._geometry.block)])
+        part = bytes(self._memory[start : start + min(self._words[used_at(block)], self._geometry.block)])
         return part if self._words[birth_at(block)] == row.birth else None
 
     def _runs(self, blocks: _Blocks, place: Place | None) -> Iterator[_Run]:
@@ -161,7 +169,9 @@ class RingReader:
                 end = at + RECORD.size + size
                 if end > len(view):
                     break
-                if since <= time <= until:
+                if time > until:
+                    break
+                if time >= since:
                     frames = _frames(view[at + RECORD.size : end], messages)
                     if frames is None:
                         torn = True

@@ -216,7 +216,7 @@ class Recorder:
             return
         now, progress = self._clock(), self._making.progress
         if now <= progress.ends:
-            self._making.step(now)
+            self._making.step()
         elif not self._revisions_asked:
             self._revisions_asked = True
             self._answers.append(messages.RevisionsWanted())
@@ -230,9 +230,8 @@ class Recorder:
     def _close(self) -> None:
         """The recording is over: its last messages, the audit records of its time, and its description."""
         assert self._making is not None  # noqa: S101  somebody has looked
-        making, progress = self._making, self._making.progress
-        making.step(progress.ends)
-        self._finish(making)
+        self._making.step()
+        self._finish(self._making)
 
     def _finish(self, making: RecordingInProgress) -> None:
         progress = making.progress

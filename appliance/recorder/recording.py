@@ -96,11 +96,11 @@ class RecordingInProgress:
             progress.following = [{} for _ring in rings]
             progress.not_there = [reader.not_there for reader in self._readers]
 
-    def step(self, until: int) -> None:
-        """Write what has come up to a time (nanoseconds since the epoch). Raises `OSError`."""
+    def step(self) -> None:
+        """Write what has come, up to the recording's end. Raises `OSError`."""
         progress = self.progress
         for number, reader in enumerate(self._readers):
-            for found in reader.read(progress.began, until):
+            for found in reader.read(progress.began, progress.ends):
                 self._take(found, progress.following[number])
         progress.places = [reader.places for reader in self._readers]
         new = self._folder / f"{_PROGRESS}.new"

@@ -132,6 +132,11 @@ def birth_at(block: int) -> int:
     return _COUNTERS // 8 + block * _WORDS
 
 
+def used_at(block: int) -> int:
+    """Which word says how much of a block counts."""
+    return birth_at(block) + 4
+
+
 class Stream:
     """What one connection to a publisher leaves in the ring, until it is closed."""
 
@@ -156,7 +161,7 @@ class Stream:
         if end <= self._end:
             RECORD.pack_into(ring.memory, place, MARK, messages, size, now, first)
             ring.memory[place + RECORD.size : end] = frames
-            ring.words[ring.used_at(self.block)] = end - self._end + ring.block
+            ring.words[used_at(self.block)] = end - self._end + ring.block
             self._place = end
         elif size > ring.longest:
             ring.count(MISSED, messages)
@@ -177,7 +182,7 @@ class Stream:
         left = len(head) + len(frames)
         if left > _LONG * ring.block and self._place + _PAD.size <= self._end:
             _PAD.pack_into(ring.memory, self._place, PAD)
-            ring.words[ring.used_at(self.block)] = ring.block
+            ring.words[used_at(self.block)] = ring.block
             self._place = self._end
         for part in (head, frames):
             done = 0
@@ -188,7 +193,7 @@ class Stream:
                 count = min(len(part) - done, self._end - self._place)
                 ring.memory[self._place : self._place + count] = part[done : done + count]
                 self._place += count
-                ring.words[ring.used_at(self.block)] = self._place - self._end + ring.block
+                ring.words[used_at(self.block)] = self._place - self._end + ring.block
                 done += count
                 left -= count
 
@@ -260,17 +265,13 @@ class RingWriter:
             block = self.take(self._last_stream, number, HEADER, 0, chain)
             place = self.geometry.data + block * self.block
             self.memory[place : place + len(part)] = part
-            self.words[self.used_at(block)] = len(part)
+            self.words[used_at(block)] = len(part)
         chain.writer = Stream(self, self._last_stream, chain)
         return chain.writer
 
     def count(self, counter: int, by: int) -> None:
         """Count what is not there."""
         self.words[counter] = (self.words[counter] + by) % (1 << 64)
-
-    def used_at(self, block: int) -> int:
-        """Which word says how much of a block counts."""
-        return birth_at(block) + 4
 
     def take(self, stream: int, number: int, kind: int, begins: int, chain: _Chain) -> int:
         """A block for a stream: a free one, or the oldest of its topic or host if that has its share, or of all."""

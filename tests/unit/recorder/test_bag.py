@@ -60,6 +60,23 @@ def test_another_writer_goes_on(tmp_path: Path, torn: int) -> None:
     assert [data for _topic, _time, data in read(path)] == [body(b"one"), body(b"two"), body(b"three")]
 
 
+def test_stock_tools_find_beginning_and_end(tmp_path: Path) -> None:
+    """They take them from the first chunk and the last, in whatever order of times chunks were written."""
+    bag = BagWriter(tmp_path / "a.bag", {})
+    chatter = bag.connect(HEADER)
+    for times in ((5, 9), (3, 4), (7, 8)):
+        bag.write([Message(chatter, time * SECOND, body(b"x")) for time in times])
+    bag.close()
+    with Reader(tmp_path / "a.bag") as reader:
+        chunks = [(info.start_time, info.end_time) for info in reader.chunk_infos]
+    assert [(first, last - 1) for first, last in chunks] == [
+        (number * SECOND, end * SECOND) for number, end in ((3, 4), (7, 8), (5, 9))
+    ]
+    assert [time for _topic, time, _data in read(tmp_path / "a.bag")] == [
+        number * SECOND for number in (3, 4, 5, 7, 8, 9)
+    ]
+
+
 def test_empty_bag(tmp_path: Path) -> None:
     """A bag without a message is a bag."""
     BagWriter(tmp_path / "a.bag", {}).close()

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from appliance.recorder import reading
 from appliance.recorder.reading import Found, RingReader
-from appliance.recorder.ring import SMALLEST, RingWriter, Stream, birth_at, geometry, rows, words_of
+from appliance.recorder.ring import DATA, SMALLEST, RingWriter, Stream, birth_at, geometry, rows, words_of
 
 EVER = 0, 1 << 63
 HEADER = {
@@ -109,6 +110,40 @@ def test_only_the_time_that_was_asked_for(memory: memoryview) -> None:
         clock.now = number
         stream.write(memoryview(frame(str(number).encode())), 1, number)
     assert texts(list(RingReader(memory).read(4, 6))) == [b"4", b"5", b"6"]
+
+
+def test_what_is_later_is_for_the_next_call(memory: memoryview) -> None:
+    """A call that asks for the time until now loses nothing that comes while it reads."""
+    clock = Clock(10)
+    writer = ring(memory, clock)
+    stream = opened(writer)
+    reader = RingReader(memory)
+    for number in range(1, 6):
+        clock.now = number * 10
+        stream.write(memoryview(frame(bytes([number]))), 1, number)
+    assert texts(list(reader.read(20, 30))) == [b"\x02", b"\x03"]
+    assert texts(list(reader.read(20, 30))) == []
+    assert texts(list(reader.read(20, 90))) == [b"\x04", b"\x05"]
+
+
+def test_table_that_changes_while_it_is_copied(memory: memoryview, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A block's row may be older than that of the block after it: nothing between them is lost."""
+    writer = ring(memory)
+    stream = opened(writer)
+    for number in range(1, 4):
+        stream.write(memoryview(frame(bytes([number]) * 100)), 1, number)
+    early = dict(rows(memory))
+    full = 4
+    while True:
+        stream.write(memoryview(frame(bytes([full]) * 100)), 1, full)
+        if sum(row.number == 1 and row.kind == DATA and row.sound for _at, row in rows(memory)):
+            break
+        full += 1
+    mixed = [(at, early[at] if early[at].sound else row) for at, row in rows(memory)]
+    monkeypatch.setattr(reading, "rows", lambda _memory: mixed)
+    found = list(RingReader(memory).read(*EVER))
+    assert texts(found) == [bytes([number]) * 100 for number in range(1, full + 1)]
+    assert not found[0].torn
 
 
 def test_flood_pushes_out_itself(memory: memoryview) -> None:
