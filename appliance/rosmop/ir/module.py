@@ -325,11 +325,17 @@ class _Body:
         return self._if(test, lambda: self._block(node.yes), no)
 
     def _loop(self, node: form.Loop) -> bytes:
+        self._brief = False
         return self._repeated(b"", node.body)
+
+    def _times(self, left: str, each: bytes, body: Sequence[form.Statement] = ()) -> bytes:
+        """So often as a local variable says, which counts down."""
+        over = self._get(left, I64) + b"\x50\x0d\x01"
+        less = self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
+        return self._repeated(over + less + each, body)
 
     def _repeated(self, before: bytes, body: Sequence[form.Statement]) -> bytes:
         """Again and again; `before` may leave the outer of the two blocks."""
-        self._brief = False
         self._depth += 2
         self._loops.append(self._depth)
         code = before + self._block(body)
@@ -340,8 +346,8 @@ class _Body:
     def _for_each(self, node: form.ForEach) -> bytes:
         kind, size = self._writer.element(node.values.type)
         first, place, count = self._elements(node.values)
+        self._brief = False
         at, left = (f"{what} {len(self._locals)}" for what in ("element", "left"))
-        over = self._get(left, I64) + b"\x50\x0d\x01"
         if isinstance(kind, kinds.String):
             each, begin, length = self._text_at(self._get(at))
             each += begin + self._set(f"place of {node.name}") + length
@@ -351,9 +357,8 @@ class _Body:
         else:
             each = self._loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
         following = self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
-        less = self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
         code = first + place + self._set(at) + count + self._set(left, I64)
-        return code + self._repeated(over + each + following + less, node.body)
+        return code + self._times(left, each + following, node.body)
 
     def _break(self, node: form.Break) -> bytes:
         del node
@@ -448,13 +453,12 @@ class _Body:
         many = self._get(count, I64) + constant(I64, MOST_TEXTS) + b"\x56"
         code += self._if(many, self._elsewhere) + self._get(count, I64) + self._set(left, I64)
         code += self._position(node.at.plus(4)) + self._set(node.end, I64) + table + self._set(entry)
-        over = self._get(left, I64) + b"\x50\x0d\x01"
-        over += self._get(entry) + self._get("at") + self._get(node.end, I64) + b"\xa7\x6a\x36\x00\x00"
-        over += self._after_text(form.AfterText(node.site, node.end, form.Spot(node.end, 0)))
+        each = self._get(entry) + self._get("at") + self._get(node.end, I64) + b"\xa7\x6a\x36\x00\x00"
+        each += self._after_text(form.AfterText(node.site, node.end, form.Spot(node.end, 0)))
         beyond = self._get(node.end, I64) + self._get("size") + b"\xad\x56"
-        over += self._if(beyond, self._elsewhere) + self._get(entry) + constant(I32, 4) + b"\x6a"
-        over += self._set(entry) + self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
-        return code + self._repeated(over, ()) + table + self._set(f"place of {node.name}")
+        each += self._if(beyond, self._elsewhere)
+        each += self._get(entry) + constant(I32, 4) + b"\x6a" + self._set(entry)
+        return code + self._times(left, each) + table + self._set(f"place of {node.name}")
 
     def _text_at(self, entry: bytes) -> tuple[bytes, bytes, bytes]:
         """The string that begins where an entry of a table says, as `_elements`."""
@@ -520,7 +524,6 @@ class _Body:
         else:
             many = self._get(left, I64) + constant(I64, FEW) + b"\x56"
             code += self._if(many, lambda: self._spend(self._get(left, I64)))
-        self._depth += 2
         if node.skipper is None:
             end = self._after_text(form.AfterText(node.site, place, form.Spot(place, 0)))
         else:
@@ -528,10 +531,7 @@ class _Body:
             skipper = self._writer.function(node.skipper, given, I64, self._context)
             end = self._get("at") + self._get("size") + self._get(place, I64)
             end += b"\x10" + unsigned(skipper.number) + self._set(place, I64)
-        self._depth -= 2
-        over = self._get(left, I64) + b"\x50\x0d\x01"
-        less = self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
-        code += b"\x02\x40\x03\x40" + over + end + less + b"\x0c\x00" + END + END
+        code += self._times(left, end)
         return code + self._get(place, I64) + self._set(node.name, I64)
 
     def _read_numbers(self, node: form.ReadNumbers) -> bytes:
@@ -838,11 +838,11 @@ class _Body:
         )
         added = form.Convert(node.type, form.Arithmetic(node.wide, "+", one, other, node.site))
         span = form.Assign(node.type, total, added)
-        over = self._get(left, I64) + b"\x50\x0d\x01"
-        over += self._loaded(self._get(at), 0, kind) + self._set(each, machine_type(kind))
-        over += self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
-        over += self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
-        code += self._repeated(over, (form.Evaluate(node.site, span),))
+        summed = self._loaded(self._get(at), 0, kind) + self._set(each, machine_type(kind))
+        summed += self._evaluate(form.Evaluate(node.site, span))
+        summed += self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
+        self._brief = False
+        code += self._times(left, summed)
         return code + self._get(total, machine_type(node.type))
 
     def _moment(self, node: form.Moment) -> bytes:
