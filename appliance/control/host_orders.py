@@ -1,6 +1,7 @@
 """What is asked about hosts, by operators and by the hosts themselves, carried out."""
 
 import time
+from collections.abc import Awaitable, Callable
 
 from appliance.channel import admin
 from appliance.channel.answers import hosts as answers
@@ -8,10 +9,15 @@ from appliance.hosts.hosts import Hosts
 
 
 class HostOrders:
-    """Each method answers the request that it takes. They raise `HostRefusedError`, `HostsChangedError`."""
+    """Each method answers the request that it takes. They raise `HostRefusedError`, `HostsChangedError`.
 
-    def __init__(self, hosts: Hosts) -> None:
+    `carried_out()` waits until the relays have carried out what they were told: who was told that a host is out finds
+    its connections closed.
+    """
+
+    def __init__(self, hosts: Hosts, carried_out: Callable[[], Awaitable[None]]) -> None:
         self._hosts = hosts
+        self._carried_out = carried_out
 
     async def listed(self, _request: admin.HostList) -> answers.Hosts:
         """All hosts, and how the tunnels stand."""
@@ -61,7 +67,9 @@ class HostOrders:
 
     async def revoke(self, request: admin.HostRevoke, who: str) -> answers.Revoked:
         """Let a host in no more."""
-        return await self._hosts.revoke(request.name, who, request.expected)
+        revoked = await self._hosts.revoke(request.name, who, request.expected)
+        await self._carried_out()
+        return revoked
 
     async def ports(self, request: admin.HostPorts, who: str) -> answers.PortsTold:
         """Somebody tried a machine's ROS ports."""
@@ -72,7 +80,9 @@ class HostOrders:
 
     async def reload(self, request: admin.HostsReload, who: str) -> answers.Reloaded:
         """Read hosts.yaml again."""
-        return await self._hosts.reload(who, request.expected)
+        reloaded = await self._hosts.reload(who, request.expected)
+        await self._carried_out()
+        return reloaded
 
     # --- what a host asks itself ---
 

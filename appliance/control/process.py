@@ -247,7 +247,7 @@ class _Control:
             looks,
             PolicyOrders(base.policies, base.store, parts.relay.carried_out),
             MonitorOrders(parts),
-            HostOrders(self._hosts),
+            HostOrders(self._hosts, parts.relay.carried_out),
             TokenOrders(self._tokens),
             self._recordings,
             EvidenceOrders(self._audit, base.trail),
