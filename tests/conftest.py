@@ -16,6 +16,8 @@ from tests.support.requirements import need_root, needs
 from tests.support.rosmaster import PlainMaster
 from tests.support.site import Site
 
+_LONGEST_STORY = 40_000  # characters; of a flood there are many more
+
 # How long an example takes says what else the machine does, and nothing of the product.
 settings.register_profile("no clock", deadline=None)
 settings.load_profile("no clock")
@@ -85,10 +87,11 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     """Add what the nodes and the appliance said to the report of a failure."""
     report = yield
     if report.failed and isinstance(item, pytest.Function):
-        for name in ("ros", "site", "appliance", "plain_master"):
-            running: Any = item.funcargs.get(name)
-            if running is not None:
-                report.sections.append((f"What {name} said", running.story()))
+        running: dict[int, tuple[str, Any]] = {
+            id(value): (name, value) for name, value in item.funcargs.items() if hasattr(value, "story")
+        }
+        for name, said in running.values():
+            report.sections.append((f"What {name} said", said.story()[-_LONGEST_STORY:]))
     return report
 
 
