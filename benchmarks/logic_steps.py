@@ -36,6 +36,10 @@ PROPERTIES = (
     ("mtl", "!c since[10ms,20ms] a", "mixed"),
     ("mtl", "!c since[10s,20s] a", "mixed"),
     ("mtl", "once[1s,1s] a", "mixed"),
+    ("mtl", "a => eventually[0,24h] b", "mixed"),
+    ("mtl", "a => !b until[10ms,24h] c", "mixed"),
+    ("mtl", "historically (a => eventually[0,24h] b)", "mixed"),
+    ("mtl", "once[0,20ms] eventually[0,24h] a", "mixed"),
     ("pattern", "globally: a forbids c within 1ns", "mixed"),
     ("pattern", "after a until c: a causes b within 1h", "mixed"),
 )

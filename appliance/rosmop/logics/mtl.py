@@ -1,13 +1,13 @@
-"""``mtl``: metric temporal logic over the past, in words, with closed time bounds.
+"""``mtl``: metric temporal logic, in words, with closed time bounds.
 
 ``once[0,500ms] a``, ``historically[…] a``, ``a since[…] b``, ``previously[…] a``; without bounds an
-operator means ``[0,inf]``. Pointwise: a formula is asked only at events, and its operators see events only,
-at the times at which they were received. The category is ``validation`` where the formula holds at this
-event, ``violation`` where not.
-
-Future operators are read, and refused: they are not supported yet.
+operator means ``[0,inf]``. ``eventually[0,500ms] a``, ``always[…] a``, ``a until[…] b``, ``next[…] a``: about the
+future the upper bound has to be there. Pointwise: a formula is asked only at events, and its operators see events
+only, at the times at which they were received. The category is ``validation`` where the formula holds at an event,
+``violation`` where not; it is told once that is certain, at the latest when the bounds have passed.
 """
 
+from appliance.rosmop.logics.bounded import compile_bounded
 from appliance.rosmop.logics.formula import NOT, Level, Syntax, boolean_levels, nodes, read_formula
 from appliance.rosmop.logics.interface import CompiledProperty, Source
 from appliance.rosmop.logics.past import compile_past
@@ -36,11 +36,12 @@ SYNTAX = Syntax(
 def compile_mtl(source: Source) -> CompiledProperty:
     """Compile an ``mtl`` formula. Raises FormulaError."""
     formula = read_formula(source, SYNTAX)
-    for node in nodes(formula):
-        if node.operator in _FUTURE:
+    future = [node for node in nodes(formula) if node.operator in _FUTURE]
+    for node in future:
+        if node.bounds is None or node.bounds[1] is None:
             raise source.error(
                 node.offset,
-                f"`{node.operator}` is about the future, which mtl does not support yet; "
-                f"write a formula about the past ({', '.join(_PAST)}), or a `pattern` with a deadline",
+                f"`{node.operator}` has no upper bound, so its verdict might never come; write"
+                f" `{node.operator}[0,10s]` with the time that there is, or `ltl` for what may come at any time",
             )
-    return compile_past(source, formula)
+    return compile_bounded(source, formula) if future else compile_past(source, formula)

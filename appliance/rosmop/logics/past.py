@@ -1,4 +1,4 @@
-"""Monitors for formulas about the past: ptltl, and the past part of mtl.
+"""Monitors for formulas about the past: ptltl, and the past part of mtl (`bounded.py` has the other part).
 
 Theory of operation. A formula becomes a *program*: its distinct subformulas in an order in which each
 follows its operands, with only ``previously`` and ``since`` left of the temporal operators (``once b`` is
@@ -17,8 +17,9 @@ enough. Otherwise the program becomes a Python function of straight-line code.
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from appliance.rosmop.logics.automaton import (
     Automaton,
@@ -102,15 +103,20 @@ class Program:
     def _temporal(self, operator: str, operands: list[int], low: int, high: int | None) -> int:
         abstract = "abstract " if operator.startswith("abstract ") else ""
         operator = operator.removeprefix("abstract ")
-        if operator in ("once", "historically"):
+        if operator in _OF_ONE:
             operands = [self._emit("true"), *operands]
-        if operator == "historically":
+        if operator in ("historically", "always"):
             operands[1] = self._not(operands[1])
         elif operator.startswith("dual "):
             operands = [self._not(operand) for operand in operands]
-        plain = {"once": "since", "historically": "since"}.get(operator, operator.removeprefix("dual "))
+        plain = _OF_ONE.get(operator, operator.removeprefix("dual "))
         number = self._emit(abstract + plain, *operands, low=low, high=high)
-        return self._not(number) if operator == "historically" or operator.startswith("dual ") else number
+        dual = operator in ("historically", "always") or operator.startswith("dual ")
+        return self._not(number) if dual else number
+
+
+_OF_ONE = {"once": "since", "historically": "since", "eventually": "until", "always": "until"}
+"""Operators that are said by another one, whose left operand is `true`."""
 
 
 def compile_past(source: Source, formula: Formula) -> CompiledProperty:
@@ -201,6 +207,12 @@ class Window:
         self._high = high
         self._intervals: deque[list[int]] = deque()
 
+    def copy(self) -> "Window":
+        """Another one that has seen the same."""
+        other = Window(self._low, self._high)
+        other._intervals.extend(interval.copy() for interval in self._intervals)
+        return other
+
     def step(self, unbroken: bool, anchor: bool, now: int) -> bool:
         """The value at ``now``, where the left operand is ``unbroken`` and the right one ``anchor``."""
         intervals = self._intervals
@@ -246,14 +258,9 @@ class PastProperty(CompiledProperty):
     def __init__(self, source: Source, program: Program) -> None:
         super().__init__(source, VERDICTS)
         self._timed = program.bounded
-        self.code = _Generator(program).text()
-        namespace: dict[str, object] = {
-            "Window": Window,
-            "VALIDATION": ("validation",),
-            "VIOLATION": ("violation",),
-        }
-        exec(compile(self.code, "<past formula>", "exec"), namespace)  # noqa: S102  # made of numbers only
-        self._make: Callable[[int], StepFunction] = namespace["make"]  # type: ignore[assignment]  # just defined
+        everything = range(len(program.instructions))
+        self.code = generate(program, everything, f"VALIDATION if v{program.result} else VIOLATION")
+        self._make: Callable[[int], StepFunction] = loaded(self.code)
 
     @property
     def timed(self) -> bool:
@@ -265,19 +272,34 @@ class PastProperty(CompiledProperty):
         return PastRun(self._make(time_ns))
 
 
-class _Generator:
-    """Writes ``make(now)``, which returns a step function with the state of one run in its closure."""
+def generate(program: Program, computed: Iterable[int], result: str) -> str:
+    """The text of ``make(now)``: it returns a step function with the state of one run in its closure.
 
+    ``computed`` are the instructions that it computes, operands first (``v`` and the number is the value of one), and
+    ``result`` is what a step gives.
+    """
+    return _Generator(program).text(computed, result)
+
+
+def loaded(code: str) -> Callable[[int], Any]:
+    """The function that ``generate`` has written."""
+    namespace: dict[str, Any] = {"Window": Window, "VALIDATION": VERDICTS[1:], "VIOLATION": VERDICTS[:1]}
+    exec(compile(code, "<past formula>", "exec"), namespace)  # noqa: S102  # made of numbers only
+    make: Callable[[int], Any] = namespace["make"]
+    return make
+
+
+class _Generator:
     def __init__(self, program: Program) -> None:
         self._program = program
         self._state: dict[str, str] = {}
         self._body: list[str] = []
         self._after: list[str] = []
 
-    def text(self) -> str:
+    def text(self, computed: Iterable[int], result: str) -> str:
         program = self._program
-        for number, instruction in enumerate(program.instructions):
-            self._write(number, instruction)
+        for number in computed:
+            self._write(number, program.instructions[number])
         if program.bounded:
             self._state["now"] = "now"
             clock = ["if t < now: t = now"]
@@ -288,7 +310,7 @@ class _Generator:
         assigned = [name for name, initial in self._state.items() if not initial.startswith("Window")]
         if assigned:
             lines.insert(0, f"nonlocal {', '.join(assigned)}")
-        lines.append(f"return VALIDATION if v{program.result} else VIOLATION")
+        lines.append(f"return {result}")
         setup = [f"{name} = {initial}" for name, initial in self._state.items()]
         return "\n".join(
             [

@@ -208,8 +208,7 @@ def test_memory_of_a_window_is_bounded_by_its_bounds() -> None:
 
 
 def test_refusals() -> None:
-    """Future operators, symbols of ltl and impossible bounds are refused with what to write."""
-    assert "not support yet" in refusal("mtl", "always[0,1s] a")[0]
+    """What has no bound, symbols of ltl and impossible bounds are refused with what to write."""
     assert refusal("mtl", "a S b") == ["7:13: `S` is written `since` in mtl"]
     assert "above the upper bound" in refusal("mtl", "once[2s,1s] a")[0]
     assert refusal("mtl", "once[0,5sec] a") == [

@@ -1,0 +1,537 @@
+"""Monitors for formulas that look into the future within bounds of time: the other part of mtl.
+
+The formula is asked at every event, and the answer for an event is told once it is certain: by an event, or when a
+bound passes. What is certain is found part by part: `x or y` is once one of them is, `x until[l,h] y` once `y` has
+come in time and `x` held until then, or `x` has failed, or the time is over.
+
+Theory of operation. A `Program` (`past.py`) has the distinct parts of the formula. Those that look back only are
+computed at their event by straight-line code. Of the others a *cell* stands for the value of one part at one event
+while that is open; a cell tells its *users* when it is decided. Cells are made for what is asked for only: of
+`fire => eventually[0,1s] safe` nothing is kept but the events `fire` that wait.
+
+- `until` over parts that are known at once keeps the events asked about in order, and decides them from the oldest on:
+  a step costs the same however many wait.
+- `until` and `since` over parts that are open themselves keep *rows*, one for each event that matters. What is certain
+  is what comes out alike whether all that is open were to fail or to hold (both operators only gain when a part comes
+  to hold); so it is computed twice, over all rows, whenever a part is decided.
+
+A run waits for at most `MOST_OPEN` events; a step beyond that is a fault, and its event is not seen.
+"""
+
+from abc import ABC, abstractmethod
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from appliance.rosmop.logics.formula import Formula
+from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
+from appliance.rosmop.logics.past import VERDICTS, Instruction, Program, Window, generate, loaded
+
+MOST_OPEN = 10_000
+FOREVER = 10**30
+"""Later than any time."""
+
+_LATER = ("until", "next")
+
+
+class Cell:
+    """The value of a part at an event that is not decided yet; `tells`: the part is the whole formula.
+
+    The value of a `kind` (`and`, `or`, `xor`, `not`) comes from `operands`, of which `missing` are open.
+    """
+
+    __slots__ = ("kind", "missing", "operands", "tells", "users", "value")
+
+    def __init__(self) -> None:
+        self.users: list[Cell | _Operator] = []
+        self.tells = False
+        self.value: bool | None = None
+        self.stand_for("", ())
+
+    def stand_for(self, kind: str, operands: tuple["Value", ...]) -> None:
+        """Take the value from these."""
+        self.kind, self.operands = kind, operands
+        self.missing = sum(_use(operand, self) for operand in operands)
+
+    @property
+    def wanted(self) -> bool:
+        """Whether it is open, and somebody waits for it."""
+        return self.value is None and (self.tells or bool(self.users))
+
+    def hear(self, value: bool) -> bool | None:
+        """What it is worth now that one more operand has this value; None: that is still open."""
+        self.missing -= 1
+        if self.kind == "not":
+            return not value
+        if value is _ABSORBING.get(self.kind):
+            return value
+        return None if self.missing else _together(self.kind, self.operands)
+
+
+Value = bool | Cell
+
+
+def _known(value: Value) -> bool | None:
+    return value.value if isinstance(value, Cell) else value
+
+
+def _use(value: Value, user: "Cell | _Operator") -> bool:
+    """Whether the value is open; its user is told then."""
+    if isinstance(value, Cell) and value.value is None:
+        value.users.append(user)
+        return True
+    return False
+
+
+def _leave(value: Value, user: "Cell | _Operator") -> None:
+    """The user waits no more; what only it waited for is not waited for either."""
+    waiting = [(value, user)]
+    while waiting:
+        left, leaver = waiting.pop()
+        if isinstance(left, Cell) and left.value is None:
+            left.users.remove(leaver)
+            if not left.wanted:
+                waiting += [(operand, left) for operand in left.operands]
+
+
+_ABSORBING = {"and": False, "or": True}
+
+
+def _together(kind: str, operands: tuple[Value, ...]) -> bool:
+    """The value of operands that are all known, none of them absorbing."""
+    if kind == "xor":
+        return sum(map(bool, map(_known, operands))) % 2 == 1
+    return bool(_known(operands[0])) is not (kind == "not")
+
+
+@dataclass(eq=False, slots=True)
+class _Row:
+    """An event that an operator keeps: its time, what its operands are worth at it, and what it was asked for."""
+
+    time: int
+    left: Value | None
+    right: Value | None
+    cell: Cell | None
+
+
+class _Operator(ABC):
+    """An operator in a run. `ask` comes before `take` for each event, and `pass_by` between events."""
+
+    def __init__(self, run: "BoundedRun", number: int, one: Instruction) -> None:
+        self.run, self.number = run, number
+        self.left, self.right = one.operands[0], one.operands[-1]
+        self.low, self.high = one.low, FOREVER if one.high is None else one.high
+        self.rows: deque[_Row] = deque()
+
+    def ask(self, now: int) -> Value:
+        """Its value at the event that happens now."""
+        self.rows.append(_Row(now, None, None, Cell()))
+        return self.rows[-1].cell or False
+
+    @abstractmethod
+    def take(self, now: int) -> None:
+        """Look at the event."""
+
+    @abstractmethod
+    def settle(self) -> None:
+        """Decide what can be, now that operands are decided."""
+
+    def pass_by(self, time: int) -> None:
+        """There will be no event any more up to this time."""
+        del time
+
+    @property
+    def deadline(self) -> int | None:
+        """When a bound passes on which something depends."""
+        return None
+
+
+class _Until(_Operator):
+    """`until` over what is known at once."""
+
+    def take(self, now: int) -> None:
+        rows = self.rows
+        if not rows:
+            return
+        if self.run.value(self.right):
+            while rows and rows[0].time <= now - self.low:
+                self.run.decide(rows.popleft().cell, True)
+        if not self.run.value(self.left):
+            while rows:
+                self.run.decide(rows.popleft().cell, False)
+
+    def settle(self) -> None:
+        raise AssertionError
+
+    def pass_by(self, time: int) -> None:
+        while self.rows and self.rows[0].time + self.high <= time:
+            self.run.decide(self.rows.popleft().cell, False)
+
+    @property
+    def deadline(self) -> int | None:
+        while self.rows and not _wanted(self.rows[0]):
+            self.rows.popleft()
+        return self.rows[0].time + self.high if self.rows else None
+
+
+def _wanted(row: _Row) -> bool:
+    return row.cell is not None and row.cell.wanted
+
+
+class _Rows(_Operator):
+    """An operator that keeps what its operands are worth."""
+
+    def take(self, now: int) -> None:
+        if not self.rows or self.rows[-1].left is not None:
+            self.rows.append(_Row(now, None, None, None))
+        row = self.rows[-1]
+        row.left, row.right = self.run.value(self.left), self.run.value(self.right)
+        _use(row.left, self)
+        _use(row.right, self)
+        self.run.look_at(self)
+
+    def drop(self) -> _Row:
+        """Keep the oldest row no longer."""
+        row = self.rows.popleft()
+        for value in (row.left, row.right):
+            if value is not None:
+                _leave(value, self)
+        return row
+
+
+class _OpenUntil(_Rows):
+    """`until` over what may be open. All time up to `passed` is over."""
+
+    passed = -FOREVER
+
+    def take(self, now: int) -> None:
+        if self.rows:
+            super().take(now)
+
+    def settle(self) -> None:
+        least, most = self._values(hopeful=False), self._values(hopeful=True)
+        for row in reversed(self.rows):
+            sure, possible = next(least), next(most)
+            if sure is possible:
+                self.run.decide(row.cell, sure)
+        while self.rows and not _wanted(self.rows[0]):
+            self.drop()
+
+    def _values(self, *, hopeful: bool) -> Iterator[bool]:
+        """What it is worth from the newest row to the oldest if all that is open were to hold, or to fail."""
+        goods: list[
+            int
+        ] = []  # the times at which the right operand holds, negated, as far as the left one reaches
+        onward = hopeful
+        for row in reversed(self.rows):
+            left, right = (_supposed(value, hopeful) for value in (row.left, row.right))
+            if not left:
+                goods.clear()
+                onward = False
+            if right:
+                goods.append(-row.time)
+            first = bisect_right(goods, -(row.time + self.low)) - 1
+            found = first >= 0 and -goods[first] <= row.time + self.high
+            yield found or (onward and row.time + self.high > self.passed)
+
+    def pass_by(self, time: int) -> None:
+        self.passed = time
+        self.settle()
+
+    @property
+    def deadline(self) -> int | None:
+        return next(
+            (
+                row.time + self.high
+                for row in self.rows
+                if row.time + self.high > self.passed and _wanted(row)
+            ),
+            None,
+        )
+
+
+def _supposed(value: Value | None, hopeful: bool) -> bool:
+    known = None if value is None else _known(value)
+    return hopeful if known is None else known
+
+
+class _OpenSince(_Rows):
+    """`since` over what may be open; `window` is where the rows begin."""
+
+    def __init__(self, run: "BoundedRun", number: int, one: Instruction) -> None:
+        super().__init__(run, number, one)
+        self.window = Window(self.low, self.high)
+
+    def settle(self) -> None:
+        least, most = self.window.copy(), self.window.copy()
+        for row in self.rows:
+            sure, possible = (
+                window.step(_supposed(row.left, hopeful), _supposed(row.right, hopeful), row.time)
+                for window, hopeful in ((least, False), (most, True))
+            )
+            if sure is possible:
+                self.run.decide(row.cell, sure)
+        while self.rows:
+            row = self.rows[0]
+            left, right = (None if value is None else _known(value) for value in (row.left, row.right))
+            if left is None or right is None:
+                break
+            self.window.step(left, right, self.drop().time)
+
+
+class _OpenPreviously(_Operator):
+    """`previously` of what may be open: what that was at the event before."""
+
+    before: Value = False
+    time = -FOREVER
+
+    def ask(self, now: int) -> Value:
+        return self.before if self.low <= now - self.time <= self.high else False
+
+    def take(self, now: int) -> None:
+        _leave(self.before, self)
+        self.before, self.time = self.run.value(self.left), now
+        _use(self.before, self)
+
+    def settle(self) -> None:
+        """Who asked has the cell itself."""
+
+
+class _Next(_Operator):
+    """`next`: the rows ask about the event before; `fresh` are those of the event that happens now."""
+
+    def __init__(self, run: "BoundedRun", number: int, one: Instruction) -> None:
+        super().__init__(run, number, one)
+        self.before: deque[_Row] = deque()
+
+    def take(self, now: int) -> None:
+        before, self.before, self.rows = self.before, self.rows, deque()
+        for row in before:
+            if not _wanted(row) or row.cell is None:
+                continue
+            inside = self.low <= now - row.time <= self.high
+            value = self.run.value(self.left) if inside else False
+            if isinstance(value, Cell):  # it is open
+                row.cell.stand_for("or", (value,))
+            else:
+                self.run.decide(row.cell, value)
+
+    def settle(self) -> None:
+        raise AssertionError
+
+    def pass_by(self, time: int) -> None:
+        while self.before and self.before[0].time + self.high <= time:
+            self.run.decide(self.before.popleft().cell, False)
+
+    @property
+    def deadline(self) -> int | None:
+        return next((row.time + self.high for row in self.before if _wanted(row)), None)
+
+
+class BoundedProperty(CompiledProperty):
+    """A formula of mtl about the future, and perhaps the past."""
+
+    def __init__(self, source: Source, formula: Formula) -> None:
+        super().__init__(source, VERDICTS)
+        self.program = program = Program(formula, source.events)
+        self.later: set[int] = set()
+        """The instructions whose value may come after their event."""
+        needed = {program.result}
+        for number in range(program.result, -1, -1):
+            if number in needed:
+                needed.update(program.instructions[number].operands)
+        for number, one in enumerate(program.instructions):
+            if number in needed and (one.operator in _LATER or not self.later.isdisjoint(one.operands)):
+                self.later.add(number)
+        at_once = sorted(needed - self.later)
+        result = ["None"] * (program.result + 1)
+        for number in at_once:
+            result[number] = f"v{number}"
+        self.make: Callable[[int], Callable[[int, int], list[Value | None]]] = loaded(
+            generate(program, at_once, f"[{', '.join(result)}]")
+        )
+        self.order = {
+            number: sorted(program.instructions[number].operands, key=self.later.__contains__)
+            for number in self.later
+        }
+        self._failing = self._decided_late()
+
+    @property
+    def timed(self) -> bool:
+        """Always."""
+        return True
+
+    def start(self, time_ns: int) -> Run:
+        """A fresh run."""
+        return BoundedRun(self, time_ns)
+
+    def operators(self, run: "BoundedRun") -> dict[int, _Operator]:
+        """Those whose values may come later, for a run; the outermost first."""
+        found: dict[int, _Operator] = {}
+        for number in sorted(self.later, reverse=True):
+            one = self.program.instructions[number]
+            kind = _KINDS.get(one.operator)
+            if one.operator == "until" and self.later.isdisjoint(one.operands):
+                kind = _Until
+            if kind is not None:
+                found[number] = kind(run, number, one)
+        return found
+
+    def _decided_late(self) -> set[str]:
+        """The verdicts that the passing of a bound may bring: then an `until` or `next` fails, nothing else.
+
+        So it is `violation` where one stands that the formula needs, `validation` where one that it must not have.
+        """
+        signs: dict[int, set[bool]] = {self.program.result: {False}}
+        for number in sorted(self.later, reverse=True):
+            one = self.program.instructions[number]
+            mine = signs.get(number, set())
+            given = {"not": {not sign for sign in mine}, "xor": {False, True}}.get(one.operator, mine)
+            for operand in one.operands:
+                signs.setdefault(operand, set()).update(given)
+        found = (
+            signs[number] for number in self.later if self.program.instructions[number].operator in _LATER
+        )
+        return {VERDICTS[sign] for one in found for sign in one}
+
+    def blocking_refused(self, category: str) -> str | None:
+        """What a deadline decides is decided when no message comes."""
+        super().blocking_refused(category)
+        if category not in self._failing:
+            return None
+        return (
+            f"`{category}` may come when a bound of time passes, and the message that would have to be stopped has"
+            " long been passed on then"
+        )
+
+
+_KINDS: dict[str, type[_Operator]] = {
+    "until": _OpenUntil,
+    "since": _OpenSince,
+    "previously": _OpenPreviously,
+    "next": _Next,
+}
+
+
+class BoundedRun:
+    """A run of a formula about the future."""
+
+    def __init__(self, compiled: BoundedProperty, time_ns: int) -> None:
+        self._compiled = compiled
+        self._at_once = compiled.make(time_ns)
+        self._operators = compiled.operators(self)
+        self._now = time_ns
+        self._values: list[Value | None] = []
+        self._decided: list[Cell] = []
+        self._looked_at: set[_Operator] = set()
+        self._told: set[bool] = set()
+
+    @property
+    def deadline(self) -> int | None:
+        """When the first bound passes on which a verdict depends."""
+        found = (operator.deadline for operator in self._operators.values())
+        return min((deadline for deadline in found if deadline is not None), default=None)
+
+    def step(self, event: int, time_ns: int) -> Categories:
+        """Take the event."""
+        if self._now < time_ns:
+            deadline = self.deadline
+            if deadline is not None and time_ns > deadline:
+                raise ValueError("the deadline has passed: expire the run first")
+            self._now = time_ns
+        if sum(len(operator.rows) for operator in self._operators.values()) >= MOST_OPEN:
+            raise RunFaultError(f"more than {MOST_OPEN} events wait for what follows them")
+        self._values = self._at_once(event, self._now)
+        whole = self.value(self._compiled.program.result)
+        if isinstance(whole, Cell):
+            whole.tells = True
+        else:
+            self._told.add(whole)
+        for operator in self._operators.values():
+            operator.take(self._now)
+        return self._tell()
+
+    def expire(self) -> Categories:
+        """Let the deadline pass."""
+        deadline = self.deadline
+        if deadline is None:
+            raise ValueError("this run has no deadline")
+        self._now = deadline
+        for operator in self._operators.values():
+            operator.pass_by(deadline)
+        return self._tell()
+
+    def value(self, number: int) -> Value:
+        """What an instruction is worth at the event that happens now: a cell only while it is open."""
+        value = self._values[number]
+        if value is None:
+            value = self._values[number] = self._find(number)
+        known = _known(value)
+        return value if known is None else known
+
+    def _find(self, number: int) -> Value:
+        operator = self._operators.get(number)
+        if operator is not None:
+            return operator.ask(self._now)
+        kind = self._compiled.program.instructions[number].operator
+        absorbing = _ABSORBING.get(kind)
+        operands = []
+        for operand in self._compiled.order[number]:
+            value = self.value(operand)
+            if value is absorbing:
+                return value
+            operands.append(value)
+        cell = Cell()
+        cell.stand_for(kind, tuple(operands))
+        return cell if cell.missing else _together(kind, cell.operands)
+
+    def decide(self, cell: Cell | None, value: bool) -> None:
+        """The value of a cell is known (None: nobody has asked)."""
+        if cell is not None and cell.value is None:
+            cell.value = value
+            self._decided.append(cell)
+
+    def look_at(self, operator: _Operator) -> None:
+        """Something has changed for this one."""
+        self._looked_at.add(operator)
+
+    def _tell(self) -> Categories:
+        """Let everybody know what is decided; the verdicts that come of it."""
+        while self._decided or self._looked_at:
+            while self._decided:
+                self._pass_on(self._decided.pop())
+            if self._looked_at:
+                innermost = min(self._looked_at, key=lambda operator: operator.number)
+                self._looked_at.remove(innermost)
+                innermost.settle()
+        told, self._told = self._told, set()
+        return _CATEGORIES[False in told, True in told]
+
+    def _pass_on(self, cell: Cell) -> None:
+        assert cell.value is not None  # noqa: S101  it was decided
+        if cell.tells:
+            self._told.add(cell.value)
+        for user in cell.users:
+            if not isinstance(user, Cell):
+                self._looked_at.add(user)
+            elif user.value is None:
+                value = user.hear(cell.value)
+                if value is not None:
+                    self.decide(user, value)
+                    for operand in user.operands:
+                        _leave(operand, user)
+        cell.users, cell.operands = [], ()
+
+
+_CATEGORIES: dict[tuple[bool, bool], Categories] = {
+    (False, False): (),
+    (True, False): VERDICTS[:1],
+    (False, True): VERDICTS[1:],
+    (True, True): VERDICTS,
+}
+
+
+def compile_bounded(source: Source, formula: Formula) -> CompiledProperty:
+    """The monitor of a formula with bounded operators about the future."""
+    return BoundedProperty(source, formula)
