@@ -129,6 +129,16 @@ def _wanted(
 
 Wanted = Annotated[Filter, Depends(_wanted)]
 Limit = Annotated[int, Query(ge=1, le=_LARGEST_PAGE)]
+OneRecord = Annotated[
+    str,
+    Path(
+        min_length=1,
+        max_length=20,
+        pattern="^[0-9a-f]+$",
+        description="id of a record, or its sequence",
+        examples=["812"],
+    ),
+]
 
 
 class Desk:
@@ -185,7 +195,10 @@ def routes(services: Services) -> Routes:
         return JSONResponse({"records": list(map(as_object, page.entries)), "cursor": page.cursor})
 
     @router.get(
-        "/stream", operation_id="follow_audit", responses=_text("text/event-stream", "Events `record`.")
+        "/stream",
+        operation_id="follow_audit",
+        responses=_text("text/event-stream", "Events `record`."),
+        response_class=Response,
     )
     async def follow_audit(
         request: Request,
@@ -226,6 +239,7 @@ def routes(services: Services) -> Routes:
         "/export",
         operation_id="export_audit",
         responses=_text("application/x-ndjson", "A record a line."),
+        response_class=Response,
     )
     async def export_audit(request: Request, bearer: Viewer, wanted: Wanted) -> Response:
         """All records that match, oldest first, one JSON object a line.
@@ -241,7 +255,7 @@ def routes(services: Services) -> Routes:
         "/{record_id}", operation_id="audit_record", responses=_json(_SHOWN) | _UNKNOWN, dependencies=[VIEWER]
     )
     async def audit_record(
-        record_id: Annotated[str, Path(min_length=1, max_length=20, pattern="^[0-9a-f]+$")],
+        record_id: OneRecord,
         neighbours: Annotated[int, Query(ge=0, le=_MOST_NEIGHBOURS)] = 5,
     ) -> JSONResponse:
         """One record (by id, or by sequence), and what the same host or caller did around it."""
@@ -252,9 +266,7 @@ def routes(services: Services) -> Routes:
         return JSONResponse({"record": as_object(shown.entry), **around})
 
     @router.get("/{record_id}/grant", operation_id="grant_of_record", responses=_UNKNOWN | _NO_GRANT)
-    async def grant_of_record(
-        record_id: Annotated[str, Path(min_length=1, max_length=20, pattern="^[0-9a-f]+$")], bearer: Viewer
-    ) -> Granted:
+    async def grant_of_record(record_id: OneRecord, bearer: Viewer) -> Granted:
         """The smallest change of the policy in force that grants what this record says was refused."""
         shown = await desk.read(show, desk.path, record_id, 0)
         if shown is None:

@@ -1,5 +1,7 @@
 """The contract: FastAPI's OpenAPI document, made true where FastAPI says what this application does not do."""
 
+import json
+from importlib.resources import files
 from typing import Any
 
 from fastapi import FastAPI
@@ -27,6 +29,9 @@ _NOT_HTTP = (
 )
 _HASH = {"description": "of this body; If-None-Match takes it", "schema": {"type": "string"}}
 _REFERENCE = CONTRACT.reference(Problem)
+# What an appliance was asked and what it answered, long texts and lists cut: by the kind of a body, or by the operation
+# where that has none. tests/integration/api/test_examples.py holds them against what comes.
+EXAMPLES: dict[str, Any] = json.loads(files(__package__).joinpath("examples.json").read_text("utf-8"))
 
 
 def contract_of(app: FastAPI) -> dict[str, Any]:
@@ -51,9 +56,12 @@ def _made(app: FastAPI) -> dict[str, Any]:
     components["AuditRecord"] = RECORD
     for kind, schema in components.items():
         _described(kind, schema)
+        if kind in EXAMPLES:
+            schema["examples"] = [EXAMPLES[kind]]
     for path in document["paths"].values():
         for method, operation in path.items():
             _complete(operation)
+            _exemplified(operation)
             if method == "get":
                 _tagged(operation["responses"])
     return document
@@ -90,6 +98,18 @@ def _tagged(responses: dict[str, Any]) -> None:
             "description": "The body is the one whose ETag is in If-None-Match.",
             "headers": {"ETag": _HASH},
         }
+
+
+def _exemplified(operation: dict[str, Any]) -> None:
+    """What an answer that is of no kind is like, and a body that is sent as text."""
+    name = operation["operationId"]
+    if name in EXAMPLES:
+        (answer,) = operation["responses"]["200"]["content"].values()
+        answer["example"] = EXAMPLES[name]
+    body = operation.get("requestBody", {}).get("content", {})
+    if "text/plain" in body:
+        kind = body["application/json"]["schema"]["$ref"].rpartition("/")[2]
+        body["text/plain"]["example"] = EXAMPLES[kind]["text"]
 
 
 def _complete(operation: dict[str, Any]) -> None:

@@ -15,10 +15,10 @@ import binascii
 import time
 from typing import Annotated
 
-from fastapi import Header, Path, Request, Response
+from fastapi import Header, Request, Response
 
-from appliance.api.hosts import SLOW_SECONDS
-from appliance.api.hosts_models import HOST_NAME, Enrolled, Enrolment, Renewal
+from appliance.api.hosts import SLOW_SECONDS, OneName
+from appliance.api.hosts_models import Enrolled, Enrolment, Renewal
 from appliance.api.kits import Wishes, kit_of
 from appliance.api.problems import ProblemError
 from appliance.api.rates import Buckets
@@ -49,7 +49,6 @@ _PEM: Responses = {
     200: {"description": "PEM", "content": {"application/x-pem-file": {"schema": {"type": "string"}}}},
     503: {"description": "The appliance cannot answer now."},
 }
-OneName = Annotated[str, Path(min_length=1, max_length=63, pattern=HOST_NAME, description="of a host")]
 
 
 def routes(services: Services) -> Routes:

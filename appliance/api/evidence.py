@@ -27,7 +27,7 @@ _ZIP: Responses = {
     },
     404: {"description": "There is no such recording, or the log has no record of that time."},
 }
-_Moment = Annotated[str, Query(max_length=64, description="1h (ago), a date, or RFC 3339")]
+_Moment = Annotated[str, Query(max_length=64, description="1h (ago), a date, or RFC 3339", examples=["1h"])]
 
 
 def routes(services: Services) -> Routes:

@@ -49,8 +49,13 @@ _NEW: Responses = {
         "headers": ETAG,
     }
 }
-OneName = Annotated[str, Path(min_length=1, max_length=63, pattern=HOST_NAME, description="of a host")]
-OneHost = Annotated[str, Path(min_length=1, max_length=63, description="of a host, or a machine's address")]
+OneName = Annotated[
+    str, Path(min_length=1, max_length=63, pattern=HOST_NAME, description="of a host", examples=["ocu-1"])
+]
+OneHost = Annotated[
+    str,
+    Path(min_length=1, max_length=63, description="of a host, or a machine's address", examples=["ocu-1"]),
+]
 
 
 def routes(services: Services) -> Routes:

@@ -69,7 +69,7 @@ def routes(services: Services) -> Routes:
         """Decisions, relayed messages and what monitors did over the last hour, as counters."""
         return Hour(services.history.samples(points))
 
-    @router.get("/live", operation_id="live_state", responses=_TEXT)
+    @router.get("/live", operation_id="live_state", responses=_TEXT, response_class=Response)
     async def live(
         request: Request,
         bearer: Viewer,

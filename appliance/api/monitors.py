@@ -10,7 +10,7 @@ from appliance.api.access import Bearer
 from appliance.api.audit import Desk
 from appliance.api.monitor_judgement import Compiler, events_of, picture_of, properties_of
 from appliance.api.monitor_models import Happened, History, Monitor
-from appliance.api.policy_models import LONGEST_REVISION
+from appliance.api.policy_models import OneRevision
 from appliance.api.problems import ProblemError
 from appliance.api.roles import VIEWER, Viewer, ask
 from appliance.api.routing import Responses, Routes, Tagged
@@ -25,7 +25,7 @@ UNKNOWN: Responses = {404: {"description": "There is no such monitor, or revisio
 _PICTURE: Responses = {
     200: {"description": "OK", "content": {"image/svg+xml": {"schema": {"type": "string"}}}}
 }
-OneName = Annotated[str, Path(min_length=1, max_length=256, description="of a monitor")]
+OneName = Annotated[str, Path(min_length=1, max_length=256, description="of a monitor", examples=["censor"])]
 
 
 class _Looking:
@@ -75,9 +75,7 @@ def routes(services: Services) -> Routes:
         return await ask(services.control, MonitorRevisions(), bearer)
 
     @router.get("/revisions/{revision}", operation_id="monitor_revision", responses=UNKNOWN)
-    async def revision_texts(
-        revision: Annotated[int, Path(ge=1, le=LONGEST_REVISION)], bearer: Viewer
-    ) -> RevisionTexts:
+    async def revision_texts(revision: OneRevision, bearer: Viewer) -> RevisionTexts:
         """A kept revision with its texts."""
         return await ask(services.control, MonitorRevisionWanted(revision), bearer)
 
@@ -99,7 +97,12 @@ def routes(services: Services) -> Routes:
         )
         return Tagged(shown, loaded.tag)
 
-    @router.get("/{name}/picture", operation_id="monitor_picture", responses=_PICTURE | UNKNOWN)
+    @router.get(
+        "/{name}/picture",
+        operation_id="monitor_picture",
+        responses=_PICTURE | UNKNOWN,
+        response_class=Response,
+    )
     async def monitor_picture(name: OneName, bearer: Viewer) -> Response:
         """The automata of its properties (SVG); 404 when it has none that is finite."""
         loaded, _state = await looking.state(bearer, name)

@@ -4,15 +4,15 @@ import asyncio
 from typing import Annotated, Literal
 
 import msgspec
-from fastapi import Path, Query
+from fastapi import Query
 
 from appliance.api.access import Bearer
 from appliance.api.judgement import explanation, judge_text
 from appliance.api.policy_models import (
-    LONGEST_REVISION,
     Decided,
     Explained,
     LostRule,
+    OneRevision,
     Question,
     RuleText,
     Text,
@@ -79,9 +79,7 @@ def routes(services: Services) -> Routes:
         return await ask(control, PolicyRevisions(), bearer)
 
     @router.get("/revisions/{revision}", operation_id="policy_revision", responses=_UNKNOWN)
-    async def revision_text(
-        revision: Annotated[int, Path(ge=1, le=LONGEST_REVISION)], bearer: Viewer
-    ) -> RevisionText:
+    async def revision_text(revision: OneRevision, bearer: Viewer) -> RevisionText:
         """A kept revision with its text."""
         known = await ask(control, PolicyWanted(revision), bearer)
         return msgspec.convert(known, RevisionText, from_attributes=True)

@@ -3,12 +3,14 @@
 from typing import Annotated, Literal
 
 import msgspec
+from fastapi import Path
 
 from appliance.api.problems import Finding
 from appliance.channel.answers.field_docs import Moment, told
 from appliance.policy.model import Category
 
 LONGEST_REVISION = 10**15
+OneRevision = Annotated[int, Path(ge=1, le=LONGEST_REVISION, description="its number", examples=[1])]
 Decided = Literal["allow", "deny", "would deny"]
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=1 << 20)]
 Signature = Annotated[

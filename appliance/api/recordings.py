@@ -33,7 +33,9 @@ _BAG: Responses = {
     }
 }
 _BEGUN: Responses = {201: {"description": "It is being made.", "content": content(RecordingBegun)}}
-OneId = Annotated[str, Path(pattern="^[0-9a-f]{20}$", description="of a recording")]
+OneId = Annotated[
+    str, Path(pattern="^[0-9a-f]{20}$", description="of a recording", examples=["18ea0bb9b11c1024196c"])
+]
 
 
 class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -27,7 +27,9 @@ def routes(services: Services) -> Routes:
         return await ask(services.control, TokenList(), bearer)
 
     @router.delete("/{name}", operation_id="revoke_token", responses=_UNKNOWN)
-    async def revoke_token(name: Annotated[str, Path(min_length=1, max_length=80)], bearer: Admin) -> Token:
+    async def revoke_token(
+        name: Annotated[str, Path(min_length=1, max_length=80, examples=["shift"])], bearer: Admin
+    ) -> Token:
         """End a token now: from then on it is answered with 401, and open streams of its holder end. For admins."""
         return await ask(services.control, TokenRevoke(name), bearer)
 

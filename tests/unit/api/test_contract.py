@@ -3,11 +3,12 @@
 import asyncio
 from typing import Any
 
+import jsonschema_rs
 import pytest
 
 from appliance.api.access import Doorkeeper
 from appliance.api.app import build_app
-from appliance.api.contract import is_described
+from appliance.api.contract import EXAMPLES, is_described
 from appliance.api.control import ControlLink
 from appliance.api.field_words import WORDS
 from appliance.api.history import History
@@ -92,3 +93,60 @@ def test_what_can_be_asked_for_when_it_changed(contract: dict[str, Any]) -> None
         said = good["headers"]["ETag"]["description"]
         assert ("If-None-Match" in said) == ("304" in responses), path
         assert ("If-Match" in said) == (path in _OF_CHANGES), path
+
+
+def _unexemplified(name: str, operation: dict[str, Any], kinds: dict[str, Any]) -> list[str]:
+    """What of an operation has no example: its path, its body, its answer where that is text."""
+
+    def without(content: dict[str, Any]) -> list[str]:
+        return [
+            media
+            for media, one in content.items()
+            if one["schema"].get("format") != "binary"
+            and "example" not in one
+            and "examples" not in kinds.get(one["schema"].get("$ref", "").rpartition("/")[2], {})
+        ]
+
+    parts = {
+        one["name"]: "examples" in one["schema"] or "examples" in one
+        for one in operation.get("parameters", ())
+        if one["in"] == "path"
+    }
+    missing = [part for part, there in parts.items() if not there]
+    missing += without(operation.get("requestBody", {}).get("content", {}))
+    for status, response in operation["responses"].items():
+        missing += without(response.get("content", {})) if status.startswith("2") else []
+    return [f"{name}: {one}" for one in missing]
+
+
+def test_no_operation_is_without_an_example(contract: dict[str, Any]) -> None:
+    """Of what is in its path, of its body, of its answer; and no example is left over."""
+    kinds = contract["components"]["schemas"]
+    operations = {
+        f"{method} {path}": one for path, row in contract["paths"].items() for method, one in row.items()
+    }
+    assert [line for name, one in operations.items() for line in _unexemplified(name, one, kinds)] == []
+    assert set(EXAMPLES) <= {*kinds, *(one["operationId"] for one in operations.values())}
+    assert len(operations) > 60
+
+
+def test_examples_are_what_their_schemas_say(contract: dict[str, Any]) -> None:
+    """Each is valid, and has every field that is not left out where it has its default."""
+    kinds = contract["components"]["schemas"]
+    told = [
+        ({"$ref": f"#/components/schemas/{kind}"}, one)
+        for kind, schema in kinds.items()
+        for one in schema.get("examples", ())
+    ]
+    for row in contract["paths"].values():
+        for operation in row.values():
+            for response in (operation.get("requestBody", {}), *operation["responses"].values()):
+                told += [
+                    (one["schema"], one["example"])
+                    for one in response.get("content", {}).values()
+                    if "example" in one
+                ]
+    for schema, value in told:
+        validator = jsonschema_rs.Draft202012Validator(schema | {"components": contract["components"]})
+        assert [str(error.message) for error in validator.iter_errors(value)] == [], schema
+    assert len(told) > len(EXAMPLES)
