@@ -26,7 +26,7 @@ class Streams:
     """The places of one kind: `tokens` and `peers` are their shares, `whole` is how many there are."""
 
     def __init__(self, tokens: Share, peers: Share, whole: int) -> None:
-        self._roles: dict[str, Role] = {}
+        self.roles: dict[str, Role] = {}
         part = whole / tokens.bounds.whole
         self._tokens: Pool[str] = Pool(
             "of these", tokens.bounds.sized(whole, max(1, int(tokens.bounds.host * part))), self._standing
@@ -39,7 +39,7 @@ class Streams:
 
     def take(self, bearer: Bearer, peer: str, what: str) -> Callable[[], None]:
         """Take a place; what is returned gives it back. Raises `ProblemError` (503)."""
-        self._roles[bearer.id] = bearer.role
+        self.roles[bearer.id] = bearer.role
         busy = self._tokens.refusal(bearer.id) or self._peers.refusal(peer)
         if busy:
             self._forget(bearer.id)
@@ -57,11 +57,11 @@ class Streams:
         return give_back
 
     def _standing(self, token: str) -> Standing:
-        return Standing.NAMED if self._roles[token] is Role.VIEWER else Standing.REGISTERED
+        return Standing.NAMED if self.roles[token] is Role.VIEWER else Standing.REGISTERED
 
     def _forget(self, token: str) -> None:
         if not self._tokens.held(token):
-            self._roles.pop(token, None)
+            self.roles.pop(token, None)
 
 
 class Held(Response):

@@ -52,7 +52,7 @@ class Budget:
         self._plenty, self._scarce = bounds, dataclasses.replace(bounds, host=reserve.host)
         self._kept = reserve.kept
         self._clock = clock
-        self._owed: Pool[str] = Pool("bytes of audit records to pay off", bounds, standing)
+        self.owed: Pool[str] = Pool("bytes of audit records to pay off", bounds, standing)
         self._paid = clock()
         self._changes: deque[tuple[str, int]] = deque()
         self._left: int | None = None
@@ -60,7 +60,7 @@ class Budget:
     def charge(self, record: Record) -> None:
         """A record was made about its host; when it is only counted, it is taken off again."""
         if record.host is not None and not record.stranger:
-            self._owed.charge(record.host, weight(record))
+            self.owed.charge(record.host, weight(record))
 
     def folded(self, record: Record) -> None:
         """A record was counted only, not written."""
@@ -88,14 +88,14 @@ class Budget:
     def owing(self, host: str) -> str:
         """Why calls of this host have to wait, in words for it; empty when they need not."""
         self._pay()
-        self._owed.bounds = self._plenty if self._left is None else self._scarce
-        return self._owed.refusal(host, 0)
+        self.owed.bounds = self._plenty if self._left is None else self._scarce
+        return self.owed.refusal(host, 0)
 
     def pause(self, host: str) -> float:
         """For how many seconds this host's calls wait, then to be asked again; 0 when they need not."""
         if not self.owing(host):
             return 0.0
-        over = (self._owed.held(host) - self._owed.bounds.host) / self._pace
+        over = (self.owed.held(host) - self.owed.bounds.host) / self._pace
         return min(_LONGEST_PAUSE_SECONDS, max(_PAID_EVERY_SECONDS, over))
 
     @property
@@ -107,14 +107,14 @@ class Budget:
         while self._changes:
             host, change = self._changes.popleft()
             if change > 0:
-                self._owed.charge(host, change)
+                self.owed.charge(host, change)
             else:
                 self._lower(host, -change)
         now = self._clock()
         if now - self._paid >= _PAID_EVERY_SECONDS:
             paid, self._paid = int((now - self._paid) * self._pace), now
-            for host, _owed in list(self._owed.holders()):
+            for host, _owed in list(self.owed.holders()):
                 self._lower(host, paid)
 
     def _lower(self, host: str, amount: int) -> None:
-        self._owed.give_back(host, min(amount, self._owed.held(host)))
+        self.owed.give_back(host, min(amount, self.owed.held(host)))

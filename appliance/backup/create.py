@@ -119,7 +119,7 @@ def _files(state: Path) -> Iterator[tuple[str, int]]:
             " there, and take them away"
         )
     for name in sorted(names, key=lambda one: one != AUDIT_LOG):
-        descriptor = _opened(state, name)
+        descriptor = opened(state, name)
         if descriptor is not None:
             yield name, descriptor
 
@@ -133,7 +133,7 @@ def _names(state: Path, part: str) -> Iterator[str]:
                 yield (Path(folder) / name).relative_to(state).as_posix()
 
 
-def _opened(state: Path, name: str) -> int | None:
+def opened(state: Path, name: str) -> int | None:
     """A file of a part, None for what is no regular file; no link is followed on the way."""
     part, *folders, last = PurePosixPath(name).parts
     here = os.open(state / part, _FOLDER)

@@ -40,7 +40,7 @@ def status(
     if as_json:
         say_json({**msgspec.structs.asdict(body), "troubles": troubles})
     else:
-        _show(body, troubles)
+        show(body, troubles)
     raise typer.Exit(1 if troubles else 0)
 
 
@@ -84,7 +84,8 @@ def troubles_of(body: Status) -> list[str]:
     return found
 
 
-def _show(body: Status, troubles: list[str]) -> None:
+def show(body: Status, troubles: list[str]) -> None:
+    """Print a status for a person, what is wrong first."""
     console = Console(highlight=False)
     policy, audit = body.policy, body.audit
     for trouble in shortened(troubles, _MOST_TROUBLES):

@@ -30,7 +30,7 @@ class ControlLifeline:
     ) -> None:
         self._stopping = stopping
         self._enclosed = enclosed
-        self._channel = Channel(socket.socket(fileno=descriptor), messages.Lifeline)
+        self.channel = Channel(socket.socket(fileno=descriptor), messages.Lifeline)
         self.surroundings = Surroundings()
         self.sockets: dict[str, socket.socket] = {}
         self.restored = asyncio.Event()
@@ -45,7 +45,7 @@ class ControlLifeline:
 
     def attach(self) -> None:
         """Begin to listen; `restored` is set when all kept sockets are here."""
-        self._channel.attach(asyncio.get_running_loop(), self._received, self._closed)
+        self.channel.attach(asyncio.get_running_loop(), self._received, self._closed)
 
     def hear(self, heard: Heard) -> None:
         """Hand out what came before control was ready for it, and from now on what comes."""
@@ -90,7 +90,7 @@ class ControlLifeline:
 
     def _send(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
         try:
-            self._channel.send(message, descriptors)
+            self.channel.send(message, descriptors)
         except ChannelClosedError:
             self._closed()
 

@@ -84,14 +84,14 @@ class Policies:
         `site_keys`, whatever comes into force is signed with one of them.
         """
         self.file = file
-        self._store = store
+        self.store = store
         self._trail = trail
         self._robot = robot
         self._hosts = hosts
         self._changed = changed
         self._site_keys = site_keys
         self._current: Policy | None = None
-        self._trial = Trial(store, "confirm", self._go_back, (PolicyRefusedError,))
+        self.trial = Trial(store, "confirm", self._go_back, (PolicyRefusedError,))
         self.revision = 0
         self.in_force = RevisionRow(0, "", "", 0.0, "", "")  # until `start`
 
@@ -105,7 +105,7 @@ class Policies:
     @property
     def confirm_by(self) -> float | None:
         """When it goes back by itself unless confirmed, in seconds since the epoch."""
-        return self._trial.confirm_by
+        return self.trial.confirm_by
 
     @property
     def differs_from_file(self) -> bool:
@@ -121,7 +121,7 @@ class Policies:
         After a crash of control (`restarted`) it is the one that was in force. At the appliance's start it is the
         file, unless an operator's own revision (a rollback, REST) was in force when it stopped.
         """
-        revisions = self._store.revisions()
+        revisions = self.store.revisions()
         last = revisions[0] if revisions else None
         if last is not None and (restarted or last.who != _DISK):
             try:
@@ -129,15 +129,15 @@ class Policies:
             except PolicyRefusedError as error:
                 raise PolicyRefusedError([*error.findings, _KEPT.format(last)]) from error
             self._enforce(policy, last)
-            self._trial.resume()
+            self.trial.resume()
             return
         text, signature = self._read()
         policy = self._judged(text, signature, str(self.file), self.known)
         if last is not None and (last.text, last.signature) == (text, signature):
             self._enforce(policy, last)
-            self._trial.resume()
+            self.trial.resume()
         else:
-            self._trial.end()
+            self.trial.end()
             self._keep(policy, signature, who=_DISK, note="read at start")
 
     async def reload(self, *, who: str = _DISK, confirm_within: float | None = None) -> Loaded:
@@ -148,7 +148,7 @@ class Policies:
         """
         before = self.revision
         policy, signature = await self._prepared(self._read, str(self.file), who)
-        self._trial.announce(before, confirm_within)
+        self.trial.announce(before, confirm_within)
         revoked = self._keep(policy, signature, who=_DISK, note="reloaded from disk", by=who)
         return self._answer(policy, before, revoked, confirm_within)
 
@@ -166,7 +166,7 @@ class Policies:
         if now.who != _DISK and (now.text, now.signature) == (text, signature):
             return Loaded(before, before, [str(one) for one in self.current.warnings], 0, self.confirm_by)
         policy, _ = await self._prepared(lambda: (text, signature), f"revision {self._next_number()}", who)
-        self._trial.announce(before, confirm_within)
+        self.trial.announce(before, confirm_within)
         revoked = self._keep(policy, signature, who=who, note=note or "posted")
         return self._answer(policy, before, revoked, confirm_within)
 
@@ -184,7 +184,7 @@ class Policies:
         """Bring a kept revision into force (None: the one before this). Raises `PolicyRefusedError`."""
         before = self.revision
         try:
-            row = wanted(self._store.revisions(), revision, before)
+            row = wanted(self.store.revisions(), revision, before)
         except UnknownRevisionError as error:
             raise PolicyRefusedError([str(error)]) from error
         policy = self._judged(row.text, row.signature, row.file, self.known)
@@ -195,19 +195,19 @@ class Policies:
         """Keep an unconfirmed change; False when there is none."""
         if self.confirm_by is None:
             return False
-        self._trial.end()
+        self.trial.end()
         self._trail.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
         return True
 
     def revisions(self) -> list[RevisionRow]:
         """All kept revisions, the newest first."""
-        return self._store.revisions()
+        return self.store.revisions()
 
     def revision_row(self, revision: int | None) -> RevisionRow | None:
         """A kept revision (None: the one in force); None when it is not kept."""
         if revision is None or revision == self.revision:
             return self.in_force
-        return next((row for row in self._store.revisions() if row.revision == revision), None)
+        return next((row for row in self.store.revisions() if row.revision == revision), None)
 
     @property
     def known(self) -> Known:
@@ -271,12 +271,12 @@ class Policies:
             raise PolicyRefusedError([str(finding) for finding in error.findings]) from error
 
     def _next_number(self) -> int:
-        return max([self.revision, *(row.revision for row in self._store.revisions())]) + 1
+        return max([self.revision, *(row.revision for row in self.store.revisions())]) + 1
 
     def _keep(self, policy: Policy, signature: str, *, who: str, note: str, by: str | None = None) -> int:
         number = self._next_number()
         row = RevisionRow(number, policy.text, policy.file, time.time(), who, note, signature)
-        self._store.save_revision(row)
+        self.store.save_revision(row)
         revoked = self._enforce(policy, row)
         self._trail.happened(
             "policy loaded",
@@ -297,7 +297,7 @@ class Policies:
         return 0 if before is None else self._changed(before, policy)
 
     def _answer(self, policy: Policy, before: int, revoked: int, confirm_within: float | None) -> Loaded:
-        self._trial.changed(before, confirm_within)
+        self.trial.changed(before, confirm_within)
         return Loaded(
             self.revision, before, [str(warning) for warning in policy.warnings], revoked, self.confirm_by
         )

@@ -156,7 +156,7 @@ class RosMaster:
             limits=limits,
             disconnected=self._lost,
         )
-        self._calls = BatchingClient(self._client, small)
+        self.calls = BatchingClient(self._client, small)
         self._open = asyncio.Event()
         self._alone = asyncio.Lock()
         self._inside = 0
@@ -177,7 +177,7 @@ class RosMaster:
         return await self._call(lambda: self._in_order(calls))
 
     async def _in_order(self, calls: Sequence[Wanted]) -> list[Answer | CallFailedError]:
-        outcomes = await self._calls.in_order(calls)
+        outcomes = await self.calls.in_order(calls)
         return [
             call if isinstance(call, CallFailedError) else _answer_to(method, call)
             for (method, _params), call in zip(calls, outcomes, strict=True)
@@ -210,7 +210,7 @@ class RosMaster:
 
     async def call_now(self, method: str, *params: Value) -> Answer:
         """Call whether or not the door is open: for the reconcile loop."""
-        answer = _answer_to(method, await self._calls.call(method, *params))
+        answer = _answer_to(method, await self.calls.call(method, *params))
         if isinstance(answer, CallFailedError):
             raise answer
         return answer

@@ -44,7 +44,7 @@ def canonical_network(network: Network) -> Network:
 class HostTable:
     """Networks and groups of one policy; built once, then only asked."""
 
-    __slots__ = ("_kept", "_lengths", "_networks", "_parents", "_tables")
+    __slots__ = ("_lengths", "_networks", "_parents", "_tables", "kept")
 
     def __init__(self) -> None:
         self._parents: list[list[Atom]] = [[]]  # of each atom; atom 0 is EVERYONE
@@ -52,7 +52,7 @@ class HostTable:
         # version -> prefix length -> leading bits -> atom of the network
         self._tables: dict[int, dict[int, dict[int, Atom]]] = {4: {}, 6: {}}
         self._lengths: dict[int, list[tuple[int, dict[int, Atom]]]] = {4: [], 6: []}
-        self._kept: dict[tuple[int, int], frozenset[Atom]] = {}
+        self.kept: dict[tuple[int, int], frozenset[Atom]] = {}
 
     def network(self, network: Network) -> Atom:
         """The atom of a network, made when it is new."""
@@ -87,11 +87,11 @@ class HostTable:
     def atoms_of(self, address: Address) -> frozenset[Atom]:
         """Every atom that holds the address; `EVERYONE` always among them."""
         key = (address.version, int(address))
-        kept = self._kept.get(key)
+        kept = self.kept.get(key)
         if kept is None:
-            if len(self._kept) >= _KEPT_HOSTS:
-                self._kept.clear()
-            kept = self._kept[key] = self._find(canonical_address(address))
+            if len(self.kept) >= _KEPT_HOSTS:
+                self.kept.clear()
+            kept = self.kept[key] = self._find(canonical_address(address))
         return kept
 
     def _find(self, address: Address) -> frozenset[Atom]:

@@ -105,12 +105,12 @@ class Policy:
         self.tell = parts.tell
         self.enrolled = parts.enrolled
         self.robot = parts.robot
-        self._hosts = parts.hosts
+        self.hosts = parts.hosts
         self._limits = parts.limits
         self._named = parts.named
         self._tables = parts.tables
         self._present = parts.present
-        self._kept: dict[tuple[int, int, Category, str], Decision] = {}
+        self.kept: dict[tuple[int, int, Category, str], Decision] = {}
         self._kept_below: dict[tuple[int, int, Category, str, bool], Decision] = {}
         self._any_audit_only = any(table.audit_only for table in parts.tables.values())
 
@@ -121,13 +121,13 @@ class Policy:
         """
         host = request.host
         key = (host.version, int(host), request.category, request.resource)
-        decision = self._kept.get(key)
+        decision = self.kept.get(key)
         if decision is None:
             decision = self._decide(request)
             if len(request.resource) <= _KEPT_NAME:
-                if len(self._kept) >= _KEPT_DECISIONS:
-                    self._kept.clear()
-                self._kept[key] = decision
+                if len(self.kept) >= _KEPT_DECISIONS:
+                    self.kept.clear()
+                self.kept[key] = decision
         return decision
 
     def decide_parameter(
@@ -161,7 +161,7 @@ class Policy:
     def _decide_below(self, request: Request, namespace: bool) -> Decision | None:
         """The denial of the call on `request.resource` because of a key below it, if there is one."""
         table = self._tables[request.category]
-        atoms = self._hosts.atoms_of(request.host)
+        atoms = self.hosts.atoms_of(request.host)
         deciding = table.tree.below(request.resource)
         if namespace:
             inherited = table.tree.inherited(request.resource) or table.default
@@ -189,7 +189,7 @@ class Policy:
         rule = self._limits.find(topic)
         if rule is None:
             return NO_LIMIT
-        return rule.rate(part, self._hosts.atoms_of(host) if host is not None else frozenset())
+        return rule.rate(part, self.hosts.atoms_of(host) if host is not None else frozenset())
 
     def limit_on(self, request: Request) -> Rate:
         """How much of what a request asks for may pass."""
@@ -201,11 +201,11 @@ class Policy:
 
         With a section in audit-only mode every address is known, because its requests pass.
         """
-        return self._any_audit_only or not self._named.isdisjoint(self._hosts.atoms_of(address))
+        return self._any_audit_only or not self._named.isdisjoint(self.hosts.atoms_of(address))
 
     def named_as(self, address: Address) -> Network:
         """By what the policy names an address: itself, or the smallest network whose every address it means as well."""
-        return self._hosts.narrowest(address)
+        return self.hosts.narrowest(address)
 
     def has_section(self, category: Category) -> bool:
         """Whether the file has the section that decides this category."""
@@ -217,7 +217,7 @@ class Policy:
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
         """The networks and groups of this policy that hold an address (for `explain`)."""
-        return self._hosts.atoms_of(address)
+        return self.hosts.atoms_of(address)
 
     def rules(self, category: Category) -> tuple[CompiledRule, ...]:
         """The rules of a category in the order of the file, `default` included."""
@@ -253,7 +253,7 @@ class Policy:
             section = BY_CATEGORY[request.category].name
             reason = f"{_what(request, 'may not')}: no key of [{section}] matches and it has no default"
             return _decided(False, None, reason, table.audit_only)
-        if found.grants(self._hosts.atoms_of(request.host)):
+        if found.grants(self.hosts.atoms_of(request.host)):
             return Decision(True, found.rule, f"{_what(request, 'may')} by {found.place}")
         what = _what(request, "is not among the hosts that may")
         return _by_rule(what, found, table.audit_only)

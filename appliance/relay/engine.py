@@ -51,17 +51,17 @@ class Engine:
         self._loop = loop
         self._limits = limits
         self._reporter = Reporter(limits)
-        self._middle = Middle(
+        self.middle = Middle(
             loop,
             self._reporter,
             publish=lambda published: self._publish(published.topic, published.data),
             changed=self._monitors_changed,
         )
         self._table = StatedTable()
-        self._memory = Memory.of(limits, self._table.standing)
-        self._context = RelayContext(loop, limits, self._reporter, self._memory, Scratch(), self._middle)
-        self._anteroom = Anteroom(loop.clock, self._table.standing, self._memory.headers)
-        self._ports = Ports(
+        self.memory = Memory.of(limits, self._table.standing)
+        self._context = RelayContext(loop, limits, self._reporter, self.memory, Scratch(), self.middle)
+        self._anteroom = Anteroom(loop.clock, self._table.standing, self.memory.headers)
+        self.ports = Ports(
             loop,
             limits,
             standing=self._table.standing,
@@ -69,14 +69,14 @@ class Engine:
             turned_away=self._turned_away,
             make_room=self._make_place,
         )
-        self._topics: dict[tuple[str, str], tuple[RelayedTopic, Publisher | OwnPublisher]] = {}
+        self.topics: dict[tuple[str, str], tuple[RelayedTopic, Publisher | OwnPublisher]] = {}
         self._own: dict[str, OwnPublisher] = {}
         self._own_headers: dict[str, dict[str, str]] = {}
-        self._clients: set[ServiceClient] = set()
+        self.clients: set[ServiceClient] = set()
         self._services: dict[tuple[str, str], ServiceTraffic] = {}
-        self._visitors: set[Visitor] = set()
-        self._waiting: dict[str, set[Visitor]] = {}
-        self._farewells: set[Farewell] = set()
+        self.visitors: set[Visitor] = set()
+        self.waiting: dict[str, set[Visitor]] = {}
+        self.farewells: set[Farewell] = set()
         self._link: Link | None = None
         self._last_rows: list[messages.TopicTraffic] = []
         self._flows = Flows(loop.clock)
@@ -97,7 +97,7 @@ class Engine:
 
     def take(self, message: messages.Message, descriptors: tuple[int, ...]) -> None:
         """Carry out one message of control."""
-        if self._middle.preparing or self._later:
+        if self.middle.preparing or self._later:
             self._later.append((message, descriptors))
         else:
             self._carry_out(message, descriptors)
@@ -112,11 +112,11 @@ class Engine:
         elif isinstance(message, messages.UpstreamFound | messages.UpstreamRefused):
             self._upstream_answered(message)
         elif isinstance(message, messages.SpecificationsStated):
-            self._middle.state(message)
+            self.middle.state(message)
         elif isinstance(message, messages.MonitorSwitched):
-            self._middle.switch(message.name, message.enabled)
+            self.middle.switch(message.name, message.enabled)
         elif isinstance(message, messages.MonitorResumed):
-            self._ask_for_latched(self._middle.resume(message.name))
+            self._ask_for_latched(self.middle.resume(message.name))
         elif isinstance(message, messages.LookWanted | messages.LookEnded):
             self._look(message)
         elif isinstance(message, messages.OwnHeaderStated):
@@ -131,20 +131,20 @@ class Engine:
 
     def close(self) -> None:
         """Cut everything."""
-        self._middle.close()
+        self.middle.close()
         for _message, descriptors in self._later:
             for descriptor in descriptors:
                 os.close(descriptor)
         self._later.clear()
-        self._ports.close_all()
-        for topic, publisher in self._topics.values():
+        self.ports.close_all()
+        for topic, publisher in self.topics.values():
             topic.cut_all("the relay ends")
             publisher.close()
-        for client in list(self._clients):
+        for client in list(self.clients):
             client.cut("the relay ends")
-        for visitor in self._visitors:
+        for visitor in self.visitors:
             visitor.close()
-        for farewell in list(self._farewells):
+        for farewell in list(self.farewells):
             farewell.close()
 
     # --- what control states ------------------------------------------------------------------------------
@@ -152,30 +152,30 @@ class Engine:
     def _state(self, message: Statement, descriptors: tuple[int, ...]) -> None:
         self._table.state(message)
         if isinstance(message, messages.NodePlaced):
-            self._ports.open(message.key, descriptors[0])
+            self.ports.open(message.key, descriptors[0])
         elif isinstance(message, messages.PublicationPlaced):
             self._place_topic(message.key, message.topic)
             self._limit_topic(message)
         elif isinstance(message, messages.GrantInstalled):
             self._limit_subscriber(message)
-        if self._waiting and message.key in self._waiting:
+        if self.waiting and message.key in self.waiting:
             self._judge_waiting(message.key)
 
     def _restated(self, epoch: int) -> None:
         for message in self._table.end(epoch):
             self._withdrawn(message)
         self._reporter.repeat_connections()
-        for topic, publisher in self._topics.values():
+        for topic, publisher in self.topics.values():
             publisher.ask_again()
             topic.repeat()
-        self._middle.observations.repeat()
+        self.middle.observations.repeat()
 
     def _withdrawn(self, message: messages.Message) -> None:
         if isinstance(message, messages.NodeWithdrawn):
-            self._ports.close(message.key)
-            for key, topic in [one for one in self._topics if one[0] == message.key]:
+            self.ports.close(message.key)
+            for key, topic in [one for one in self.topics if one[0] == message.key]:
                 self._remove_topic(key, topic, "the publisher's node is gone")
-            for visitor in [one for one in self._visitors if one.key == message.key]:
+            for visitor in [one for one in self.visitors if one.key == message.key]:
                 self._visitor_failed(visitor, "")
             self._cut_clients("the service's node is gone", message.key)
             self._forget_services(message.key)
@@ -194,7 +194,7 @@ class Engine:
     def _cut_clients(
         self, reason: str, key: str, service: str | None = None, of: tuple[str, str] | None = None
     ) -> None:
-        for client in list(self._clients):
+        for client in list(self.clients):
             placed = client.service
             who = client.host, client.caller_id
             if placed.key == key and service in {None, placed.service} and of in {None, who}:
@@ -207,7 +207,7 @@ class Engine:
                 self._last_rows.append(row)
 
     def _place_topic(self, key: str, topic: str) -> None:
-        if (key, topic) in self._topics:
+        if (key, topic) in self.topics:
             return
         node = self._table.node(key)
         name, host = (key, "") if node is None else (node.name, node.host)
@@ -218,7 +218,7 @@ class Engine:
             host,
             grace=self._limits.queue_grace,
             clock=self._loop.clock,
-            share=self._memory.latched.of(host),
+            share=self.memory.latched.of(host),
             fresh=not self._table.restating,
             limited=lambda part, messages, size: self._reporter.limited(
                 (key, topic, part, host, name), messages, size
@@ -233,15 +233,13 @@ class Engine:
             relayed.upstream = publisher
             relayed.monitor(None, wanted=True)
         else:
-            publisher = Publisher(
-                self._context, relayed, lambda header: self._middle.objection(topic, header)
-            )
+            publisher = Publisher(self._context, relayed, lambda header: self.middle.objection(topic, header))
             relayed.upstream = publisher
             self._let_monitor(relayed)
-        self._topics[key, topic] = (relayed, publisher)
+        self.topics[key, topic] = (relayed, publisher)
 
     def _limit_topic(self, message: messages.PublicationPlaced) -> None:
-        relayed, _publisher = self._topics[message.key, message.topic]
+        relayed, _publisher = self.topics[message.key, message.topic]
         together = self._flows.of(message.together, message.topic)
         relayed.flow.set(message.limit, together, self._loop.clock())
 
@@ -252,17 +250,17 @@ class Engine:
             subscriber.flow = flow
 
     def _connected_by(self, grant: messages.GrantInstalled | messages.GrantRevoked) -> list[Subscriber]:
-        placed = self._topics.get((grant.key, grant.topic))
+        placed = self.topics.get((grant.key, grant.topic))
         members = () if placed is None else placed[0].members
         who = grant.host, grant.caller_id
         return [one for one in members if isinstance(one, Subscriber) and (one.host, one.caller_id) == who]
 
     def _make_room(self, host: str, size: int) -> None:
         """A host wants to have a message latched: those that have more than it would have make room."""
-        latched, share = self._memory.latched, self._memory.latched.of(host)
+        latched, share = self.memory.latched, self.memory.latched.of(host)
         while share.refusal(size):
             greatest, held = max(latched.holders(), key=lambda one: one[1], default=("", 0))
-            of_greatest = (topic for topic, _publisher in self._topics.values() if topic.host == greatest)
+            of_greatest = (topic for topic, _publisher in self.topics.values() if topic.host == greatest)
             largest = max(of_greatest, key=lambda topic: topic.latched, default=None)
             if held <= share.used + size or largest is None or not largest.latched:
                 return
@@ -270,22 +268,22 @@ class Engine:
 
     def _let_monitor(self, relayed: RelayedTopic) -> None:
         """Messages of a topic go through the monitors if one stands there, and past them otherwise."""
-        middle, topic = self._middle, relayed.topic
+        middle, topic = self.middle, relayed.topic
         place = Place(relayed.key, topic, relayed.host, relayed.name)
         through = middle.lane(place).through if middle.stands(topic) else None
         relayed.monitor(through, wanted=middle.wants(topic))
 
     def _monitors_changed(self, topics: frozenset[str] | None) -> None:
-        monitors = self._middle.monitors
+        monitors = self.middle.monitors
         self._context.scratch.move(None if monitors is None else monitors.area)
-        for relayed, publisher in list(self._topics.values()):
+        for relayed, publisher in list(self.topics.values()):
             publisher.judge_again()
             if isinstance(publisher, Publisher):
                 self._let_monitor(relayed)
-        for client in list(self._clients):
+        for client in list(self.clients):
             client.judge_again()
         self._ask_for_latched(topics)
-        while self._later and not self._middle.preparing:
+        while self._later and not self.middle.preparing:
             self._carry_out(*self._later.popleft())
 
     def _ask_for_latched(self, topics: frozenset[str] | None) -> None:
@@ -293,7 +291,7 @@ class Engine:
 
         Only of these topics (None: all); what did not change would judge the same message twice.
         """
-        for relayed, publisher in list(self._topics.values()):
+        for relayed, publisher in list(self.topics.values()):
             concerned = topics is None or relayed.topic in topics
             if concerned and relayed.lacks_latched and isinstance(publisher, Publisher):
                 publisher.give_again()
@@ -308,7 +306,7 @@ class Engine:
 
     def _header_of(self, topic: str) -> dict[str, str] | None:
         """The connection header of what the appliance publishes: of the monitors' definitions, or as control says."""
-        return self._middle.header_of(topic) or self._own_headers.get(topic)
+        return self.middle.header_of(topic) or self._own_headers.get(topic)
 
     def _publish(self, topic: str, data: bytes) -> None:
         """Between two messages, or in the middle of a batch of another topic: never of this one."""
@@ -317,9 +315,9 @@ class Engine:
             publisher.publish(data)
 
     def _remove_topic(self, key: str, topic: str, reason: str) -> None:
-        if (key, topic) not in self._topics:
+        if (key, topic) not in self.topics:
             return
-        relayed, publisher = self._topics.pop((key, topic))
+        relayed, publisher = self.topics.pop((key, topic))
         if self._own.get(topic) is publisher:
             del self._own[topic]
         relayed.cut_all(reason)
@@ -329,7 +327,7 @@ class Engine:
             self._last_rows.append(row)
 
     def _upstream_answered(self, message: messages.UpstreamFound | messages.UpstreamRefused) -> None:
-        placed = self._topics.get((message.key, message.topic))
+        placed = self.topics.get((message.key, message.topic))
         if placed is None:
             return
         if isinstance(message, messages.UpstreamFound):
@@ -339,7 +337,7 @@ class Engine:
 
     def _look(self, message: messages.LookWanted | messages.LookEnded) -> None:
         if isinstance(message, messages.LookWanted):
-            topics = [topic for topic, _publisher in self._topics.values() if topic.topic == message.topic]
+            topics = [topic for topic, _publisher in self.topics.values() if topic.topic == message.topic]
             self._looks.begin(message, topics)
         else:
             self._looks.end(message.number)
@@ -351,7 +349,7 @@ class Engine:
             tune(sock)
         except OSError:
             sock.close()
-            self._ports.left(host)
+            self.ports.left(host)
             return
         visitor = Visitor(
             self._context,
@@ -362,13 +360,13 @@ class Engine:
             introduced=self._introduced,
             failed=self._visitor_failed,
         )
-        self._visitors.add(visitor)
+        self.visitors.add(visitor)
 
     def _make_place(self, host: str) -> bool:
         """End a connection so that one of this host has room: of a peer that waits, else of the host that has most."""
         if self._anteroom.make_room(host):
             return True
-        pool = self._ports.connected
+        pool = self.ports.connected
         if self._table.standing(host) is not Standing.REGISTERED:
             return False
         largest, most = max(pool.holders(), key=lambda holder: holder[1], default=("", 0))
@@ -381,8 +379,8 @@ class Engine:
         return False
 
     def _served(self) -> Iterator[Subscriber | ServiceClient]:
-        yield from list(self._clients)
-        for relayed, _publisher in self._topics.values():
+        yield from list(self.clients)
+        for relayed, _publisher in self.topics.values():
             yield from [member for member in relayed.members if isinstance(member, Subscriber)]
 
     def _turned_away(self, key: str, host: str, reason: str) -> None:
@@ -391,14 +389,14 @@ class Engine:
     def _visitor_failed(self, visitor: Visitor, reason: str) -> None:
         visitor.close()
         self._forget_visitor(visitor)
-        self._ports.left(visitor.host)
+        self.ports.left(visitor.host)
         if reason:
             self._reporter.refused(visitor.key, NOTHING, visitor.host, "", reason)
 
     def _introduced(self, visitor: Visitor) -> None:
         if self._link is not None:
             self._link.catch_up()
-        if visitor in self._visitors:
+        if visitor in self.visitors:
             self._judge(visitor, patient=True)
 
     def _judge(self, visitor: Visitor, *, patient: bool) -> None:
@@ -407,9 +405,9 @@ class Engine:
         reason = flaw(fields, rest)
         if not reason:
             reason = missing(self._table, visitor.key, visitor.host, fields)
-            if reason and (patient or self._table.restating or self._middle.preparing):
+            if reason and (patient or self._table.restating or self.middle.preparing):
                 visitor.wait(self._limits.grant_seconds, lambda: self._judge(visitor, patient=False))
-                self._waiting.setdefault(visitor.key, set()).add(visitor)
+                self.waiting.setdefault(visitor.key, set()).add(visitor)
                 return
         self._forget_visitor(visitor)
         sock = visitor.take()
@@ -422,17 +420,17 @@ class Engine:
 
     def _judge_waiting(self, key: str) -> None:
         """Something new is stated of this incarnation: who can be served now is served."""
-        for visitor in list(self._waiting.get(key, ())):
+        for visitor in list(self.waiting.get(key, ())):
             if not missing(self._table, key, visitor.host, visitor.fields):
                 self._judge(visitor, patient=True)
 
     def _forget_visitor(self, visitor: Visitor) -> None:
-        self._visitors.discard(visitor)
-        waiting = self._waiting.get(visitor.key)
+        self.visitors.discard(visitor)
+        waiting = self.waiting.get(visitor.key)
         if waiting is not None:
             waiting.discard(visitor)
             if not waiting:
-                del self._waiting[visitor.key]
+                del self.waiting[visitor.key]
 
     def _serve_client(
         self, visitor: Visitor, sock: socket.socket, fields: Mapping[str, str], rest: bytes
@@ -444,12 +442,12 @@ class Engine:
         traffic = self._services.setdefault((service.key, service.service), ServiceTraffic())
 
         def refuse(sock: socket.socket, reason: str) -> None:
-            self._clients.discard(client)
+            self.clients.discard(client)
             self._refuse(visitor, ("service", service.service), caller_id, sock, reason)
 
         def ended() -> None:
-            self._clients.discard(client)
-            self._ports.left(visitor.host)
+            self.clients.discard(client)
+            self.ports.left(visitor.host)
 
         client = ServiceClient(
             self._context,
@@ -462,17 +460,17 @@ class Engine:
             refuse=refuse,
             ended=ended,
         )
-        self._clients.add(client)
+        self.clients.add(client)
         client.start(rest)
 
     def _subscribe(self, visitor: Visitor, sock: socket.socket, fields: Mapping[str, str]) -> None:
-        relayed, _publisher = self._topics[visitor.key, fields["topic"]]
+        relayed, _publisher = self.topics[visitor.key, fields["topic"]]
 
         def refuse(sock: socket.socket, reason: str) -> None:
             self._refuse(visitor, ("topic", relayed.topic), fields["callerid"], sock, reason)
 
         def ended() -> None:
-            self._ports.left(visitor.host)
+            self.ports.left(visitor.host)
 
         subscriber = Subscriber(
             self._context, sock, relayed, visitor.host, fields, refuse=refuse, ended=ended
@@ -489,18 +487,18 @@ class Engine:
         self._reporter.refused(visitor.key, asked, visitor.host, caller_id, reason)
 
         def ended(farewell: Farewell) -> None:
-            self._farewells.discard(farewell)
+            self.farewells.discard(farewell)
             self._anteroom.leave(farewell)
-            self._ports.left(visitor.host)
+            self.ports.left(visitor.host)
 
         farewell = Farewell(self._loop, sock, reason, self._limits.farewell, ended)
         if farewell.live:
-            self._farewells.add(farewell)
+            self.farewells.add(farewell)
             self._anteroom.enter(farewell, visitor.host)
 
     def _rows(self) -> list[messages.TopicTraffic]:
         """What went through since the last call."""
-        rows = [row for topic, _publisher in self._topics.values() if (row := topic.traffic()) is not None]
+        rows = [row for topic, _publisher in self.topics.values() if (row := topic.traffic()) is not None]
         rows += [
             row for (key, name), one in self._services.items() if (row := one.row(key, name)) is not None
         ]
@@ -508,12 +506,12 @@ class Engine:
         return rows
 
     def _tick(self) -> None:
-        for topic, publisher in list(self._topics.values()):
+        for topic, publisher in list(self.topics.values()):
             topic.tidy()
             if isinstance(publisher, Publisher):
                 publisher.look()
-        for client in list(self._clients):
+        for client in list(self.clients):
             client.look()
-        self._middle.tick()
-        self._reporter.tick(self._rows, self._memory.held())
+        self.middle.tick()
+        self._reporter.tick(self._rows, self.memory.held())
         self._loop.after(self._limits.report_every, self._tick)

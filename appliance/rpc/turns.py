@@ -37,13 +37,13 @@ class Turns:
         alike: Callable[[Address], Hashable] = itself,
         pause: Callable[[str], float] = lambda _host: 0.0,
     ) -> None:
-        self._slots: Pool[Address] = Pool("requests being served", bounds, standing)
+        self.slots: Pool[Address] = Pool("requests being served", bounds, standing)
         self._alike = alike
         self._pause = pause
         self._together = max(bounds.host, bounds.whole // 2)
         self._taken: Counter[Hashable] = Counter()  # by hosts that are alike
         self._taken_as: dict[Address, Hashable] = {}
-        self._waiting: OrderedDict[Hashable, OrderedDict[Address, Queue]] = OrderedDict()
+        self.waiting: OrderedDict[Hashable, OrderedDict[Address, Queue]] = OrderedDict()
 
     async def enter(self, host: Address) -> None:
         """Take a slot, once this host's records are paid, waiting for its turn when there is none."""
@@ -53,7 +53,7 @@ class Turns:
         if self._take(host, kind):
             return
         turn = asyncio.get_running_loop().create_future()
-        self._waiting.setdefault(kind, OrderedDict()).setdefault(host, deque()).append(turn)
+        self.waiting.setdefault(kind, OrderedDict()).setdefault(host, deque()).append(turn)
         try:
             await turn
         except asyncio.CancelledError:
@@ -68,13 +68,13 @@ class Turns:
         self._give_back(host)
         while (following := self._next()) is not None:
             kind, host = following
-            hosts = self._waiting.pop(kind)
+            hosts = self.waiting.pop(kind)
             queue = hosts.pop(host)
             turn = queue.popleft()
             if queue:
                 hosts[host] = queue  # to the end of the line: its next request waits a round
             if hosts:
-                self._waiting[kind] = hosts
+                self.waiting[kind] = hosts
             if turn.done():  # its task was cancelled, and has not run since to give up its place
                 self._give_back(host)
             else:
@@ -82,7 +82,7 @@ class Turns:
 
     def _next(self) -> tuple[Hashable, Address] | None:
         """The host whose turn it is, and its kind; its slot is taken."""
-        for kind, hosts in self._waiting.items():
+        for kind, hosts in self.waiting.items():
             if self._taken[kind] < self._together:
                 for host in hosts:
                     if self._take(host, kind):
@@ -91,23 +91,23 @@ class Turns:
 
     def _take(self, host: Address, kind: Hashable) -> bool:
         kind = self._taken_as.get(host, kind)  # as whose its other slots count
-        if self._taken[kind] >= self._together or self._slots.take(host):
+        if self._taken[kind] >= self._together or self.slots.take(host):
             return False
         self._taken[kind] += 1
         self._taken_as[host] = kind
         return True
 
     def _give_back(self, host: Address) -> None:
-        self._slots.give_back(host)
+        self.slots.give_back(host)
         kind = self._taken_as[host]
         self._taken[kind] -= 1
         if not self._taken[kind]:
             del self._taken[kind]
-        if not self._slots.held(host):
+        if not self.slots.held(host):
             del self._taken_as[host]
 
     def _give_up(self, kind: Hashable, host: Address, turn: asyncio.Future[None]) -> None:
-        hosts = self._waiting.get(kind, OrderedDict())
+        hosts = self.waiting.get(kind, OrderedDict())
         queue = hosts.get(host)
         if queue is None or turn not in queue:
             return
@@ -115,4 +115,4 @@ class Turns:
         if not queue:
             del hosts[host]
         if not hosts:
-            self._waiting.pop(kind, None)
+            self.waiting.pop(kind, None)

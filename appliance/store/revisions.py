@@ -58,7 +58,7 @@ class Trial:
         self._setting = setting
         self._go_back = go_back
         self._refusals = refusals
-        self._task: asyncio.Task[None] | None = None
+        self.task: asyncio.Task[None] | None = None
         self._back_to = 0  # the last revision that needed no confirmation
         self.confirm_by: float | None = None  # seconds since the epoch
 
@@ -76,9 +76,9 @@ class Trial:
 
     def end(self) -> None:
         """What is in force stays."""
-        if self._task is not None and self._task is not asyncio.current_task():
-            self._task.cancel()
-        self._task = self.confirm_by = None
+        if self.task is not None and self.task is not asyncio.current_task():
+            self.task.cancel()
+        self.task = self.confirm_by = None
         self._store.save_setting(self._setting, "")
 
     def resume(self) -> None:
@@ -97,7 +97,7 @@ class Trial:
     def _await(self, back_to: int, deadline: float) -> None:
         self._back_to, self.confirm_by = back_to, deadline
         self._save(back_to, deadline)
-        self._task = asyncio.get_running_loop().create_task(self._run(back_to, deadline))
+        self.task = asyncio.get_running_loop().create_task(self._run(back_to, deadline))
 
     async def _run(self, back_to: int, deadline: float) -> None:
         await asyncio.sleep(max(0.0, deadline - time.time()))

@@ -121,43 +121,43 @@ class StateStore:
     """Control's durable state, in `directory/state.db`. Raises `StoreError` when it cannot be opened."""
 
     def __init__(self, directory: Path, *, failed: Callable[[str], None]) -> None:
-        self._database = Database(directory / "state.db", _SCHEMA + hosts.SCHEMA, failed=failed)
-        self.hosts = hosts.HostTables(self._database)
+        self.database = Database(directory / "state.db", _SCHEMA + hosts.SCHEMA, failed=failed)
+        self.hosts = hosts.HostTables(self.database)
         self._parameter_changes = 0  # the number of the last one
 
     async def settled(self) -> None:
         """Wait until everything saved so far is in the file."""
-        await self._database.settled()
+        await self.database.settled()
 
     def close(self) -> None:
         """Write what is left and close."""
-        self._database.close()
+        self.database.close()
 
     # --- registry ---
 
     def save_incarnation(self, row: IncarnationRow) -> None:
         """Keep an incarnation, or its new `life`."""
-        self._database.put("incarnation", *row[:-1])
-        self._database.delete("relay_port", key=row.key)
+        self.database.put("incarnation", *row[:-1])
+        self.database.delete("relay_port", key=row.key)
         for relay, port in enumerate(row.more_relay_ports, start=1):
-            self._database.put("relay_port", row.key, relay, port)
+            self.database.put("relay_port", row.key, relay, port)
 
     def forget_incarnation(self, key: str) -> None:
         """Drop an incarnation and its registrations."""
         for table in ("incarnation", "relay_port", "registration", "permission"):
-            self._database.delete(table, key=key)
+            self.database.delete(table, key=key)
 
     def save_registration(self, row: RegistrationRow) -> None:
         """Keep a registration."""
-        self._database.put("registration", *row)
+        self.database.put("registration", *row)
 
     def remove_registration(self, key: str, kind: str, resource: str) -> None:
         """Drop a registration."""
-        self._database.delete("registration", key=key, kind=kind, resource=resource)
+        self.database.delete("registration", key=key, kind=kind, resource=resource)
 
     def load_registry(self) -> tuple[list[IncarnationRow], list[RegistrationRow]]:
         """Everything that is kept, registrations in order."""
-        query = self._database.query
+        query = self.database.query
         ports: dict[str, tuple[int, ...]] = {}
         for key, port in query("SELECT key, port FROM relay_port ORDER BY key, relay"):
             ports[key] = (*ports.get(key, ()), port)
@@ -173,23 +173,23 @@ class StateStore:
 
     def save_permission(self, row: PermissionRow) -> None:
         """Keep a grant."""
-        self._database.put("permission", *row)
+        self.database.put("permission", *row)
 
     def remove_permission(self, row: PermissionRow) -> None:
         """Drop a grant."""
-        self._database.delete("permission", **row._asdict())
+        self.database.delete("permission", **row._asdict())
 
     def permissions(self) -> list[PermissionRow]:
         """All grants that are kept."""
-        return [PermissionRow(*row) for row in self._database.query("SELECT * FROM permission")]
+        return [PermissionRow(*row) for row in self.database.query("SELECT * FROM permission")]
 
     # --- parameters ---
 
     def save_parameters(self, tree: dict[str, Any]) -> None:
         """Keep the whole parameter tree, in the place of the changes before it."""
-        self._database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
+        self.database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
         # Changes that stay though the tree has them (after a crash) are made once more, in order: the tree is the same.
-        self._database.submit(
+        self.database.submit(
             "DELETE FROM parameter_change WHERE number <= ?", (self._parameter_changes,), ahead=False
         )
 
@@ -202,34 +202,34 @@ class StateStore:
         if data is not None and len(data) > LARGEST_CHANGE:
             return
         self._parameter_changes += 1
-        self._database.put("parameter_change", self._parameter_changes, key, data)
+        self.database.put("parameter_change", self._parameter_changes, key, data)
 
     def parameter_changes(self) -> list[tuple[str, Any]]:
         """The changes since the tree was kept, in order; None for a parameter that is gone."""
         query = "SELECT number, key, value FROM parameter_change ORDER BY number"
-        rows = self._database.query(query)
+        rows = self.database.query(query)
         self._parameter_changes = rows[-1][0] if rows else 0
         return [(key, None if data is None else msgspec.msgpack.decode(data)) for _number, key, data in rows]
 
     def parameter_owned(self, key: str, host: str) -> None:
         """From this key on the parameters are this host's."""
-        self._database.put("parameter_owner", key, host)
+        self.database.put("parameter_owner", key, host)
 
     def parameters_disowned(self, key: str) -> None:
         """This key and those below it have no owner of their own any more."""
         above = key.rstrip("/")  # '0' follows '/'
-        self._database.submit(
+        self.database.submit(
             "DELETE FROM parameter_owner WHERE key = ? OR (key > ? AND key < ?)",
             (key, f"{above}/", f"{above}0"),
         )
 
     def parameter_owners(self) -> list[tuple[str, str]]:
         """The keys from which on parameters are another host's, and the host."""
-        return [(key, host) for key, host in self._database.query("SELECT key, host FROM parameter_owner")]
+        return [(key, host) for key, host in self.database.query("SELECT key, host FROM parameter_owner")]
 
     def load_parameters(self) -> dict[str, Any]:
         """The kept parameter tree; empty when there is none."""
-        rows = self._database.query("SELECT tree FROM parameters WHERE id = 1")
+        rows = self.database.query("SELECT tree FROM parameters WHERE id = 1")
         return msgspec.msgpack.decode(rows[0][0], type=dict[str, Any]) if rows else {}
 
     # --- revisions of the policy and of the specifications ---
@@ -237,12 +237,12 @@ class StateStore:
     def save_revision(self, row: RevisionRow) -> None:
         """Keep a policy that comes into force."""
         # First: a revision without its signature would be refused by a start in between.
-        self._database.put("policy_signature", row.revision, row.signature)
-        self._database.put("policy_revision", *row[:-1])
+        self.database.put("policy_signature", row.revision, row.signature)
+        self.database.put("policy_revision", *row[:-1])
 
     def revisions(self) -> list[RevisionRow]:
         """All kept revisions, the newest first."""
-        rows = self._database.query(
+        rows = self.database.query(
             "SELECT policy_revision.*, coalesce(signature, '') FROM policy_revision"
             " LEFT JOIN policy_signature USING (revision) ORDER BY revision DESC"
         )
@@ -250,38 +250,38 @@ class StateStore:
 
     def save_monitor_revision(self, row: MonitorRevisionRow) -> None:
         """Keep specifications that come into force."""
-        self._database.put("monitor_revision", *row)
+        self.database.put("monitor_revision", *row)
 
     def monitor_revisions(self) -> list[MonitorRevisionRow]:
         """All kept revisions of the specifications, the newest first."""
-        rows = self._database.query("SELECT * FROM monitor_revision ORDER BY revision DESC")
+        rows = self.database.query("SELECT * FROM monitor_revision ORDER BY revision DESC")
         return [MonitorRevisionRow(*row) for row in rows]
 
     def monitor_revision(self) -> MonitorRevisionRow | None:
         """The last that came into force; None when there never was one."""
-        rows = self._database.query("SELECT * FROM monitor_revision ORDER BY revision DESC LIMIT 1")
+        rows = self.database.query("SELECT * FROM monitor_revision ORDER BY revision DESC LIMIT 1")
         return MonitorRevisionRow(*rows[0]) if rows else None
 
     # --- tokens ---
 
     def save_token(self, row: TokenRow) -> None:
         """Keep a token, or that it is revoked."""
-        self._database.put("token", *row[:-1])
+        self.database.put("token", *row[:-1])
         if row.keys is not None:
-            self._database.put("token_keys", row.id, *row.keys)
+            self.database.put("token_keys", row.id, *row.keys)
 
     def tokens(self) -> list[TokenRow]:
         """All tokens that were ever made, the oldest first."""
-        kept = {token: TokenKeys(*keys) for token, *keys in self._database.query("SELECT * FROM token_keys")}
-        rows = self._database.query("SELECT * FROM token ORDER BY created")
+        kept = {token: TokenKeys(*keys) for token, *keys in self.database.query("SELECT * FROM token_keys")}
+        rows = self.database.query("SELECT * FROM token ORDER BY created")
         return [TokenRow._make((*row, kept.get(row[0]))) for row in rows]
 
     # --- settings ---
 
     def save_setting(self, name: str, value: str) -> None:
         """Keep a named value."""
-        self._database.put("setting", name, value)
+        self.database.put("setting", name, value)
 
     def settings(self) -> dict[str, str]:
         """All named values."""
-        return dict(self._database.query("SELECT name, value FROM setting"))
+        return dict(self.database.query("SELECT name, value FROM setting"))

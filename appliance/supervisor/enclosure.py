@@ -121,7 +121,7 @@ class Contained(Enclosure):
         self._ports = ports
         self._namespace = namespace or Namespace.own()
         self._backend = backend
-        self._firewall: Firewall | None = None
+        self.firewall: Firewall | None = None
         self._tunnels: tuple[str, Esp] | None = None  # the pool of their addresses
         self._own: str | None = None  # the appliance's address in the tunnels
         self._owed = False  # rules that are not in force yet, for the kernel refused them
@@ -158,8 +158,8 @@ class Contained(Enclosure):
         if self._namespace == Namespace.own():
             _require_own_network()
         try:
-            self._firewall = Firewall(self._namespace, self._backend)
-            chosen = self._firewall.install(self._settings())
+            self.firewall = Firewall(self._namespace, self._backend)
+            chosen = self.firewall.install(self._settings())
         except NetworkError as error:
             self.remove()
             raise StartError(str(error)) from error
@@ -172,13 +172,13 @@ class Contained(Enclosure):
 
     def remove(self) -> None:
         """Take every rule away again, and the address that the tunnels end at."""
-        if self._firewall is None:
+        if self.firewall is None:
             return
         with self._taking_away():
             try:
                 if self._own is not None:
                     self._end_tunnels(self._own)
-                self._firewall.remove()
+                self.firewall.remove()
             except NetworkError as error:
                 log.error("rules of the firewall may be left", error=str(error))
 
@@ -193,22 +193,22 @@ class Contained(Enclosure):
     def control_ready(self, inner_port: int, own_port: int) -> None:
         """Close them to everybody but rosmaster's user, and rosout's."""
         with self._standing():
-            if self._firewall is not None and (inner_port, own_port) != (self._ports.inner, self._ports.own):
+            if self.firewall is not None and (inner_port, own_port) != (self._ports.inner, self._ports.own):
                 self._ports = replace(self._ports, inner=inner_port, own=own_port)
                 self._owed = True
-                self._firewall.update(self._settings())
+                self.firewall.update(self._settings())
                 self._owed = False
 
     def open_tunnels(self, pool: str, address: str) -> Esp:
         """Close the pool to clear text first; only then it has a way in."""
         with self._standing():
-            if self._firewall is None:
+            if self.firewall is None:
                 raise NetworkError("the firewall is not in force")
             esp = choose_esp(self._namespace)
             before, self._tunnels = self._tunnels, (str(ipaddress.ip_network(pool)), esp)
             if self._tunnels != before:
                 try:
-                    self._firewall.update(self._settings())
+                    self.firewall.update(self._settings())
                 except NetworkError:
                     self._tunnels = before
                     raise
@@ -229,16 +229,16 @@ class Contained(Enclosure):
     def report(self) -> FirewallState:
         """Back end, rules with counters; rules that are gone are put back first."""
         with self._standing():
-            if self._firewall is None:
+            if self.firewall is None:
                 return FirewallState()
-            report = self._firewall.report()
+            report = self.firewall.report()
             if self._owed or not report.intact:
                 gone = [rule.purpose for rule in report.rules if not rule.in_force]
                 self._require_standing()
                 log.critical("rules of the firewall are not in force and are put back", rules=gone)
-                self._firewall.install(self._settings())
+                self.firewall.install(self._settings())
                 self._owed = False
-                report = self._firewall.report()
+                report = self.firewall.report()
         return FirewallState(report.backend, list(report.not_used), _shown(report.rules))
 
     def probe(self) -> str | None:

@@ -106,18 +106,18 @@ class Supervisor:
         connections wait for its next life. `rings` is the memory of the flight recorder; None: nothing is recorded.
         """
         self._facts = facts
-        self._posts = [Post(role, index) for role in roles for index in range(relays if role.indexed else 1)]
-        self._kept = KeptSockets()
-        self._kept.keep(ADMIN, admin.detach())
+        self.posts = [Post(role, index) for role in roles for index in range(relays if role.indexed else 1)]
+        self.kept = KeptSockets()
+        self.kept.keep(ADMIN, admin.detach())
         self._listeners = dict(listeners or {})
         self._rings = rings
         self._ready = ready
-        self._is_ready = False
+        self.is_ready = False
         self._guard = Guard(enclosure or Enclosure(), self._tell_control)
         self._reports = Reports(self._received, self._violated, self._died)
-        self._stopping = asyncio.Event()
+        self.stopping = asyncio.Event()
         self._someone_died = asyncio.Event()
-        self._failure: str | None = None
+        self.failure: str | None = None
         self._asking: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._unanswered = 0
@@ -136,18 +136,18 @@ class Supervisor:
         loop.add_signal_handler(signal.SIGHUP, lambda: self._tell_control(messages.PolicyReloadRequested()))
         with signals.heard():
             await self._serve()
-        if self._failure is not None:
-            raise StartError(self._failure)
+        if self.failure is not None:
+            raise StartError(self.failure)
 
     async def _serve(self) -> None:
         self._spawn(self._watch())
         try:
             await self._start()
             self._spawn(self._guard.run())
-            await self._stopping.wait()
+            await self.stopping.wait()
         finally:
             await self._end()
-            self._kept.close()
+            self.kept.close()
             for listener in self._listeners.values():
                 listener.close()
             if self._rings is not None:
@@ -155,44 +155,45 @@ class Supervisor:
 
     def stop(self, failure: str | None = None) -> None:
         """End the appliance; `failure` is why it cannot go on, nothing for an orderly end."""
-        if not self._stopping.is_set():
-            self._failure = failure
-            self._stopping.set()
+        if not self.stopping.is_set():
+            self.failure = failure
+            self.stopping.set()
 
     # --- starting -----------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
-        for post in self._posts:
-            if post.role.after is None and not post.role.on_demand and not self._stopping.is_set():
-                self._fill(post)
+        for post in self.posts:
+            if post.role.after is None and not post.role.on_demand and not self.stopping.is_set():
+                self.fill(post)
                 if post.role.asks:
-                    await self._until_answering(post)
+                    await self.until_answering(post)
                     reason = await self._guard.look()
                     if reason is not None:
                         self.stop(reason)
-        self._spawn(self._until_ready())
+        self._spawn(self.until_ready())
 
-    async def _until_answering(self, post: Post) -> None:
+    async def until_answering(self, post: Post) -> None:
+        """Wait until the process at this post answers over HTTP, in whichever of its lives."""
         began = time.monotonic()
-        while self._gets_on(began, [post]) and not self._stopping.is_set():
+        while self._gets_on(began, [post]) and not self.stopping.is_set():
             life = post.life
-            if life is not None and await self._answers(1.0) and post.life is life:
+            if life is not None and await self.answers(1.0) and post.life is life:
                 life.heard()
                 return
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._stopping.wait(), 0.05)
+                await asyncio.wait_for(self.stopping.wait(), 0.05)
         self.stop(f"rosmaster does not answer on 127.0.0.1:{self._facts.rosmaster_port}; the log may say why")
 
-    async def _until_ready(self) -> None:
+    async def until_ready(self) -> None:
         """Say what the start waits for, and give it up when nothing gets on any more."""
         began = time.monotonic()
-        while not self._is_ready and not self._stopping.is_set():
+        while not self.is_ready and not self.stopping.is_set():
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._stopping.wait(), _LOOK_SECONDS)
-            late = [post for post in self._posts if post.is_late]
+                await asyncio.wait_for(self.stopping.wait(), _LOOK_SECONDS)
+            late = [post for post in self.posts if post.is_late]
             words = ", ".join(post.role.name for post in late) or "the firewall around control's ports"
             waited = round(time.monotonic() - began)
-            if self._is_ready or self._stopping.is_set():
+            if self.is_ready or self.stopping.is_set():
                 return
             if not self._gets_on(began, late):
                 self.stop(
@@ -209,9 +210,10 @@ class Supervisor:
         still = min((post.life.still_seconds for post in posts if post.life is not None), default=0.0)
         return waited < LONGEST_START_SECONDS and still < FIRST_ANSWER_SECONDS
 
-    def _fill(self, post: Post) -> None:
+    def fill(self, post: Post) -> None:
+        """Start a process at this post; one that cannot be made is tried again, ever later."""
         post.due = None
-        if self._stopping.is_set():
+        if self.stopping.is_set():
             return
         here, there = socket.socketpair()
         try:
@@ -240,14 +242,14 @@ class Supervisor:
         self._tell_processes()
 
     def _equip_control(self, life: Life) -> None:
-        for name, descriptor in self._kept:
+        for name, descriptor in self.kept:
             life.send(messages.SocketRestored(name), (descriptor,))
-        life.send(messages.SocketsRestored(len(self._kept), self._is_ready))
+        life.send(messages.SocketsRestored(len(self.kept), self.is_ready))
         for message in (*self._guard.news(), self._clock):
             life.send(message)
 
     def _link(self, post: Post) -> None:
-        for other in self._posts:
+        for other in self.posts:
             if other.role.name in post.role.links and post.life is not None and other.life is not None:
                 link(post.life, other.life)
 
@@ -270,7 +272,7 @@ class Supervisor:
             case messages.Failed(said):
                 self._cannot_serve(life, _printable(said))
             case _:
-                self._control_said(life, message, descriptors)
+                self.control_said(life, message, descriptors)
 
     def _walled(self, life: Life, walls: messages.Walled) -> None:
         """What it is enclosed in, by its own first word: what it says later is not believed."""
@@ -286,20 +288,21 @@ class Supervisor:
 
     def _cannot_serve(self, life: Life, reason: str) -> None:
         """Before nodes may connect, it is for the person who starts the appliance; later the next life may succeed."""
-        post = next(one for one in self._posts if one.life is life)
-        if self._is_ready or post.role.dispensable:
+        post = next(one for one in self.posts if one.life is life)
+        if self.is_ready or post.role.dispensable:
             log.error("process cannot serve", role=life.role, reason=reason)
             life.kill()
         else:
             self.stop(reason)  # which says it, as the last line
 
-    def _control_said(self, life: Life, message: messages.Message, descriptors: tuple[int, ...]) -> None:
+    def control_said(self, life: Life, message: messages.Message, descriptors: tuple[int, ...]) -> None:
+        """Carry out one message of control."""
         match message:
             case messages.SocketKept(name):
                 self._keep(life, name, descriptors[0])
             case messages.SocketDropped(name):
                 if name != ADMIN:
-                    self._kept.drop(name)
+                    self.kept.drop(name)
             case messages.RouteWanted(host):
                 self._answer(life, self._route(life, host))
             case messages.EndpointWanted():
@@ -317,8 +320,8 @@ class Supervisor:
 
         Where the kernel does not know who (-1), or names a process that is none of ours, all readers are ended.
         """
-        ours = {post.life.pid for post in self._posts if post.life is not None}
-        for post in self._posts:
+        ours = {post.life.pid for post in self.posts if post.life is not None}
+        for post in self.posts:
             if _READERS not in {post.role.user, post.role.group} or post.life is None:
                 continue
             if post.life.pid in processes or not ours.issuperset(processes):
@@ -332,7 +335,7 @@ class Supervisor:
             self._violated(life, "sent a socket under the name of the admin socket")
             return
         try:
-            self._kept.keep(name, descriptor)
+            self.kept.keep(name, descriptor)
         except RefusedSocketError as error:
             log.error("socket is not kept, a restart of control would lose it", reason=str(error))
 
@@ -350,24 +353,25 @@ class Supervisor:
             self._violated(life, f"said it is ready, but not where: {error}")
             return
         self._facts = replace(self._facts, rosout_master=said.rosout_master)
-        self._spawn(self._control_ready(life, said))
+        self._spawn(self.control_ready(life, said))
 
-    async def _control_ready(self, life: Life, said: ControlReady) -> None:
+    async def control_ready(self, life: Life, said: ControlReady) -> None:
+        """Control serves: close off its inner ports, and announce it to whoever started the appliance."""
         reason = await self._guard.control_ready(said.inner_port, said.own_port)
-        if reason is not None and not self._is_ready:
+        if reason is not None and not self.is_ready:
             self.stop(reason)
-        if self._stopping.is_set() or not life.alive:
+        if self.stopping.is_set() or not life.alive:
             return
-        for post in self._posts:
+        for post in self.posts:
             if post.role.after == life.role and post.is_vacant:
-                self._fill(post)
-        if not self._is_ready:
+                self.fill(post)
+        if not self.is_ready:
             try:
                 self._ready(said)
             except StartError as error:
                 self.stop(str(error))
                 return
-            self._is_ready = True
+            self.is_ready = True
             life.send(messages.Announced())
 
     def _answer(self, life: Life, work: Coroutine[Any, Any, None]) -> None:
@@ -395,9 +399,9 @@ class Supervisor:
             return
         answer = await self._guard.open_tunnels(pool, address)
         if answer.esp is not None:
-            for post in self._posts:
+            for post in self.posts:
                 if post.role.on_demand and post.is_vacant:
-                    self._fill(post)
+                    self.fill(post)
         life.send(answer)
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
@@ -423,7 +427,7 @@ class Supervisor:
             await asyncio.sleep(1.0)
             now = time.monotonic()
             slept, before = now - before - 1.0, now
-            for post in self._posts:
+            for post in self.posts:
                 if post.life is not None:
                     self._look_at(post, post.life, slept)
             clock = messages.ClockRead(clock_is_synchronised())
@@ -449,54 +453,55 @@ class Supervisor:
             self._asking = self._spawn(self._listen_to(life))
 
     async def _listen_to(self, life: Life) -> None:
-        if await self._answers(2 * ANSWER_SECONDS):
+        if await self.answers(2 * ANSWER_SECONDS):
             life.heard()
 
-    async def _answers(self, seconds: float) -> bool:
+    async def answers(self, seconds: float) -> bool:
+        """Whether ROSMaster answers within so many seconds."""
         inside = self._guard.enclosure.inside()
         return await health.answers(self._facts.rosmaster_port, account_of("rosrv"), inside, seconds)
 
     def _died(self, life: Life, code: int) -> None:
-        post = next(one for one in self._posts if one.life is life)
+        post = next(one for one in self.posts if one.life is life)
         lived = post.bury(life)
         self._someone_died.set()
-        if self._stopping.is_set():
+        if self.stopping.is_set():
             return
         log.error("process died", role=life.role, pid=life.pid, end=_end_of(code), lived=round(lived, 3))
         self._tell_processes()
         if post.keeps_dying:
-            if not self._is_ready:
+            if not self.is_ready:
                 self.stop(f"{life.role} died {post.short_lives} times ({_end_of(code)}); the log says why")
                 return
             log.critical("process keeps dying", role=life.role, times=post.short_lives)
         self._fill_later(post)
 
     def _fill_later(self, post: Post) -> None:
-        post.due = asyncio.get_running_loop().call_later(post.delay(), self._fill, post)
+        post.due = asyncio.get_running_loop().call_later(post.delay(), self.fill, post)
 
     def _tell_processes(self) -> None:
         rows = [
             messages.ProcessInfo(
                 post.role.name, life.pid, life.since, post.lives - 1, *life.enclosed, life.congestion
             )
-            for post in self._posts
+            for post in self.posts
             if (life := post.life) is not None
         ]
         own = messages.ProcessInfo("supervisor", os.getpid(), self._since, 0)
         self._tell_control(messages.ProcessesChanged([own, *rows]))
 
     def _tell_control(self, message: messages.Message) -> None:
-        for post in self._posts:
+        for post in self.posts:
             if post.role.name == "control" and post.life is not None:
                 post.life.send(message)
 
     # --- ending -------------------------------------------------------------------------------------------
 
     async def _end(self) -> None:
-        self._stopping.set()
+        self.stopping.set()
         for task in self._tasks:
             task.cancel()
-        await end_all(self._posts, self._someone_died)
+        await end_all(self.posts, self._someone_died)
 
 
 def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:

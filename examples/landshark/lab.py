@@ -77,16 +77,16 @@ class Lab:
             raise ValueError(f"{prefix!r} is no lab prefix: small letters, digits and - only")
         self.prefix = prefix
         self._mark = f"{prefix}.{os.getpid()}.{next(self._numbers)}"
-        self._switch = Namespace(f"{self._mark}.switch")
+        self.switch = Namespace(f"{self._mark}.switch")
         self.hosts: dict[str, Host] = {}
 
     def __enter__(self) -> Self:
         require_privileges("a lab of network namespaces")
         clear_leftovers(self.prefix)
         try:
-            self._switch.create()
-            links.set_link(self._switch, "lo", up=True)
-            links.create_bridge(self._switch, _BRIDGE)
+            self.switch.create()
+            links.set_link(self.switch, "lo", up=True)
+            links.create_bridge(self.switch, _BRIDGE)
         except BaseException:
             self.close()
             raise
@@ -107,8 +107,8 @@ class Lab:
         port = f"port{len(self.hosts)}"
         self.hosts[name] = host = Host(name, namespace, port, addresses)
         links.set_link(namespace, "lo", up=True)
-        links.create_veth(namespace, INTERFACE, self._switch, port)
-        links.attach(self._switch, port, _BRIDGE)
+        links.create_veth(namespace, INTERFACE, self.switch, port)
+        links.attach(self.switch, port, _BRIDGE)
         for address in addresses:
             links.add_address(namespace, INTERFACE, address)
         if gateway is not None:
@@ -117,15 +117,15 @@ class Lab:
 
     def unplug(self, host: Host) -> None:
         """Take the host's cable out: packets are lost from now on."""
-        links.set_link(self._switch, host.port, up=False)
+        links.set_link(self.switch, host.port, up=False)
 
     def plug(self, host: Host) -> None:
         """Put the host's cable back in."""
-        links.set_link(self._switch, host.port, up=True)
+        links.set_link(self.switch, host.port, up=True)
 
     def close(self) -> None:
         """End every process in the lab and delete it; closing twice is fine."""
-        _clear([*(host.namespace for host in self.hosts.values()), self._switch])
+        _clear([*(host.namespace for host in self.hosts.values()), self.switch])
         self.hosts.clear()
 
 

@@ -298,7 +298,7 @@ class ControlParts:
             self.registry, self.grants, self.graph, lambda: self.current, lambda: self.parameters.tree
         )
         self.rosmaster = RosMaster(1, limits=Limits(), hold=1.0)
-        self.rosmaster._calls = cast(Any, self.hidden)
+        self.rosmaster.calls = cast(Any, self.hidden)
         self.entries = Entries(self.rosmaster, self.faces.inner_uri)
         self.enactor = Noted(
             self.graph,
@@ -406,11 +406,11 @@ class ControlParts:
 
     async def round(self) -> None:
         """One round of the reconcile loop."""
-        await self.reconciler._round()
+        await self.reconciler.round()
 
     async def look(self, node: Incarnation) -> None:
         """Look at a node now, to the end of what follows from it."""
-        await self.liveness._look(node)
+        await self.liveness.look(node)
         await self.settle()
 
     async def settle(self) -> None:

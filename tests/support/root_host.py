@@ -18,7 +18,7 @@ _PORT = "port-root"
 def root_host(lab: Lab, address: str) -> Iterator[Host]:
     """The machine, connected to the lab under an address such as `10.77.0.2/24`, until the block ends."""
     own = Namespace.own()
-    switch = lab._switch  # the lab gives its hosts away, not what they are plugged into
+    switch = lab.switch
     links.create_veth(own, INTERFACE, switch, _PORT)
     try:
         links.attach(switch, _PORT, "br0")

@@ -45,7 +45,7 @@ def running(appliance: Appliance) -> Iterator[Found]:
     yield from told("processes", lambda: _processes(status.processes))
     yield from told("audit log", lambda: _audit(appliance))
     master = _reachable(appliance, status.master)
-    yield from told("RVMaster", lambda: _call(appliance, master))
+    yield from told("RVMaster", lambda: check_call(appliance, master))
     yield from told("relay", lambda: _message(master))
 
 
@@ -95,7 +95,7 @@ def _reachable(appliance: Appliance, master: str) -> str:
     return urlunsplit((parts.scheme, f"{shown}:{parts.port}", "", "", ""))
 
 
-def _call(appliance: Appliance, master: str) -> Iterator[Found]:
+def check_call(appliance: Appliance, master: str) -> Iterator[Found]:
     """A call as any tool makes it: it must be answered, and be in the audit log."""
     before = _last(appliance)
     caller = f"{_CALLER}_{secrets.token_hex(4)}"

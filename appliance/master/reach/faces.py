@@ -39,7 +39,7 @@ class Faces:
         troubled: Callable[[Peer, str], None],
     ) -> None:
         self._registry = registry
-        self._places = places
+        self.places = places
         self._inner_port = inner_port
         self._serve = serve
         self._limits = limits
@@ -47,7 +47,7 @@ class Faces:
         self._turns = turns
         self._refuse = refuse
         self._troubled = troubled
-        self._servers: dict[str, HttpServer] = {}
+        self.servers: dict[str, HttpServer] = {}
 
     def inner_uri(self, incarnation: Incarnation) -> str:
         """What ROSMaster knows the incarnation by."""
@@ -64,7 +64,7 @@ class Faces:
     async def open(self, incarnation: Incarnation) -> None:
         """Serve the outer face."""
         server = HttpServer(
-            self._places.socket(incarnation.outer_port).dup(),
+            self.places.socket(incarnation.outer_port).dup(),
             self._serve(incarnation),
             limits=self._limits,
             visitors=self._visitors,
@@ -72,7 +72,7 @@ class Faces:
             refuse=self._refuse,
             troubled=self._troubled,
         )
-        self._servers[incarnation.key] = server
+        self.servers[incarnation.key] = server
         await server.start()
 
     async def reopen(self, incarnation: Incarnation) -> list[Durable]:
@@ -81,21 +81,21 @@ class Faces:
         Raises `NoPortError` when a port is taken.
         """
         ports = incarnation.ports
-        if not self._places.reopen(incarnation):
+        if not self.places.reopen(incarnation):
             raise NoPortError(f"a port of {incarnation.name} is in use by another program")
         await self.open(incarnation)
         return [SaveNode(incarnation)] if incarnation.ports != ports else []
 
     def close(self, incarnation: Incarnation) -> None:
         """Close the outer face and all its ports, once: afterwards the ports may be another incarnation's."""
-        server = self._servers.pop(incarnation.key, None)
+        server = self.servers.pop(incarnation.key, None)
         if server is not None:
             server.close()
-            self._places.close(incarnation)
+            self.places.close(incarnation)
 
     def close_all(self) -> None:
         """Stop serving; the ports stay open for the next control."""
-        for server in self._servers.values():
+        for server in self.servers.values():
             server.close()
 
 

@@ -55,7 +55,7 @@ class Places:
         self._keep = keep
         self._drop = drop
         self._range = ports
-        self._unused = deque(ports)
+        self.unused = deque(ports)
         self._sockets: dict[str, sockets.socket] = {}
         self._named_as = named_as
         self._owners: dict[int, tuple[Address, Network]] = {}  # of each port, and as whose it counts
@@ -66,7 +66,7 @@ class Places:
         if ports != self._range:
             self._range = ports
             used = {socket.getsockname()[1] for socket in self._sockets.values()}
-            self._unused = deque(port for port in ports if port not in used)
+            self.unused = deque(port for port in ports if port not in used)
         self.taken = self._counted()
 
     def _counted(self) -> Pool[Network]:
@@ -90,7 +90,7 @@ class Places:
         Raises `NoPortError`.
         """
         named = self._named_as(host)
-        held, left = self.taken.held(named), len(self._unused)
+        held, left = self.taken.held(named), len(self.unused)
         if left and held >= _TIMES_THE_REST * left:
             who = named if named.num_addresses > 1 else host
             raise NoPortError(
@@ -105,10 +105,10 @@ class Places:
         opened: list[sockets.socket] = []
         try:
             while len(opened) < count:
-                opened.append(self._listen())
+                opened.append(self.listen())
         except NoPortError:
             for sock in opened:
-                self._unused.append(sock.getsockname()[1])
+                self.unused.append(sock.getsockname()[1])
                 sock.close()
             raise
         for sock in opened:
@@ -125,8 +125,8 @@ class Places:
         """Take a kept socket back after a restart of control."""
         self._sockets[name] = sock
         port = sock.getsockname()[1]
-        if port in self._unused:
-            self._unused.remove(port)
+        if port in self.unused:
+            self.unused.remove(port)
 
     def reopen(self, incarnation: Incarnation) -> bool:
         """Open the same ports again (after a restart of the appliance); False when another process has one.
@@ -165,7 +165,7 @@ class Places:
             sock.close()
             self._drop(f"port:{port}")
             if port in self._range:
-                self._unused.append(port)
+                self.unused.append(port)
 
     def close_unclaimed(self, claimed: set[int]) -> None:
         """Close kept sockets that belong to no known incarnation; the next to be opened come after those claimed."""
@@ -176,13 +176,14 @@ class Places:
                 sock.close()
                 self._drop(name)
                 if port in self._range:  # it may be from before the range was another
-                    self._unused.append(port)
+                    self.unused.append(port)
         last = max(claimed, default=0)
-        self._unused = deque(sorted(self._unused, key=lambda port: (port <= last, port)))
+        self.unused = deque(sorted(self.unused, key=lambda port: (port <= last, port)))
 
-    def _listen(self) -> sockets.socket:
-        for _ in range(len(self._unused)):
-            port = self._unused.popleft()
+    def listen(self) -> sockets.socket:
+        """A socket that listens at the next port that is free."""
+        for _ in range(len(self.unused)):
+            port = self.unused.popleft()
             try:
                 return listen(self._host, port)
             except OSError as error:
@@ -190,7 +191,7 @@ class Places:
                     raise NoPortError(
                         f"port {port} on {self._host} cannot be opened: {error.strerror}"
                     ) from error
-                self._unused.append(port)  # another program has it for now
+                self.unused.append(port)  # another program has it for now
         raise NoPortError(
             f"all ports {self._range.start}-{self._range.stop - 1} are in use"
             f" ({self._each} per node); widen [Ports] range"
@@ -219,7 +220,7 @@ class Addresses:
         listen: str,
     ) -> None:
         address = plain_address(listen)
-        self._listen = None if address.is_unspecified else str(address)
+        self.listen = None if address.is_unspecified else str(address)
         self._advertised = advertised
         self._route_to = route_to
         self._routes: dict[Address, str | None] = {}
@@ -230,7 +231,7 @@ class Addresses:
             if peer.host in network:
                 return str(address)
         # The appliance's own nodes come to a listener of their own, on loopback, where nothing else may be.
-        return self._routes.get(peer.host) or self._listen or peer.local
+        return self._routes.get(peer.host) or self.listen or peer.local
 
     async def learn(self, peer: Peer) -> None:
         """Find out how this peer reaches us, once; to be awaited before `told_to`."""

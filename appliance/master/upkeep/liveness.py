@@ -185,7 +185,7 @@ class Liveness:
         call it.
         """
         if incarnation.key not in self._looks and not incarnation.of_monitors:
-            task = asyncio.get_running_loop().create_task(self._look(incarnation))
+            task = asyncio.get_running_loop().create_task(self.look(incarnation))
             self._looks[incarnation.key] = task
             task.add_done_callback(lambda _done: self._looks.pop(incarnation.key, None))
 
@@ -217,7 +217,8 @@ class Liveness:
         self._enactor.carry_out(self._revocation.returned(incarnation))
         await self._enactor.put_back(incarnation, registrations)
 
-    async def _look(self, incarnation: Incarnation) -> None:
+    async def look(self, incarnation: Incarnation) -> None:
+        """Ask a node whether it is there, and carry out what follows from its answer."""
         await self._turns.enter(incarnation.host)
         try:
             there, why = await self._ask(incarnation)

@@ -75,7 +75,7 @@ class Reconciler:
         while True:
             self._rosmaster.doubtful.clear()
             try:
-                await self._round()
+                await self.round()
             except CallFailedError as error:
                 self._rosmaster.shut()
                 _log.warning("the ROS Master is away", error=str(error))
@@ -88,7 +88,8 @@ class Reconciler:
             except TimeoutError:
                 pass
 
-    async def _round(self) -> None:
+    async def round(self) -> None:
+        """Compare what ROSMaster has with what the registry has, once, and settle every difference."""
         async with self._rosmaster.alone():
             pid = (await self._rosmaster.call_now("getPid", NAME))[2]
             if pid == self._entries.pid:

@@ -26,17 +26,17 @@ class Reminders:
         self._relay = relay
         self._graph = graph
         self._enactor = enactor
-        self._round: asyncio.Task[None] | None = None
+        self.round: asyncio.Task[None] | None = None
 
     def begin(self) -> None:
         """A relay is new."""
         self.close()
-        self._round = asyncio.get_running_loop().create_task(self._remind())
+        self.round = asyncio.get_running_loop().create_task(self._remind())
 
     def close(self) -> None:
         """Stop looking."""
-        if self._round is not None:
-            self._round.cancel()
+        if self.round is not None:
+            self.round.cancel()
 
     async def _remind(self) -> None:
         for number, pause in enumerate(_PAUSES):

@@ -84,7 +84,7 @@ class ServiceClient:
         self.host = host
         self.caller_id = caller_id
         self._context = context
-        self._fields = fields
+        self.fields = fields
         self._traffic = traffic
         self._refuse = refuse
         self._ended = ended
@@ -165,7 +165,7 @@ class ServiceClient:
 
     def _connected(self) -> None:
         self._patience(self._context.limits.service_seconds)
-        self._to_service(encode_header(to_service(self._fields, self.caller_id)))
+        self._to_service(encode_header(to_service(self.fields, self.caller_id)))
 
     def _server_received(self, data: bytes) -> None:
         if not data:

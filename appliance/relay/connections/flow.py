@@ -79,15 +79,15 @@ class Flows:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._flows: WeakValueDictionary[tuple[str, ...], Flow] = WeakValueDictionary()
+        self.flows: WeakValueDictionary[tuple[str, ...], Flow] = WeakValueDictionary()
 
     def of(self, limit: FlowLimit, *names: str) -> Flow | None:
         """The flow of these names under this limit from now on; None where there is none to keep."""
-        flow = self._flows.get(names)
+        flow = self.flows.get(names)
         if flow is not None:
             flow.set(limit, self._clock())
         elif limit != UNLIMITED:
-            flow = self._flows[names] = Flow(limit, self._clock())
+            flow = self.flows[names] = Flow(limit, self._clock())
         return flow
 
 

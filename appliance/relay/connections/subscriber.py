@@ -48,7 +48,7 @@ class Subscriber:
         self._loop = context.loop
         self._socket = sock
         self._send = sock.send
-        self._fields = fields
+        self.fields = fields
         self._reporter = context.reporter
         self._refuse = refuse
         self._ended = ended
@@ -61,7 +61,7 @@ class Subscriber:
 
     def greet(self, header: Mapping[str, str]) -> bool:
         """Answer with the publisher's header, or with an error header where type and md5sum do not fit."""
-        mismatch = describe_mismatch(self._fields, header)
+        mismatch = describe_mismatch(self.fields, header)
         if mismatch:
             self._live = False
             self._loop.unwatch(self._socket.fileno())

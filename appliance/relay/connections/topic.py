@@ -151,7 +151,7 @@ class RelayedTopic:
         self._first_words: FirstWords | None = None
         self._paused = False
         self._connected = False
-        self._through: Through | None = None
+        self.through: Through | None = None
         self._looks: tuple[Callable[[Batch], None], ...] = ()
         self._wanted = False
         self._reported = True
@@ -207,7 +207,7 @@ class RelayedTopic:
 
     def monitor(self, through: Through | None, *, wanted: bool) -> None:
         """From the next batch on messages go `through` monitors (None: past them), who want them or do not."""
-        self._through = through
+        self.through = through
         if wanted == self._wanted:
             return
         self._wanted = wanted
@@ -270,7 +270,7 @@ class RelayedTopic:
             self._pass(batch, since)
             return
         # Recorded when subscribers have it, so that nothing is later; monitors may change it in place meanwhile.
-        view = batch.view if self._through is None else memoryview(bytes(batch.view))
+        view = batch.view if self.through is None else memoryview(bytes(batch.view))
         messages, first = batch.messages, batch.first
         self._pass(batch, since)
         if recording is self._recording:
@@ -285,7 +285,7 @@ class RelayedTopic:
             self._admit(passing, since)
 
     def _admit(self, batch: Batch, since: float) -> None:
-        left = batch if self._through is None else self._through(batch)
+        left = batch if self.through is None else self.through(batch)
         if left is None:
             self._withheld = True
         else:

@@ -51,7 +51,7 @@ class Publisher:
         self._received = self._receiver.received
         self._wanted = False
         self._asked = False
-        self._failures = 0
+        self.failures = 0
         self._flowing = 0.0  # since when
         self._timer: Timer | None = None
         self._linger: Timer | None = None
@@ -207,7 +207,7 @@ class Publisher:
             if reason:
                 self._object(reason)
         elif self._objected and self._timer is not None and not self._asked and self._stream is None:
-            self._failures = 0
+            self.failures = 0
             self.ask()
 
     def _object(self, reason: str) -> None:
@@ -271,8 +271,8 @@ class Publisher:
     def _retry(self) -> None:
         self._set_timer(0, None)
         if self._wanted:
-            wait = min(self._limits.retry_first * 2.0**self._failures, self._limits.retry_longest)
-            self._failures = min(self._failures + 1, 32)
+            wait = min(self._limits.retry_first * 2.0**self.failures, self._limits.retry_longest)
+            self.failures = min(self.failures + 1, 32)
             self._set_timer(wait, self.ask)
 
     def _close_unwanted(self) -> None:
@@ -291,7 +291,7 @@ class Publisher:
             self._pause = None
         if self._socket is not None:
             if self._clock() - self._flowing > self._limits.retry_longest:
-                self._failures = 0
+                self.failures = 0
             self._loop.discard(self._socket)
             self._socket = None
             self._weight.set(0)

@@ -41,7 +41,7 @@ class Compiler:
 
     def now(self, message: SpecificationsStated) -> None:
         """Compile at once."""
-        self._done(message, self._compile(message))
+        self._done(message, self.compile(message))
 
     def later(self, message: SpecificationsStated) -> None:
         """Compile while the loop goes on."""
@@ -72,7 +72,7 @@ class Compiler:
         self._thread.start()
 
     def _work(self, message: SpecificationsStated, wake: int) -> None:
-        self._result = self._compile(message)
+        self._result = self.compile(message)
         os.eventfd_write(wake, 1)
 
     def _ready(self, _events: int) -> None:
@@ -85,7 +85,8 @@ class Compiler:
         if self._waiting and self._thread is None:  # `done` may have brought others, and begun
             self._begin()
 
-    def _compile(self, message: SpecificationsStated) -> Result:
+    def compile(self, message: SpecificationsStated) -> Result:
+        """The set that these specifications make, or what is wrong with them."""
         try:
             if not message.files:
                 return MonitorSet.load({}, Definitions({}), message.on_fault, _patience)

@@ -75,7 +75,7 @@ class Middle:
         self.sight = object()
         self._timer: Timer | None = None
         self._due: int | None = None
-        self._compiler = Compiler(loop, self._compiled)
+        self._compiler = Compiler(loop, self.compiled)
         self.observations = Observations(loop, reporter, self._rows)
         self._changed = changed
         self.telling = Telling(self.observations, publish)
@@ -98,7 +98,8 @@ class Middle:
             self._awaited = message
         self._compiler.later(message)
 
-    def _compiled(self, message: SpecificationsStated, result: Result) -> None:
+    def compiled(self, message: SpecificationsStated, result: Result) -> None:
+        """Put a set that was compiled into force, or refuse it, and tell control."""
         if message is self._awaited:
             self._awaited = None
         self.look_again()

@@ -131,12 +131,12 @@ class Observations:
         self._last.clear()
         self._shared.clear()
         self._distinct.clear()
-        self._tell_counters()
+        self.tell_counters()
 
     def repeat(self) -> None:
         """There is a new control: it is told everything that waits, and all counters."""
         self._counted = []
-        self._flush()
+        self.flush()
 
     def _count_of(self, key: _Key, count: int) -> MonitorEvent:
         kind, monitor, owner, resource, host, distinction = key
@@ -178,17 +178,19 @@ class Observations:
             return
         self._waiting.append(event)
         if self._timer is None:
-            self._timer = self._loop.after(_FLUSH_SECONDS, self._flush)
+            self._timer = self._loop.after(_FLUSH_SECONDS, self.flush)
 
-    def _flush(self) -> None:
+    def flush(self) -> None:
+        """Send what waits to control, and the counters after it."""
         self._timer = None
         while self._reporter.attached and self._waiting:
             events = [self._waiting.popleft() for _ in range(min(_AT_ONCE, len(self._waiting)))]
             self._reporter.send(MonitorsReported(events, self._lost))
             self._lost = 0
-        self._tell_counters()  # who reads of a drop finds it counted
+        self.tell_counters()  # who reads of a drop finds it counted
 
-    def _tell_counters(self) -> None:
+    def tell_counters(self) -> None:
+        """Send the counters that have changed."""
         if not self._reporter.attached:
             return
         rows = list(self._rows())

@@ -47,7 +47,7 @@ class Trials:
         self._now = now
         self._telling = telling
         self._monitors: MonitorSet | None = None
-        self._waiting: deque[_Waiting] = deque()
+        self.waiting: deque[_Waiting] = deque()
         self._bytes = 0
         self._spent = 0.0
         self._foreign: set[str] = set()
@@ -59,9 +59,9 @@ class Trials:
     def settle(self) -> frozenset[str]:
         """Give what waits, as others take over; those that are incomplete."""
         self._turn(_LAST_SLICE)
-        for waiting in self._waiting:
+        for waiting in self.waiting:
             self._miss(waiting.tapped.trial, waiting.place, _TOO_SLOW)
-        self._waiting.clear()
+        self.waiting.clear()
         self._bytes = 0
         return self._telling.incomplete
 
@@ -88,17 +88,17 @@ class Trials:
     def wait(self, place: Place, sighting: Sighting | None) -> None:
         """A message is on its way and was copied: it is given when it has gone on."""
         assert self._monitors is not None  # noqa: S101  they have copied it
-        idle = not self._waiting
+        idle = not self.waiting
         for tapped in self._monitors.tapped:
             if tapped.resource in self._foreign:
                 continue
-            if len(self._waiting) >= _MOST_WAITING or self._bytes + len(tapped.data) > _MOST_BYTES:
+            if len(self.waiting) >= _MOST_WAITING or self._bytes + len(tapped.data) > _MOST_BYTES:
                 self._miss(tapped.trial, place, _TOO_MANY, sighting)
                 continue
-            self._waiting.append(_Waiting(tapped, place, sighting))
+            self.waiting.append(_Waiting(tapped, place, sighting))
             self._bytes += len(tapped.data)
         self._monitors.tapped.clear()
-        if idle and self._waiting:
+        if idle and self.waiting:
             self.schedule()
 
     def tick(self) -> None:
@@ -119,25 +119,26 @@ class Trials:
             self._timer.cancel()
             self._timer = None
         due = min((trial.next_due for trial in self._awake() if trial.next_due is not None), default=None)
-        if self._waiting:
-            self._timer = self._loop.after(0, self._have_turn)
+        if self.waiting:
+            self._timer = self._loop.after(0, self.have_turn)
         elif due is not None:
-            self._timer = self._loop.after(max(0, due - self._now()) / 1e9, self._have_turn)
+            self._timer = self._loop.after(max(0, due - self._now()) / 1e9, self.have_turn)
 
     def _awake(self) -> list[MonitorSet]:
         """Those that may have a turn in this second."""
         trials = self._monitors.trials if self._monitors is not None and self._spent <= SHARE else ()
         return [trial for trial in trials if trial not in self._resting]
 
-    def _have_turn(self) -> None:
+    def have_turn(self) -> None:
+        """Give what waits to the specifications on trial, for one slice of time."""
         self._timer = None
         self._turn(_SLICE)
         self.schedule()
 
     def _turn(self, longest: float) -> None:
         began = last = time.thread_time()
-        while self._waiting and last - began < longest:
-            waiting = self._waiting.popleft()
+        while self.waiting and last - began < longest:
+            waiting = self.waiting.popleft()
             self._bytes -= len(waiting.tapped.data)
             if self._spent > SHARE or waiting.tapped.trial in self._resting:
                 self._miss(waiting.tapped.trial, waiting.place, _TOO_SLOW, waiting.sighting)
@@ -146,7 +147,7 @@ class Trials:
             now = time.thread_time()
             self._spent += now - last
             last = now
-        if not self._waiting:
+        if not self.waiting:
             self._advance()
             self._spent += time.thread_time() - last
 

@@ -89,7 +89,7 @@ def test_rules_that_were_refused_are_owed(
 ) -> None:
     """A new inner face that could not be closed is closed by the next look; its failure was an error."""
     enclosure.build()
-    firewall = enclosure._firewall
+    firewall = enclosure.firewall
     assert firewall is not None
 
     def refused(_settings: object) -> None:
@@ -122,7 +122,7 @@ def test_what_is_taken_away_stays_away(
 ) -> None:
     """A look that is still under way at the end, or comes after it, puts nothing back: the end waits for it."""
     enclosure.build()
-    firewall = enclosure._firewall
+    firewall = enclosure.firewall
     assert firewall is not None
     looking, go_on = threading.Event(), threading.Event()
     report = firewall.report
@@ -158,7 +158,7 @@ def test_an_end_does_not_wait_for_a_look_that_hangs(
     """The rules are taken away all the same, and the look puts nothing back when it wakes up."""
     monkeypatch.setattr("appliance.supervisor.enclosure._PATIENCE_SECONDS", 0.1)
     enclosure.build()
-    firewall = enclosure._firewall
+    firewall = enclosure.firewall
     assert firewall is not None
     looking, go_on = threading.Event(), threading.Event()
     report = firewall.report

@@ -71,4 +71,4 @@ def test_a_place_is_given_back_however_the_response_ends(*, fails: bool) -> None
             asyncio.run(held({"type": "http"}, receive, send))
         except ConnectionResetError:
             assert fails
-    assert not streams._roles
+    assert not streams.roles

@@ -39,7 +39,7 @@ def test_who_owes_too_much_waits_until_it_is_paid() -> None:
     assert desk.budget.pause(GUEST) == 0
     desk.now += 60
     assert desk.budget.pause(GUEST) == 0
-    assert not list(desk.budget._owed.holders())  # who owes nothing takes no memory
+    assert not list(desk.budget.owed.holders())  # who owes nothing takes no memory
 
 
 def test_what_was_only_counted_costs_nothing() -> None:
@@ -70,7 +70,7 @@ def test_strangers_owe_nothing() -> None:
         stranger = Record(id="0", time=0, event="decision", host=f"10.9.0.{number}", stranger=True)
         desk.budget.charge(stranger)
         desk.budget.folded(stranger)
-    assert not list(desk.budget._owed.holders())
+    assert not list(desk.budget.owed.holders())
     assert desk.budget.pause("10.9.0.1") == 0
 
 

@@ -197,7 +197,7 @@ def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: 
     """Who writes on while it is read cannot fill the disk with a backup, either."""
     content = state / "api" / "growing"
     content.write_bytes(bytes(1000))
-    opened = backup._opened
+    opened = backup.opened
 
     def grown(state: Path, name: str) -> int | None:
         descriptor = opened(state, name)
@@ -205,7 +205,7 @@ def test_a_file_that_grows_is_refused(state: Path, tmp_path: Path, monkeypatch: 
             monkeypatch.setattr(backup, "LARGEST", 999)
         return descriptor
 
-    monkeypatch.setattr(backup, "_opened", grown)
+    monkeypatch.setattr(backup, "opened", grown)
     with pytest.raises(BackupError, match=r"api/growing has more than 999 bytes: see who put it there"):
         back_up(state, tmp_path / "backup.tar.gz")
     assert not (tmp_path / "backup.tar.gz").exists()
@@ -286,7 +286,7 @@ def test_a_database_that_becomes_a_link_gives_nothing_of_roots_away(
         connection.execute("CREATE TABLE secret (value TEXT)")
         connection.commit()
     secret.chmod(0o600)
-    opened = backup._opened
+    opened = backup.opened
 
     def swapped(state: Path, name: str) -> int | None:
         descriptor = opened(state, name)
@@ -295,7 +295,7 @@ def test_a_database_that_becomes_a_link_gives_nothing_of_roots_away(
             (state / name).symlink_to(secret)
         return descriptor
 
-    monkeypatch.setattr(backup, "_opened", swapped)
+    monkeypatch.setattr(backup, "opened", swapped)
     with pytest.raises(BackupError, match=r"control/state\.db cannot be read by user id 61011"):
         back_up(owned, tmp_path / "backup.tar.gz")
     assert not (tmp_path / "backup.tar.gz").exists()

@@ -49,7 +49,7 @@ def screen(
 ) -> list[str]:
     """The lines on a terminal of this width."""
     monkeypatch.setenv("COLUMNS", str(width))
-    status._show(shown, status.troubles_of(shown))
+    status.show(shown, status.troubles_of(shown))
     return capsys.readouterr().out.splitlines()
 
 

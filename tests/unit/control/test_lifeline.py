@@ -71,7 +71,7 @@ def run(
             await work(lifeline, supervisor)
         finally:
             supervisor.close()
-            lifeline._channel.close()
+            lifeline.channel.close()
 
     asyncio.run(inside())
 

@@ -55,8 +55,8 @@ class Appliance:
         try:
             yield policies
         finally:
-            if policies._trial._task is not None:
-                policies._trial._task.cancel()
+            if policies.trial.task is not None:
+                policies.trial.task.cancel()
             store.close()
 
 
@@ -153,7 +153,7 @@ async def test_a_reload_that_another_change_overtakes_is_refused(
     appliance = Appliance(tmp_path)
     slow = Slow(monkeypatch, appliance)
     with appliance.started() as policies:
-        await policies._store.settled()
+        await policies.store.settled()
         loading = asyncio.ensure_future(policies.reload())
         await slow.until_begun()
         policies.rollback(1, who="not confirmed in time")

@@ -322,7 +322,7 @@ def test_a_token_of_an_earlier_version_is_good_as_it_was(tmp_path: Path) -> None
 
     async def story(world: World) -> None:
         row, token = await world.tokens.add("alice", "admin", 600)
-        world.store._database.submit("DELETE FROM token_keys WHERE id = ?", (row.id,))
+        world.store.database.submit("DELETE FROM token_keys WHERE id = ?", (row.id,))
         await world.store.settled()
         world.begin(require_proof=False)
         api = Api(world)

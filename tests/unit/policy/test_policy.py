@@ -408,6 +408,6 @@ def test_memory_does_not_grow_with_requests() -> None:
     ask(policy, "10.0.0.1", "publish", "/" + "x" * 900)
     for number in range(5_000):
         ask(policy, f"10.1.{number >> 8}.{number & 255}", "publish", "/topic")
-    assert len(policy._kept) <= 8192
-    assert len(policy._hosts._kept) <= 1024
-    assert max(len(key[-1]) for key in policy._kept) <= 256
+    assert len(policy.kept) <= 8192
+    assert len(policy.hosts.kept) <= 1024
+    assert max(len(key[-1]) for key in policy.kept) <= 256

@@ -101,11 +101,11 @@ def test_messages_that_come_with_the_publishers_header_are_not_lost(world: World
 def test_a_grant_that_was_sent_before_the_peer_came_counts(world: World) -> None:
     """Even when the peer is faster than the grant: it is kept waiting for a moment."""
     peer = world.connect(encode_header(ASK | {"callerid": "/late"}))
-    world.until(lambda: world.engine._waiting)
+    world.until(lambda: world.engine.waiting)
     world.control.send(GrantInstalled("k", "/chatter", LOOPBACK, "/late"))
     world.upstream()
     assert world.gets_header(peer) == HEADER
-    assert not world.engine._waiting
+    assert not world.engine.waiting
 
 
 def test_nobody_is_refused_while_control_restates(world: World) -> None:
@@ -117,7 +117,7 @@ def test_nobody_is_refused_while_control_restates(world: World) -> None:
         world.connect(encode_header(ASK)),
         world.connect(encode_header(ASK | {"callerid": "/x"})),
     )
-    world.until(lambda: len(world.engine._waiting.get("k", ())) == 2)
+    world.until(lambda: len(world.engine.waiting.get("k", ())) == 2)
     done = world.loop.clock() + 3 * LIMITS.grant_seconds
     world.until(lambda: world.loop.clock() > done)
     world.state(PublicationPlaced("k", "/chatter", "*"))
@@ -131,10 +131,10 @@ def test_nobody_is_refused_while_control_restates(world: World) -> None:
 def test_a_peer_that_leaves_while_it_waits_leaves_nothing(world: World) -> None:
     """Its place is free at once."""
     peer = world.connect(encode_header(ASK | {"callerid": "/late"}))
-    world.until(lambda: world.engine._waiting)
+    world.until(lambda: world.engine.waiting)
     peer.sock.close()
-    world.until(lambda: not world.engine._waiting and not world.engine._visitors)
-    assert world.engine._ports.connected.total == 0
+    world.until(lambda: not world.engine.waiting and not world.engine.visitors)
+    assert world.engine.ports.connected.total == 0
 
 
 @pytest.mark.parametrize(
@@ -195,7 +195,7 @@ def test_connections_have_a_bound_and_places_are_given_back(world: World) -> Non
     assert "the share of one host is 15" in world.hears(ConnectionRefused).reason
     for peer in flood:
         peer.reset()
-    world.until(lambda: not world.engine._visitors)
+    world.until(lambda: not world.engine.visitors)
     world.subscribed()
 
 
@@ -206,7 +206,7 @@ def test_a_peer_that_resets_at_any_point_harms_nobody(world: World) -> None:
         world.connect(encode_header(ASK)[:length]).reset()
     publisher.send(encode_frame(b"still here"))
     world.gets(subscriber, encode_frame(b"still here"))
-    world.until(lambda: not world.engine._visitors)
+    world.until(lambda: not world.engine.visitors)
 
 
 def test_a_lost_publisher_is_found_again_and_subscribers_stay(world: World) -> None:
@@ -272,12 +272,12 @@ def test_a_publisher_that_always_closes_is_waited_for_ever_longer_until_it_stays
     staying = patient.upstream()
     ends = time.monotonic() + 0.1
     patient.until(lambda: time.monotonic() > ends)
-    ((_topic, publisher),) = patient.engine._topics.values()
+    ((_topic, publisher),) = patient.engine.topics.values()
     assert isinstance(publisher, Publisher)
-    assert publisher._failures == 3
+    assert publisher.failures == 3
     staying.sock.close()
     patient.hears(UpstreamLost)
-    assert publisher._failures == 1
+    assert publisher.failures == 1
     patient.close()
 
 
@@ -323,9 +323,9 @@ def test_whatever_peers_send_the_relay_serves_on(world: World, seed: int) -> Non
                 world.loop.turn(0.005)
         chance.choice((peer.reset, peer.sock.close, lambda: None))()
     world.state(NodeWithdrawn("k"))
-    world.until(lambda: not (world.engine._farewells or world.engine._visitors or world.engine._clients))
+    world.until(lambda: not (world.engine.farewells or world.engine.visitors or world.engine.clients))
     assert world.held == 0
-    assert world.engine._ports.connected.total == 0
+    assert world.engine.ports.connected.total == 0
     world.publisher = world.listen()
     world.state(NodePlaced("k", "/talker", LOOPBACK), world.port)
     world.state(PublicationPlaced("k", "/chatter", "*"))
@@ -490,10 +490,10 @@ def test_a_long_header_that_is_never_finished_gives_back_what_it_held() -> None:
     world = World(replace(LIMITS, header_seconds=30.0))
     unfinished = struct.pack("<I", 60_000) + bytes(20_000)
     first = world.connect(unfinished)
-    world.until(lambda: world.engine._memory.headers.of(LOOPBACK).used == len(unfinished) - 4096)
+    world.until(lambda: world.engine.memory.headers.of(LOOPBACK).used == len(unfinished) - 4096)
     first.reset()
-    world.until(lambda: not world.engine._visitors)
-    assert world.engine._memory.headers.of(LOOPBACK).used == 0
+    world.until(lambda: not world.engine.visitors)
+    assert world.engine.memory.headers.of(LOOPBACK).used == 0
     world.close()
 
 
@@ -503,7 +503,7 @@ def test_strangers_make_room_for_each_other_and_never_fill_the_relay() -> None:
     strangers = [world.connect(host=f"127.0.1.{number}") for number in range(1, 31)]
     for peer in strangers[:25]:
         world.ends(peer)
-    assert world.engine._ports.connected.total == 5
+    assert world.engine.ports.connected.total == 5
     assert not any(peer.ended for peer in strangers[-5:])
     world.subscribed()
     world.close()
@@ -522,7 +522,7 @@ def test_the_host_with_most_makes_room_for_one_with_less() -> None:
         world.gets_header(world.connect(encode_header(ASK), host=greedy))
     for _ in range(5):
         world.gets_header(world.connect(encode_header(ASK), host=other))
-    pool = world.engine._ports.connected
+    pool = world.engine.ports.connected
     assert (pool.held(greedy), pool.held(other)) == (5, 5)
     world.ends(world.connect(encode_header(ASK), host=other))
     assert (pool.held(greedy), pool.held(other)) == (5, 5)
@@ -682,7 +682,7 @@ def test_a_service_that_is_silent_or_gone_is_an_error_header(world: World) -> No
     world.service.close()
     client = world.connect(encode_header(CALL))
     assert "connection to the service" in world.gets_header(client)["error"]
-    world.until(lambda: not world.engine._clients)
+    world.until(lambda: not world.engine.clients)
 
 
 @pytest.mark.parametrize("reply", [b"\x05abcd", encode_service_reply(b"1") * 2, b"\x01\xff\xff\xff\xff"])
@@ -713,7 +713,7 @@ def test_a_client_that_goes_while_the_service_works_frees_everything(world: Worl
     world.gets(service, encode_frame(b"ask"))
     client.sock.close()
     world.ends(service)
-    world.until(lambda: not world.engine._clients)
+    world.until(lambda: not world.engine.clients)
     assert world.held == 0
 
 

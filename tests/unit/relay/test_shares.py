@@ -81,16 +81,16 @@ def test_latched_messages_of_a_guest_stop_nobody_else(world: World) -> None:
         world.gets(subscriber, message)
         carries_images(world, *robot) if not number % 10 else None
         refused += any(isinstance(one, LatchRefused) and one.key == f"guest{number}" for one in world.told)
-    assert world.engine._memory.latched.of("10.9.9.9").used < 9 * MIB
+    assert world.engine.memory.latched.of("10.9.9.9").used < 9 * MIB
     assert world.hears(LatchRefused, key="guest29").size == len(message)
     assert refused > 20
     own, subscriber = publish(world, 100, LOOPBACK, LATCHED)
     world.push(own, message)
     world.gets(subscriber, message)
-    assert world.engine._memory.latched.of(LOOPBACK).used == len(message)
+    assert world.engine.memory.latched.of(LOOPBACK).used == len(message)
     for number in range(29):
         world.state(NodeWithdrawn(f"guest{number}"))
-    assert world.engine._memory.latched.of("10.9.9.9").used == 0
+    assert world.engine.memory.latched.of("10.9.9.9").used == 0
     carries_images(world, *robot)
 
 
@@ -106,7 +106,7 @@ def test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots(world: 
     message = encode_frame(bytes(2 * MIB))
     world.push(robot, message)
     world.gets(subscriber, message)
-    assert world.engine._memory.latched.of(LOOPBACK).used == len(message)
+    assert world.engine.memory.latched.of(LOOPBACK).used == len(message)
 
 
 def test_unfinished_messages_of_a_guest_stop_nobody_else(world: World) -> None:
@@ -118,10 +118,10 @@ def test_unfinished_messages_of_a_guest_stop_nobody_else(world: World) -> None:
         world.push(publisher, begun)
         if not number % 10:
             carries_images(world, *robot)
-    assert world.engine._memory.frames.of("10.9.9.9").used < 18 * MIB
+    assert world.engine.memory.frames.of("10.9.9.9").used < 18 * MIB
     world.hears(UpstreamLost, violation="limit exceeded")
     carries_images(world, *robot)
-    world.until(lambda: world.engine._memory.frames.of("10.9.9.9").used == 0)
+    world.until(lambda: world.engine.memory.frames.of("10.9.9.9").used == 0)
 
 
 def test_subscribers_of_a_guest_that_never_read_stop_nobody_else(world: World) -> None:
@@ -140,8 +140,8 @@ def test_subscribers_of_a_guest_that_never_read_stop_nobody_else(world: World) -
     for _ in range(20):
         world.push(publisher, large)
         world.gets(quick, large)
-    assert world.engine._memory.queues.of(LOOPBACK).used == 0
-    share = world.engine._memory.queues.of("127.0.0.2")
+    assert world.engine.memory.queues.of(LOOPBACK).used == 0
+    share = world.engine.memory.queues.of("127.0.0.2")
     assert 0 < share.used < 16 * MIB
     share.add(8 * MIB)
     assert "no memory left" in world.hears(ConnectionClosed).reason
@@ -165,18 +165,18 @@ def test_headers_of_strangers_leave_room_for_the_robots(world: World) -> None:
     ours = world.connect(encode_header(ASK | {"filler": "x" * 30_000}))
     world.upstream()
     assert world.gets_header(ours)["callerid"] == "/talker"
-    pool = world.engine._memory.headers
+    pool = world.engine.memory.headers
     assert 0 < pool.total <= MIB // 4 + len(unfinished)
 
 
 def test_headers_of_publishers_and_servers_count_while_they_are_connected(world: World) -> None:
     """They choose how long theirs are, and the relay remembers them: nothing of a host is there for nothing."""
-    share = world.engine._memory.frames.of("10.9.9.9")
+    share = world.engine.memory.frames.of("10.9.9.9")
     publisher, _subscriber = publish(world, 1, "10.9.9.9", HEADER | {"message_definition": "x" * 60_000})
     assert 60_000 < share.used < 61_000
     publisher.reset()
     world.until(lambda: share.used == 0)
-    own = world.engine._memory.frames.of(LOOPBACK)
+    own = world.engine.memory.frames.of(LOOPBACK)
     client = world.connect(encode_header(CALL) + encode_frame(bytes(50_000)))
     service = world.accept(world.service)
     world.until(lambda: own.used > 50_000)
@@ -194,6 +194,6 @@ def test_of_a_peers_header_little_is_remembered(world: World, asked: dict[str, s
     long = world.connect(encode_header(asked | {"type": "x" * 2000}))
     assert world.gets_header(long)["error"] == "its header has a type of 2000 characters"
     world.connect(encode_header(asked | {"message_definition": "x" * 30_000, "own": "x" * 30_000}))
-    members = lambda: [*world.engine._clients, *world.engine._topics["k", "/chatter"][0].members]  # noqa: E731 - said once
+    members = lambda: [*world.engine.clients, *world.engine.topics["k", "/chatter"][0].members]  # noqa: E731 - said once
     [member] = world.until(members)
-    assert set(member._fields) == set(asked)
+    assert set(member.fields) == set(asked)

@@ -130,7 +130,7 @@ class World:
     @property
     def held(self) -> int:
         """The bytes of messages that the relay holds for all hosts."""
-        return sum(size for what, size in self.engine._memory.held().items() if what != "headers")
+        return sum(size for what, size in self.engine.memory.held().items() if what != "headers")
 
     def state(self, message: Message, *sockets: socket.socket) -> None:
         """Control says something, and it is carried out."""

@@ -56,7 +56,7 @@ def test_one_host_never_has_all_slots() -> None:
             task.cancel()
         await asyncio.gather(*stuck, return_exceptions=True)
         assert sum(not task.cancelled() for task in stuck) == 2
-        assert not turns._waiting
+        assert not turns.waiting
 
     asyncio.run(test())
 
@@ -80,7 +80,7 @@ def test_turns_balance() -> None:
             await asyncio.sleep(0)
             tasks[i].cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        assert (turns._slots.total, dict(turns._waiting)) == (0, {})
+        assert (turns.slots.total, dict(turns.waiting)) == (0, {})
 
     asyncio.run(test())
 
@@ -99,7 +99,7 @@ def test_who_was_cancelled_and_has_not_run_since_gets_no_turn() -> None:
             await following
         turns.leave(HOST)
         assert gone.cancelled()
-        assert (turns._slots.total, dict(turns._waiting)) == (0, {})
+        assert (turns.slots.total, dict(turns.waiting)) == (0, {})
 
     asyncio.run(test())
 

@@ -42,11 +42,11 @@ def test_only_readers_of_the_log_are_ended(tmp_path: Path, holding: list[str | i
     supervisor = Supervisor(roles_of(syslog=True), facts, admin=admin, ready=lambda _said: None)
     try:
         lives = {}
-        for number, post in enumerate(supervisor._posts):
+        for number, post in enumerate(supervisor.posts):
             lives[post.role.name] = _Life(1000 + number)
             post.life = cast(Life, lives[post.role.name])
         named = [one if isinstance(one, int) else lives[one].pid for one in holding]
-        supervisor._control_said(cast(Life, lives["control"]), LogHeld(named), ())
+        supervisor.control_said(cast(Life, lives["control"]), LogHeld(named), ())
         assert {role for role, life in lives.items() if life.killed} == ended
     finally:
-        supervisor._kept.close()
+        supervisor.kept.close()

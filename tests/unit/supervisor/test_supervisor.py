@@ -65,7 +65,7 @@ def test_a_master_that_dies_while_it_is_asked_is_asked_again(
 
     async def scene() -> tuple[StandIn, StandIn]:
         supervisor = made(tmp_path, ROSMASTER)
-        post = supervisor._posts[0]
+        post = supervisor.posts[0]
         first, second = StandIn(), StandIn()
         asked = asyncio.Event()
 
@@ -75,9 +75,9 @@ def test_a_master_that_dies_while_it_is_asked_is_asked_again(
                 asked.set()
             return True
 
-        monkeypatch.setattr(supervisor, "_answers", answers)
+        monkeypatch.setattr(supervisor, "answers", answers)
         post.life = cast(Life, first)
-        waiting = asyncio.create_task(supervisor._until_answering(post))
+        waiting = asyncio.create_task(supervisor.until_answering(post))
         async with asyncio.timeout(20):
             await asked.wait()
             post.life = cast(Life, second)
@@ -96,9 +96,9 @@ def test_a_first_token_that_cannot_be_kept_ends_the_start_in_words(tmp_path: Pat
 
     async def scene() -> StandIn:
         supervisor, control = made(tmp_path, CONTROL, ready), StandIn()
-        await supervisor._control_ready(cast(Life, control), READY)
-        assert supervisor._failure == "the first access token cannot be written"
-        assert not supervisor._is_ready
+        await supervisor.control_ready(cast(Life, control), READY)
+        assert supervisor.failure == "the first access token cannot be written"
+        assert not supervisor.is_ready
         return control
 
     assert "Announced" not in asyncio.run(scene()).told
@@ -115,9 +115,9 @@ def test_a_machine_without_processes_is_not_asked_in_a_tight_loop(
     async def scene() -> list[float]:
         supervisor = made(tmp_path, CONTROL)
         monkeypatch.setattr(module, "Life", none_left)
-        (post,), delays = supervisor._posts, []
+        (post,), delays = supervisor.posts, []
         for _ in range(5):
-            supervisor._fill(post)
+            supervisor.fill(post)
             assert post.due is not None
             delays.append(round(post.due.when() - asyncio.get_running_loop().time(), 1))
             post.due.cancel()
@@ -132,7 +132,7 @@ def test_a_control_that_asks_for_too_much_at_once_is_replaced(tmp_path: Path) ->
     async def scene() -> tuple[StandIn, int]:
         supervisor, control = made(tmp_path, CONTROL), StandIn()
         for number in range(10_000):
-            supervisor._control_said(cast(Life, control), RouteWanted(f"10.0.0.{number}"), ())
+            supervisor.control_said(cast(Life, control), RouteWanted(f"10.0.0.{number}"), ())
             if control.killed:
                 return control, number
         return control, -1
@@ -149,15 +149,15 @@ def test_a_slow_start_is_waited_for_with_words(tmp_path: Path, monkeypatch: pyte
 
     async def scene() -> tuple[list[str], list[MutableMapping[str, Any]]]:
         supervisor, slow, reasons = made(tmp_path, CONTROL), StandIn(), list[str]()
-        supervisor._posts[0].life = cast(Life, slow)
+        supervisor.posts[0].life = cast(Life, slow)
 
         def stop(reason: str) -> None:
             reasons.append(reason)
-            supervisor._stopping.set()
+            supervisor.stopping.set()
 
         monkeypatch.setattr(supervisor, "stop", stop)
         with capture_logs() as said:
-            waiting = asyncio.create_task(supervisor._until_ready())
+            waiting = asyncio.create_task(supervisor.until_ready())
             async with asyncio.timeout(20):
                 while len(said) < 2:
                     await asyncio.sleep(0)

@@ -62,7 +62,7 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Iterator[Log]:
 
 def outcome(log: Log) -> tuple[str, str]:
     """What the check of RVMaster says."""
-    (found,) = selftest_running._call(cast(Appliance, log), "http://127.0.0.1:11311")
+    (found,) = selftest_running.check_call(cast(Appliance, log), "http://127.0.0.1:11311")
     return found.outcome, found.text
 
 

@@ -26,7 +26,7 @@ def test_ports_are_closed_once() -> None:
     """
     places, server = Told(), Told()
     faces = cast(Any, Faces.__new__(Faces))
-    faces._places, faces._servers = places, {"key": server}
+    faces.places, faces.servers = places, {"key": server}
     uri = "http://10.0.0.5:4000/"
     host = ipaddress.ip_address("10.0.0.5")
     node = Incarnation("key", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 19001, 19002)

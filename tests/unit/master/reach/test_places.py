@@ -155,7 +155,7 @@ def test_no_host_takes_all_ports() -> None:
     here = Places(
         "127.0.0.1", ports, keep=lambda *_: None, drop=lambda _: None, named_as=NAMING.named_as, relays=4
     )
-    here._listen = lambda: Listening(here._unused.popleft())  # type: ignore[method-assign,assignment,return-value]
+    here.listen = lambda: Listening(here.unused.popleft())  # type: ignore[method-assign,assignment,return-value]
     for host in HOSTS[:3]:
         taken = []
         with pytest.raises(NoPortError, match=r"3 times as many as are left; widen \[Ports\] range"):
@@ -175,7 +175,7 @@ def test_many_addresses_of_one_network_are_one_host() -> None:
         "127.0.0.1", range(20_000, 20_800), keep=lambda *_: None, drop=lambda _: None,
         named_as=NAMING.named_as, relays=4,
     )  # fmt: skip
-    here._listen = lambda: Listening(here._unused.popleft())  # type: ignore[method-assign,assignment,return-value]
+    here.listen = lambda: Listening(here.unused.popleft())  # type: ignore[method-assign,assignment,return-value]
     refused = ""
     for number in range(200):
         try:

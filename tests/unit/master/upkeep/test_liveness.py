@@ -156,7 +156,7 @@ async def test_a_node_that_returns_while_it_is_taken_out_is_in_again() -> None:
     for topic in ("/a", "/b", "/c"):
         await world.register(node, Kind.PUBLICATION, topic)
     world.clients.silent = {"/n"}
-    losing = asyncio.ensure_future(world.liveness._look(node))
+    losing = asyncio.ensure_future(world.liveness.look(node))
     while node.life is Life.LIVE:
         await asyncio.sleep(0)
     await world.liveness.revive(node)

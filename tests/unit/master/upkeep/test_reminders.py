@@ -64,8 +64,8 @@ def test_reminded_until_back(
     async def run() -> None:
         looks = Reminders(registry, cast(Any, told), cast(Any, told), cast(Any, told))
         looks.begin()
-        assert looks._round is not None
-        await looks._round
+        assert looks.round is not None
+        await looks.round
 
     asyncio.run(run())
     assert told.reminded == [("/ear", "/chatter")] * reminded

@@ -96,7 +96,7 @@ def test_connections_with_the_same_names_have_one_flow() -> None:
     assert flows.of(FlowLimit(7), "/scan", "10.0.0.2", "/ear") is not one
     assert flows.of(UNLIMITED, "/scan", "10.0.0.3", "/ear") is None
     del one
-    assert len(flows._flows) == 0
+    assert len(flows.flows) == 0
 
 
 def test_a_publication_is_limited_by_itself_and_with_its_topic() -> None:

@@ -150,12 +150,12 @@ def test_a_topic_without_an_enabled_event_never_goes_through_monitors(world: Mon
     """Not with specifications for other topics, and not while its monitor is disabled; then messages are untouched."""
     world.load(GUARD.replace("/chatter", "/other"))
     publisher, subscriber = world.subscribed()
-    relayed, _publisher = world.engine._topics["k", "/chatter"]
-    assert relayed._through is None
+    relayed, _publisher = world.engine.topics["k", "/chatter"]
+    assert relayed.through is None
     publisher.send(string("bad"))
     world.gets(subscriber, string("bad"))
     world.load(GUARD, revision=2, guard=False)
-    assert relayed._through is None
+    assert relayed.through is None
     publisher.send(string("bad") + string("one"))
     world.gets(subscriber, string("bad") + string("one"))
 
@@ -202,13 +202,13 @@ def test_the_first_specifications_hold_up_nothing_but_what_is_to_be_carried(
 ) -> None:
     """However long they take to compile: the loop serves on (its supervisor), and nothing goes past the monitors."""
     compiled = threading.Event()
-    compile_now = Compiler._compile
+    compile_now = Compiler.compile
 
     def compile_late(compiler: Compiler, message: SpecificationsStated) -> Any:
         compiled.wait()
         return compile_now(compiler, message)
 
-    monkeypatch.setattr(Compiler, "_compile", compile_late)
+    monkeypatch.setattr(Compiler, "compile", compile_late)
     late = GUARD.replace("/chatter", "/late")
     world.state(SpecificationsStated(1, [("0.rv", late)], {}, {}, True, statement=7))
     world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
@@ -217,14 +217,14 @@ def test_the_first_specifications_hold_up_nothing_but_what_is_to_be_carried(
     turned: list[bool] = []
     world.loop.after(0, lambda: turned.append(True))
     world.until(lambda: turned)
-    assert ("k", "/late") not in world.engine._topics
+    assert ("k", "/late") not in world.engine.topics
     compiled.set()
     taken = world.until(lambda: world.taken(SpecificationsTaken, 1))
     assert (taken.began, taken.statement) == (["guard"], 7)
-    assert ("k", "/late") in world.engine._topics
-    assert not world.engine._middle.wants("/late")
+    assert ("k", "/late") in world.engine.topics
+    assert not world.engine.middle.wants("/late")
     world.state(MonitorSwitched("guard", True))
-    assert world.engine._middle.wants("/late")
+    assert world.engine.middle.wants("/late")
 
 
 def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_order(world: Monitored) -> None:
@@ -237,8 +237,8 @@ def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_ord
     answers = [one for one in world.told if isinstance(one, SpecificationsTaken | SpecificationsRefused)]
     assert [one.statement for one in answers] == [1, 2, 3, 4, 5, 6]
     assert isinstance(answers[3], SpecificationsRefused)
-    assert world.engine._middle.wants("/other")
-    assert not world.engine._middle.wants("/chatter")
+    assert world.engine.middle.wants("/other")
+    assert not world.engine.middle.wants("/chatter")
     assert isinstance(world.load(GUARD, revision=7), SpecificationsTaken)
     for _ in range(20):  # nothing is left that the loop is woken for
         world.loop.turn(0.01)
@@ -251,19 +251,19 @@ def test_what_a_new_control_begins_with_is_in_force_before_it_places_anything(
     """It may have another revision than the relay, after a crash in the middle of a change; or one that is refused."""
     world.load(GUARD)
     compiled = threading.Event()
-    compile_now = Compiler._compile
+    compile_now = Compiler.compile
 
     def compile_late(compiler: Compiler, message: SpecificationsStated) -> Any:
         compiled.wait()
         return compile_now(compiler, message)
 
-    monkeypatch.setattr(Compiler, "_compile", compile_late)
+    monkeypatch.setattr(Compiler, "compile", compile_late)
     world.state(SpecificationsStated(2, [("0.rv", text)], {}, {}, True, ahead=True))
     world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
-    assert ("k", "/late") not in world.engine._topics
+    assert ("k", "/late") not in world.engine.topics
     compiled.set()
     world.until(lambda: world.taken(SpecificationsTaken, 2) or world.taken(SpecificationsRefused, 2))
-    assert ("k", "/late") in world.engine._topics
+    assert ("k", "/late") in world.engine.topics
 
 
 def test_bad_specifications_change_nothing(world: Monitored) -> None:
@@ -358,7 +358,7 @@ def test_messages_that_cost_much_are_seen_by_the_clock_at_once(world: Monitored)
     """Not after sixteen: several monitors that use up nearly all of their budgets would take a minute for them."""
     text = """a() { int n; event e() /chatter std_msgs/String '{}' { for (int i = 0; i < 60000; i++) n += i; } }"""
     world.load(text)
-    middle = world.engine._middle
+    middle = world.engine.middle
     lane = middle.lane(Place("k", "/chatter"))
     seen: list[float] = []
     process = MonitorSet.process
@@ -390,7 +390,7 @@ def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(world: Moni
     """Even one that is ours."""
     world.load(GUARD)
     publisher, subscriber = world.typed()
-    monitors = world.engine._middle.monitors
+    monitors = world.engine.middle.monitors
     assert monitors is not None
     process, monitors.process = monitors.process, lambda *_args: 1 / 0  # type: ignore[method-assign, assignment]  # a defect, put there
     publisher.send(string("a"))
@@ -588,7 +588,7 @@ def test_a_request_that_is_refused_never_reaches_the_service(world: Monitored) -
 def test_the_client_of_a_service_reads_why_its_request_could_not_be_judged(world: Monitored) -> None:
     """The fault, as well as what a monitor says; services whose monitors are off are not judged."""
     world.load(LATCH.replace("open = wish;", "int zero = 0; open = 1 / zero;"))
-    middle = world.engine._middle
+    middle = world.engine.middle
     refused = middle.request(Place("k", "/mode"), b"\0").refused
     assert refused == "the request is refused by the monitor gate: division by zero"
     world.state(MonitorSwitched("gate", False))
@@ -598,7 +598,7 @@ def test_the_client_of_a_service_reads_why_its_request_could_not_be_judged(world
 def test_a_service_without_a_monitor_goes_on_while_monitors_are_slow(world: Monitored) -> None:
     """Those of other topics have taken too long: only what they would have to judge is refused."""
     world.load(LATCH)
-    middle = world.engine._middle
+    middle = world.engine.middle
     middle.spent = 99.0
     assert middle.request(Place("k", "/plain"), b"x").body == b"x"
     assert middle.request(Place("k", "/mode"), b"\1").refused == TOO_LONG

@@ -67,7 +67,7 @@ class Monitored:
         self.set = MonitorSet.load(texts, known, on_fault)
         if together:
             self.set.write_module()
-        self.middle._compiled(SpecificationsStated(1, [], {}, {}, restarted=False), self.set)
+        self.middle.compiled(SpecificationsStated(1, [], {}, {}, restarted=False), self.set)
 
     def close(self) -> None:
         """End."""
@@ -95,12 +95,13 @@ class Monitored:
     def told(self) -> list[str]:
         """Everything that was sent to control, the counts of a second in a fixed order."""
         self.middle.tick()
-        self.middle.observations._flush()
-        told = sorted(repr(one) for one in self._events())
+        self.middle.observations.flush()
+        told = sorted(repr(one) for one in self.sent())
         self.heard.messages.clear()
         return told
 
-    def _events(self) -> Iterable[object]:
+    def sent(self) -> Iterable[object]:
+        """All that was sent to control, rows and events one by one."""
         for one in self.heard.messages:
             yield from getattr(one, "events", None) or getattr(one, "rows", None) or [one]
 

@@ -38,8 +38,8 @@ class Told:
     def events(self, kind: str) -> list[MonitorEvent]:
         """What control is told of this kind when the second is over."""
         self.monitored.middle.tick()
-        self.monitored.middle.observations._flush()
-        found: list[Any] = [one for one in self.monitored._events() if getattr(one, "kind", "") == kind]
+        self.monitored.middle.observations.flush()
+        found: list[Any] = [one for one in self.monitored.sent() if getattr(one, "kind", "") == kind]
         self.monitored.heard.messages.clear()
         return found
 
@@ -137,8 +137,8 @@ def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(
     assert {row.name: row.changes for row in monitored.rows()} == dict.fromkeys(
         (f"m{bit}" for bit in range(8)), 128
     ) | {"m8": 256}
-    monitored.middle.observations._flush()
-    changes: list[Any] = [one for one in monitored._events() if getattr(one, "kind", "") == "change"]
+    monitored.middle.observations.flush()
+    changes: list[Any] = [one for one in monitored.sent() if getattr(one, "kind", "") == "change"]
     assert {one.monitor for one in changes} == {"m8"}
     assert sum(one.count or 1 for one in changes) == 256
     assert len(changes) <= 102
@@ -148,7 +148,7 @@ def test_changes_of_very_many_sets_of_monitors_are_few_records_and_exact_counts(
 def test_counters_come_with_the_event_that_they_count_not_a_second_later(told: Told) -> None:
     """Who reads of a drop in the audit log finds it in the counters, events included."""
     told.send((1, 5, 0))
-    told.monitored.middle.observations._flush()
+    told.monitored.middle.observations.flush()
     *_before, events, counters = told.monitored.heard.messages
     assert isinstance(events, MonitorsReported)
     assert isinstance(counters, MonitorsCounted)
@@ -173,8 +173,8 @@ def test_what_is_told_names_publisher_and_message(together: bool, equal: bool) -
     frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
     told.monitored.through(Traffic("/scan", frames, len(bodies)), first=101)
     told.monitored.middle.tick()
-    told.monitored.middle.observations._flush()
-    found: list[Any] = [one for one in told.monitored._events() if isinstance(one, MonitorEvent)]
+    told.monitored.middle.observations.flush()
+    found: list[Any] = [one for one in told.monitored.sent() if isinstance(one, MonitorEvent)]
     [drop, more] = [one for one in found if one.kind == "drop"]
     [fault] = [one for one in found if one.kind == "fault"]
     assert {(one.host, one.caller_id) for one in (drop, more, fault)} == {("10.0.0.7", "/talker")}

@@ -38,7 +38,7 @@ class Trying(Monitored):
 
     def row(self, name: str) -> MonitorRow:
         """The counters of a monitor, as control was told last."""
-        self.engine._middle.observations._tell_counters()
+        self.engine.middle.observations.tell_counters()
         self.link.catch_up()
 
         def last() -> MonitorRow | None:
@@ -107,13 +107,13 @@ def test_messages_that_wait_are_given_before_it_is_promoted(world: Trying) -> No
     """So what it has seen is complete."""
     world.state_trials(GUARD, tried=("guard",))
     publisher, subscriber = world.typed()
-    middle = world.engine._middle
-    have_turn = middle.trials._have_turn
-    middle.trials._have_turn = lambda: None  # type: ignore[method-assign]  # it never has its turn
+    middle = world.engine.middle
+    have_turn = middle.trials.have_turn
+    middle.trials.have_turn = lambda: None  # type: ignore[method-assign]  # it never has its turn
     publisher.send(string("a") * 3)
     world.gets(subscriber, string("a") * 3)
-    assert len(middle.trials._waiting) == 3
-    middle.trials._have_turn = have_turn  # type: ignore[method-assign]
+    assert len(middle.trials.waiting) == 3
+    middle.trials.have_turn = have_turn  # type: ignore[method-assign]
     assert world.state_trials(GUARD, revision=2) == []
     publisher.send(string("count"))
     world.gets(subscriber, string("4"))
@@ -129,9 +129,9 @@ def test_a_loop_without_end_delays_and_drops_nothing(world: Trying, monkeypatch:
     world.gets(subscriber, (string("loop") + string("bad")) * 20)
     assert "more than 100000 instructions" in world.event("trial fault", monitor="guard", count=0).text
     assert "one on trial may not take" in world.event("trial missed", monitor="guard", count=0).text
-    world.until(lambda: not world.engine._middle.trials._waiting)
+    world.until(lambda: not world.engine.middle.trials.waiting)
     monkeypatch.undo()
-    world.engine._middle.trials.tick()
+    world.engine.middle.trials.tick()
     row = world.row("guard")
     assert (row.events, row.missed, row.drops) == (1, 40, 0)
     assert world.state_trials(GUARD, revision=2) == ["guard"]
@@ -150,7 +150,7 @@ def test_ticks_without_end_rest_for_the_second(world: Trying, monkeypatch: pytes
     world.until(lambda: turned)
     assert world.row("s").missed == 1
     monkeypatch.undo()
-    world.engine._middle.trials.tick()
+    world.engine.middle.trials.tick()
     world.until(lambda: world.row("s").missed > 1)
 
 
@@ -170,9 +170,9 @@ def test_trials_have_a_share_of_the_processor_and_no_more(
     monkeypatch.setattr(trials.Trials, "tick", lambda _self: None)  # the second is not over
     publisher.send(string("a") * 100)
     world.gets(subscriber, string("a") * 100)
-    world.until(lambda: not world.engine._middle.trials._waiting)
+    world.until(lambda: not world.engine.middle.trials.waiting)
     monkeypatch.undo()
-    world.engine._middle.trials.tick()
+    world.engine.middle.trials.tick()
     row = world.row("guard")
     assert row.events + row.missed == 100
     assert 0 < row.events < 10
@@ -193,8 +193,8 @@ def test_a_defect_in_it_ends_no_message(world: Trying) -> None:
     """An exception that no action explains is told, and the relay goes on."""
     world.state_trials(GUARD, tried=("guard",))
     publisher, subscriber = world.typed()
-    assert world.engine._middle.monitors is not None
-    (trial,) = world.engine._middle.monitors.trials
+    assert world.engine.middle.monitors is not None
+    (trial,) = world.engine.middle.monitors.trials
     trial._steps = {"/chatter": (None,)}  # type: ignore[dict-item]
     publisher.send(string("a"))
     world.gets(subscriber, string("a"))
