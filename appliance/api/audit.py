@@ -22,7 +22,7 @@ from appliance.api.problems import ProblemError
 from appliance.api.roles import OPERATOR, VIEWER, Viewer, ask
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
-from appliance.api.streams import Held, Streams, peer_of
+from appliance.api.streams import Held, Streams, peer_of, turn
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.evidence import Chain, evidence, evidence_line
@@ -42,7 +42,6 @@ from appliance.shares.table import REST_STREAM_PEERS, REST_STREAMS
 
 _T = TypeVar("_T")
 _SEARCHES = 4
-_PATIENCE_SECONDS = 5.0
 _POLL_SECONDS = 0.2
 _PING_SECONDS = 15
 _STREAM_PAGE = 500
@@ -152,7 +151,7 @@ class Desk:
 
     async def read(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
         """What a function of `appliance.audit` says. Raises `ProblemError`."""
-        async with self.turn(self.searches, "searches of the audit log"):
+        async with turn(self.searches, "searches of the audit log"):
             return await self.in_thread(function, *arguments, **named)
 
     async def in_thread(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
@@ -163,19 +162,6 @@ class Desk:
             raise ProblemError(422, "bad-input", str(error)) from error
         except (LogUnreadableError, KeyUnreadableError) as error:
             raise ProblemError(503, "log-unreadable", str(error)) from error
-
-    @contextlib.asynccontextmanager
-    async def turn(self, turns: asyncio.Semaphore, what: str) -> AsyncIterator[None]:
-        """Wait a moment for one of so many at once."""
-        try:
-            async with asyncio.timeout(_PATIENCE_SECONDS):
-                await turns.acquire()
-        except TimeoutError:
-            raise ProblemError(503, "busy", f"too many {what} at once: try again", retry_after=5) from None
-        try:
-            yield
-        finally:
-            turns.release()
 
 
 def routes(services: Services) -> Routes:
@@ -223,7 +209,7 @@ def routes(services: Services) -> Routes:
 
         What the signer remembers is not looked at: `rosrv audit verify` on the machine does that too.
         """
-        async with desk.turn(desk.verification, "verifications"):
+        async with turn(desk.verification, "verifications"):
             return await desk.in_thread(verify, desk.path)
 
     @router.get("/checkpoints", operation_id="audit_checkpoints", dependencies=[VIEWER])

@@ -4,9 +4,10 @@ No change here needs `If-Match`: a recording never changes, it only ends.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path as FilePath
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 from fastapi import Path, Query, Request, Response
@@ -17,12 +18,29 @@ from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Investigator, Operator, Viewer, answered, ask
 from appliance.api.routing import Responses, Routes, answer, body, content
 from appliance.api.services import Services
-from appliance.api.streams import Held, peer_of
+from appliance.api.streams import Held, peer_of, turn
+from appliance.audit.moment import MomentError, parse_moment
 from appliance.channel import admin
 from appliance.channel.answers.field_docs import told
-from appliance.channel.answers.recordings import Recording, RecordingBegun, Recordings
+from appliance.channel.answers.recordings import (
+    RecordedMessages,
+    Recording,
+    RecordingBegun,
+    Recordings,
+    Timeline,
+)
+from appliance.recorder.bag_reader import Place
 from appliance.recorder.mcap import as_mcap
+from appliance.recorder.timeline import (
+    COLUMNS,
+    MOST_COLUMNS,
+    MOST_NEIGHBOURS,
+    NEIGHBOURS,
+    messages_around,
+    timeline,
+)
 
+_T = TypeVar("_T")
 _PIECE = 1 << 20
 _SLOW_SECONDS = 15.0  # longer than control waits for the recorder
 _UNKNOWN: Responses = {404: {"description": "There is no such recording, or the flight recorder is off."}}
@@ -36,6 +54,16 @@ _BEGUN: Responses = {201: {"description": "It is being made.", "content": conten
 OneId = Annotated[
     str, Path(pattern="^[0-9a-f]{20}$", description="of a recording", examples=["18ea0bb9b11c1024196c"])
 ]
+_Moment = Annotated[
+    str | None, Query(max_length=64, description="RFC 3339", examples=["2026-03-01T12:00:00.5Z"])
+]
+_Topics = Annotated[
+    list[Annotated[str, Query(max_length=500)]],
+    Query(max_length=20, description="of these alone; none: of all", examples=[["/scan"]]),
+]
+
+
+_Reading = Callable[[Recording, FilePath], _T]
 
 
 class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -50,6 +78,20 @@ def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1/recordings", tags=["recordings"])
     control = services.control
+    reading = asyncio.Semaphore(1)
+
+    async def read(
+        asked: admin.RecordingWanted | admin.RecordingRead, bearer: Bearer, what: _Reading[_T]
+    ) -> _T:
+        """What is read of a bag, one at a time; the recording is what control answers."""
+        recording = answered(await control.ask(asked, bearer, _SLOW_SECONDS))
+        async with turn(reading, "readings of recordings"):
+            try:
+                return await asyncio.to_thread(what, recording, _bag_of(services, recording.id))
+            except FileNotFoundError:
+                raise _gone(recording.id) from None
+            except ValueError as error:
+                raise ProblemError(422, "bad-input", str(error)) from error
 
     @router.get("", operation_id="recordings", responses=_UNKNOWN)
     async def recordings(bearer: Viewer) -> Recordings:
@@ -89,6 +131,50 @@ def routes(services: Services) -> Routes:
             give_back()
             raise
 
+    @router.get("/{recording_id}/timeline", operation_id="recording_timeline", responses=_UNKNOWN)
+    async def recording_timeline(
+        recording_id: OneId,
+        bearer: Viewer,
+        since: _Moment = None,
+        until: _Moment = None,
+        columns: Annotated[
+            int, Query(ge=1, le=MOST_COLUMNS, description="parts that the time is divided into")
+        ] = COLUMNS,
+    ) -> Timeline:
+        """What flowed on each topic of a recording, and what happened, on one time line; no message is in it."""
+        start, end = _moment(since), _moment(until)
+        return await read(
+            admin.RecordingWanted(recording_id),
+            bearer,
+            lambda row, bag: timeline(row, bag, start, end, columns),
+        )
+
+    @router.get("/{recording_id}/messages", operation_id="recording_messages", responses=_UNKNOWN)
+    async def recording_messages(
+        recording_id: OneId,
+        bearer: Investigator,
+        at: Annotated[
+            str,
+            Query(
+                max_length=64,
+                description="RFC 3339, or the place of a message",
+                examples=["2026-03-01T12:00:00.5Z"],
+            ),
+        ],
+        topic: _Topics = [],  # noqa: B006  FastAPI copies it
+        neighbours: Annotated[
+            int, Query(ge=1, le=MOST_NEIGHBOURS, description="messages before, and after")
+        ] = NEIGHBOURS,
+    ) -> RecordedMessages:
+        """Messages of a recording around a moment, read as fields, for investigators; it is recorded who read."""
+        moment = Place.parsed(at) or _moment(at)
+        assert moment is not None  # noqa: S101  it is text
+        return await read(
+            admin.RecordingRead(recording_id, topic),
+            bearer,
+            lambda row, bag: messages_around(row, bag, moment, topic, neighbours),
+        )
+
     @router.delete("/{recording_id}", operation_id="remove_recording", responses=_UNKNOWN)
     async def remove(recording_id: OneId, bearer: Admin) -> Recording:
         """Remove a recording; it is recorded who removed it. For admins."""
@@ -101,15 +187,30 @@ def routes(services: Services) -> Routes:
 async def _bag(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:
     """The file, once it is on record who fetches it."""
     found = answered(await services.control.ask(admin.RecordingFetch(recording_id), bearer, _SLOW_SECONDS))
-    path = services.settings.state / "recordings" / found.id / "recording.bag"
+    path = _bag_of(services, found.id)
     if not await asyncio.to_thread(path.is_file):
-        raise ProblemError(503, "not-available", f"the bag of {found.id} is not there any more")
+        raise _gone(found.id)
     pieces = as_mcap(path) if mcap else _pieces_of(path)
     name = f"rosrv-{found.id}.{'mcap' if mcap else 'bag'}"
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
     if not mcap:
         headers["Content-Length"] = str(found.size)
     return StreamingResponse(_in_thread(pieces), media_type="application/octet-stream", headers=headers)
+
+
+def _bag_of(services: Services, recording_id: str) -> FilePath:
+    return services.settings.state / "recordings" / recording_id / "recording.bag"
+
+
+def _gone(recording_id: str) -> ProblemError:
+    return ProblemError(503, "not-available", f"the bag of {recording_id} is not there any more")
+
+
+def _moment(text: str | None) -> int | None:
+    try:
+        return None if text is None else parse_moment(text, time.time_ns())
+    except (MomentError, OverflowError, ValueError) as error:
+        raise ProblemError(422, "bad-input", str(error)) from error
 
 
 def _pieces_of(path: FilePath) -> Iterator[bytes]:

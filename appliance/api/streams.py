@@ -5,7 +5,9 @@ places of the others nor those that are kept for operators and admins, from howe
 with many tokens does not, either. Places are given back when the response is over, whatever ended it.
 """
 
-from collections.abc import Callable
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -15,6 +17,8 @@ from appliance.api.access import Bearer, Role
 from appliance.api.problems import ProblemError
 from appliance.shares.pool import Pool, Standing
 from appliance.shares.table import Share
+
+_PATIENCE_SECONDS = 5.0
 
 
 def peer_of(request: Request) -> str:
@@ -62,6 +66,20 @@ class Streams:
     def _forget(self, token: str) -> None:
         if not self._tokens.held(token):
             self.roles.pop(token, None)
+
+
+@contextlib.asynccontextmanager
+async def turn(turns: asyncio.Semaphore, what: str) -> AsyncIterator[None]:
+    """Wait a moment for one of so many at once. Raises `ProblemError` (503)."""
+    try:
+        async with asyncio.timeout(_PATIENCE_SECONDS):
+            await turns.acquire()
+    except TimeoutError:
+        raise ProblemError(503, "busy", f"too many {what} at once: try again", retry_after=5) from None
+    try:
+        yield
+    finally:
+        turns.release()
 
 
 class Held(Response):

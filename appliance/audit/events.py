@@ -55,6 +55,7 @@ EVENTS: dict[str, str] = {
     "recording ordered": "Somebody had messages recorded; `detail` has who, and the seconds before and after.",
     "recording closed": "The flight recorder has a recording; `detail` has its sha256, and what triggered it.",
     "recording fetched": "Somebody fetched the messages of a recording; `detail` has who.",
+    "recording read": "Somebody read messages of a recording, decoded; `detail` has who, and of which topics.",
     "recording removed": "A recording was removed: `detail.who` has by whom; `recorder` to make room, or by age.",
     "recording missed": "A trigger made no recording: `reason` says why (the hour's number, the disk).",
     "topic looked into": "Somebody has messages of a topic shown; `detail` has who, and the `seconds` it covers.",

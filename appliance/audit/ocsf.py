@@ -131,6 +131,7 @@ KINDS: dict[str, Kind] = {
     "recording ordered": Kind(API, _CREATE),
     "recording closed": Kind(LOG, _OTHER),
     "recording fetched": Kind(API, _READ),
+    "recording read": Kind(API, _READ),
     "recording removed": Kind(API, _DELETE),
     "recording missed": Kind(FINDING, _FOUND, _LOGGED),
     "topic looked into": Kind(API, _READ),

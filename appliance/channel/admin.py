@@ -241,13 +241,22 @@ class RecordingFetch(AdminRequest[recordings.Recording], frozen=True, tag="recor
     id: str
 
 
+class RecordingRead(AdminRequest[recordings.Recording], frozen=True, tag="recording read"):
+    """Somebody reads messages of a recording, of these topics (none: of all): it is recorded who."""
+
+    id: str
+    topics: list[str] = []
+
+
 class RecordingRemove(AdminRequest[recordings.Recording], frozen=True, tag="recording remove"):
     """Remove a recording."""
 
     id: str
 
 
-RecorderRequest = RecordingsWanted | RecordingWanted | RecordNow | RecordingFetch | RecordingRemove
+RecorderRequest = (
+    RecordingsWanted | RecordingWanted | RecordNow | RecordingFetch | RecordingRead | RecordingRemove
+)  # fmt: skip
 
 
 class TokenAdd(AdminRequest[tokens.NewToken], frozen=True, tag="token add"):

@@ -13,7 +13,7 @@ from appliance.channel import admin
 from appliance.channel.admin import AdminRequest
 from appliance.channel.answers.tokens import TokenRole
 
-PARAMETERS = {"names": "name"}
+PARAMETERS = {"names": "name", "topics": "topic"}
 """What a field is called in a query, where it may stand there several times."""
 
 
@@ -82,6 +82,7 @@ OPERATIONS = (
     Operation(admin.RecordNow, "operator", "POST", "/v1/recordings"),
     Operation(admin.RecordingWanted, "viewer", "GET", "/v1/recordings/{id}"),
     Operation(admin.RecordingFetch, "investigator", "GET", "/v1/recordings/{id}/bag"),
+    Operation(admin.RecordingRead, "investigator", "GET", "/v1/recordings/{id}/messages", ("topics",)),
     Operation(admin.RecordingRemove, "admin", "DELETE", "/v1/recordings/{id}"),
     Operation(admin.TokenList, "admin", "GET", "/v1/tokens"),
     Operation(admin.TokenRevoke, "admin", "DELETE", "/v1/tokens/{name}"),

@@ -155,6 +155,14 @@ VERBS: dict[str, Verb | Group] = {
                 "appliance.cli.record:list_recordings", "List the recordings that are kept, the oldest first."
             ),
             "show": Verb("appliance.cli.record:show", "Show why a recording was made, and what it has."),
+            "timeline": Verb(
+                "appliance.cli.record:show_timeline",
+                "Show what flowed on each topic of a recording, and what happened, on one time line.",
+            ),
+            "messages": Verb(
+                "appliance.cli.record:messages",
+                "Show the messages of a recording around a moment; it is recorded who read them.",
+            ),
             "fetch": Verb(
                 "appliance.cli.record:fetch",
                 "Write a recording's bag to a file; it is recorded who fetched it.",

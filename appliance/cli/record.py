@@ -1,24 +1,43 @@
-"""`rosrv record now|list|show|fetch|remove`: what the flight recorder has of the robot's messages."""
+"""`rosrv record now|list|show|timeline|messages|fetch|remove`: what the flight recorder has of the robot's messages."""
 
 import hashlib
 import shutil
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
+import msgspec
 import typer
 
+from appliance.audit.moment import parse_moment
+from appliance.audit.output import rfc3339
 from appliance.channel import admin
-from appliance.channel.answers.recordings import Recording
+from appliance.channel.answers.recordings import RecordedMessages, Recording, Timeline
 from appliance.cli import completion
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
-from appliance.cli.output import Json, counted, say, say_json, usage_error
+from appliance.cli.output import Json, counted, printable, say, say_json, usage_error
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
+from appliance.cli.topic import lines_of
+from appliance.recorder.bag_reader import Place
+from appliance.recorder.mcap import as_mcap
+from appliance.recorder.timeline import (
+    MOST_COLUMNS,
+    MOST_NEIGHBOURS,
+    NEIGHBOURS,
+    messages_around,
+    timeline,
+)
+
+if TYPE_CHECKING:
+    from appliance.cli.rest.way import RestWay
 
 _Id = Annotated[str, typer.Argument(metavar="ID", show_default=False, autocompletion=completion.recordings)]
 _SECOND = 1_000_000_000
+_BARS = " ▁▂▃▄▅▆▇█"
+_T = TypeVar("_T")
 
 
 @speaks
@@ -70,6 +89,94 @@ def show(appliance: Appliance, recording: _Id, as_json: Json = False) -> None:
     body = appliance.answer_or_exit(admin.RecordingWanted(recording), as_json=as_json)
     for line in _described(body):
         say(line)
+
+
+@speaks
+def show_timeline(
+    appliance: Appliance,
+    recording: _Id,
+    *,
+    since: Annotated[
+        str | None, typer.Option(help="From this moment on (RFC 3339)", show_default=False)
+    ] = None,
+    until: Annotated[
+        str | None, typer.Option(help="Up to this moment (RFC 3339)", show_default=False)
+    ] = None,
+    columns: Annotated[
+        int, typer.Option(min=1, max=MOST_COLUMNS, help="Parts that the time is divided into")
+    ] = 60,
+    as_json: Json = False,
+) -> None:
+    """Show what flowed on each topic of a recording, and what happened, on one time line.
+
+    Example: rosrv record timeline 1879f3c2a4b5d6e7f012
+    """
+    way = appliance.way
+    if isinstance(way, AdminSocket):
+        body = appliance.ask_or_exit(admin.RecordingWanted(recording), as_json=as_json)
+        start, end = _moment_given("--since", since), _moment_given("--until", until)
+        found = _read(lambda: timeline(body, _bag(way, body), start, end, columns))
+    else:
+        query = {"since": since, "until": until, "columns": columns}
+        found = _asked(way, f"{recording}/timeline", query, Timeline)
+    if as_json:
+        say_json(found)
+        return
+    for line in _drawn(found):
+        say(line)
+
+
+@speaks
+def messages(
+    appliance: Appliance,
+    recording: _Id,
+    *,
+    at: Annotated[
+        str | None,
+        typer.Option(
+            help="A moment (RFC 3339), a record that triggered it, or the place of a message"
+            " (default: its first trigger)",
+            show_default=False,
+        ),
+    ] = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option(help="Of this topic alone (repeat for more)", show_default=False),
+    ] = None,
+    neighbours: Annotated[
+        int, typer.Option(min=1, max=MOST_NEIGHBOURS, help="How many before it, and after")
+    ] = NEIGHBOURS,
+    as_json: Json = False,
+) -> None:
+    """Show the messages of a recording around a moment; it is recorded who read them.
+
+    As they were sent, before monitors changed or dropped them. Long strings and arrays are cut, bytes are hexadecimal.
+
+    Example: rosrv record messages 1879f3c2a4b5d6e7f012 --topic /cmd_vel
+    """
+    topics = topic or []
+    body = appliance.ask_or_exit(admin.RecordingWanted(recording), as_json=as_json)
+    moments = {trigger.record: rfc3339(trigger.time) for trigger in body.triggers}
+    text = next(iter(moments.values())) if at is None else moments.get(at, at)
+    way = appliance.way
+    if isinstance(way, AdminSocket):
+        place = Place.parsed(text) or _moment_given("--at", text)
+        assert place is not None  # noqa: S101  it is text
+        appliance.ask_or_exit(admin.RecordingRead(recording, topics), as_json=as_json)
+        found = _read(lambda: messages_around(body, _bag(way, body), place, topics, neighbours))
+    else:
+        query = {"at": text, "topic": topics, "neighbours": neighbours}
+        found = _asked(way, f"{recording}/messages", query, RecordedMessages)
+    for number, message in enumerate(found.messages):
+        if as_json:
+            say_json(message)
+            continue
+        mark = "->" if number == found.chosen else "  "
+        sender = " ".join(filter(None, (message.sender.node, message.sender.host)))
+        words = (rfc3339(message.time), message.topic, sender, f"{message.size} bytes", message.why)
+        say(f"{mark} {'  '.join(printable(word) for word in words if word)}", "dim")
+        for line in lines_of(message.fields, 2):
+            say(line)
 
 
 @speaks
@@ -131,7 +238,7 @@ def _fetched(appliance: Appliance, recording: str, part: Path, *, as_json: bool)
     way = appliance.way
     if isinstance(way, AdminSocket):
         body = appliance.ask_or_exit(admin.RecordingFetch(recording), as_json=as_json)
-        shutil.copyfile(way.state / "recordings" / body.id / "recording.bag", part)
+        shutil.copyfile(_bag(way, body), part)
         return body
     from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
@@ -145,17 +252,68 @@ def _fetched(appliance: Appliance, recording: str, part: Path, *, as_json: bool)
     return body
 
 
+def _bag(way: AdminSocket, recording: Recording) -> Path:
+    return way.state / "recordings" / recording.id / "recording.bag"
+
+
+def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> _T:
+    """What REST answers. Ends the program with 2 when it refuses."""
+    from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
+
+    given = {name: value for name, value in query.items() if value is not None}
+    try:
+        return msgspec.convert(way.client.call("GET", f"/v1/recordings/{path}", params=given), kind)
+    except (ProblemError, NotRunningError) as error:
+        raise usage_error(str(error)) from None
+
+
+def _read(what: Callable[[], _T]) -> _T:
+    """What is read of a bag. Ends the program with 2 when that is not possible."""
+    try:
+        return what()
+    except OSError as error:
+        raise usage_error(f"{error.filename}: {error.strerror}") from None
+    except ValueError as error:
+        raise usage_error(str(error)) from None
+
+
+def _moment_given(option: str, text: str | None) -> int | None:
+    """Nanoseconds since the epoch. Ends the program with 2 when it is no moment."""
+    try:
+        return None if text is None else parse_moment(text, time.time_ns())
+    except ValueError as error:
+        raise usage_error(f"{option}: {error}") from None
+
+
+def _drawn(found: Timeline) -> Iterator[str]:
+    """A line for each topic and kind of event, with a bar for each column; then the events."""
+    yield f"{found.id}  {_moment(found.since)} to {_moment(found.until)}"
+    lanes = [(flow.topic, flow.counts, "message", flow.senders) for flow in found.topics]
+    lanes += [(mark.kind, mark.counts, "event", []) for mark in found.marks]
+    width = min(40, max((len(name) for name, *_rest in lanes), default=0))
+    for name, counts, what, senders in lanes:
+        most = max(counts) or 1
+        bars = "".join(_BARS[-(-count * (len(_BARS) - 1) // most)] for count in counts)
+        by = ", ".join(f"{sender.node} {sender.host}".strip() for sender in senders)
+        yield f"  {printable(name):{width}} {bars} {counted(sum(counts), what)}  {printable(by)}".rstrip()
+    if found.more_topics:
+        yield f"  {counted(found.more_topics, 'more topic')} with fewer messages"
+    for event in found.events:
+        who = " ".join(filter(None, (event.resource, event.caller_id, event.host)))
+        offset = (event.time - found.since) / _SECOND
+        what = f"{event.event}: {event.reason}" if event.reason else event.event
+        yield f"  +{offset:.3f} s  {event.kind}  {printable(who)}  {printable(what)}  (record {event.record})"
+    if found.more_events:
+        yield f"  {counted(found.more_events, 'more event')}: a shorter time (--since, --until) lists them"
+
+
 def _convert(bag: Path, target: Path) -> None:
     """Write the bag as MCAP. Raises `OSError`; ends the program with 1 where a message type makes no sense."""
-    from rosbags.rosbag1 import ReaderError  # noqa: PLC0415  slow to import
-
-    from appliance.recorder.mcap import as_mcap  # noqa: PLC0415
-
     try:
         with target.open("xb") as file:
             for piece in as_mcap(bag):
                 file.write(piece)
-    except (ReaderError, ValueError) as error:
+    except ValueError as error:
         target.unlink()
         typer.echo(f"rosrv: it cannot be made MCAP, fetch the bag: {error}", err=True)
         raise typer.Exit(1) from None

@@ -88,7 +88,7 @@ def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
     at = datetime.fromtimestamp(message.time / 1e9, UTC).isoformat(timespec="milliseconds")
     words = [at, printable(message.node), f"{message.size} bytes", printable(message.why)]
     say("  ".join(filter(None, words)), "dim")
-    for line in _lines(value, 0):
+    for line in lines_of(value, 0):
         say(line)
 
 
@@ -108,19 +108,19 @@ def _part(fields: Any, path: str) -> Any:
     return value
 
 
-def _lines(value: Any, depth: int) -> Iterator[str]:
-    """A value as rostopic shows it: a field a line."""
+def lines_of(value: Any, depth: int) -> Iterator[str]:
+    """A value as rostopic shows it: a field a line, fit for a terminal."""
     indent = "  " * depth
     if isinstance(value, Mapping):
         for name, inner in value.items():
             if _is_deep(inner):
                 yield f"{indent}{printable(str(name))}:"
-                yield from _lines(inner, depth + 1)
+                yield from lines_of(inner, depth + 1)
             else:
                 yield f"{indent}{printable(str(name))}: {_plain(inner)}"
     elif _is_deep(value):
         for row in value:
-            first, *rest = _lines(row, 0)
+            first, *rest = lines_of(row, 0)
             yield f"{indent}- {first}"
             yield from (f"{indent}  {line}" for line in rest)
     else:

@@ -4,6 +4,7 @@ import asyncio
 import itertools
 import time
 from collections.abc import Callable
+from typing import Any
 
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
@@ -16,6 +17,7 @@ from appliance.control.errors import SenselessError, UnknownThingError
 
 _PATIENCE_SECONDS = 10.0
 _LONGEST_NOTE = 300
+_MOST_TOPICS = 20
 _Answer = messages.RecordingBegun | messages.RecordingRemoved | messages.RecordingRefused
 
 
@@ -105,15 +107,32 @@ class RecordingOrders:
 
     async def fetch(self, request: admin.RecordingFetch, who: str) -> Recording:
         """Say that somebody takes its messages, which he reads where they lie."""
+        return await self._given_out(request.id, "recording fetched", f"by {who}", who)
+
+    async def read(self, request: admin.RecordingRead, who: str) -> Recording:
+        """Say that somebody reads some of its messages; what is read again within seconds is counted."""
+        topics = [topic[:_LONGEST_NOTE] for topic in request.topics[:_MOST_TOPICS]]
+        what = ", ".join(topics) or "all topics"
+        return await self._given_out(
+            request.id, "recording read", f"messages of {what}, by {who}", who, reads=True, topics=topics
+        )
+
+    async def _given_out(
+        self, recording_id: str, event: str, reason: str, who: str, *, reads: bool = False, **detail: Any
+    ) -> Recording:
+        """The recording, once it is on record who has messages of it."""
         self._require()
-        recording = self._find(request.id)
+        recording = self._find(recording_id)
         self._trail.happened(
-            "recording fetched",
-            f"by {who}",
+            event,
+            reason,
             severity=Severity.NOTICE,
+            resource=recording.id,
+            reads=reads,
             recording=recording.id,
             sha256=recording.sha256,
             who=who,
+            **detail,
         )
         failure = await self._trail.durable()
         if failure is not None:

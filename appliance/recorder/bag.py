@@ -11,11 +11,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-_MAGIC = b"#ROSBAG V2.0\n"
+MAGIC = b"#ROSBAG V2.0\n"
 _HEAD_SIZE = 4096
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
-_MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = (bytes([op]) for op in (2, 3, 4, 5, 6, 7))
-_INDEX_ENTRY = struct.Struct("<III")
+MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = (bytes([op]) for op in (2, 3, 4, 5, 6, 7))
+INDEX_ENTRY = struct.Struct("<III")
 _COUNT = struct.Struct("<II")
 _BILLION = 1_000_000_000
 
@@ -39,7 +39,7 @@ class BagWriter:
             self._file.truncate(size)
             self._file.seek(size)
         else:
-            self._file.write(_MAGIC + _bag_header(0, 0, 0))
+            self._file.write(MAGIC + _bag_header(0, 0, 0))
 
     def connect(self, header: Mapping[str, str]) -> int:
         """Begin a connection with this header (topic, type, md5sum, message_definition, callerid, …); its number."""
@@ -56,15 +56,15 @@ class BagWriter:
                 index[message.connection] = []
                 chunk += self._connection(message.connection)
             stamp = divmod(message.time, _BILLION)
-            index[message.connection].append(_INDEX_ENTRY.pack(*stamp, len(chunk)))
+            index[message.connection].append(INDEX_ENTRY.pack(*stamp, len(chunk)))
             conn, time = _U32.pack(message.connection), struct.pack("<II", *stamp)
-            chunk += _record({"op": _MESSAGE, "conn": conn, "time": time}, message.body)
+            chunk += _record({"op": MESSAGE, "conn": conn, "time": time}, message.body)
             first, last = min(first, message.time), max(last, message.time)
         if index:
             size = _U32.pack(len(chunk))
-            self._file.write(_record({"op": _CHUNK, "compression": b"none", "size": size}, chunk))
+            self._file.write(_record({"op": CHUNK, "compression": b"none", "size": size}, chunk))
             for number, entries in index.items():
-                fields = {"op": _INDEX, "ver": _U32.pack(1), "conn": _U32.pack(number)}
+                fields = {"op": INDEX, "ver": _U32.pack(1), "conn": _U32.pack(number)}
                 self._file.write(_record(fields | {"count": _U32.pack(len(entries))}, b"".join(entries)))
         self._file.flush()
         return self._file.tell()
@@ -83,12 +83,12 @@ class BagWriter:
                 self._file.write(self._connection(number))
             for info in infos:
                 self._file.write(info)
-            self._file.seek(len(_MAGIC))
+            self._file.seek(len(MAGIC))
             self._file.write(_bag_header(end, len(self._connections), len(infos)))
 
     def _connection(self, number: int) -> bytes:
         header = self._connections[number]
-        fields = {"op": _CONNECTION, "conn": _U32.pack(number), "topic": header["topic"].encode()}
+        fields = {"op": CONNECTION, "conn": _U32.pack(number), "topic": header["topic"].encode()}
         return _record(
             fields,
             _fields({name: value.encode("utf-8", "surrogateescape") for name, value in header.items()}),
@@ -97,15 +97,15 @@ class BagWriter:
     def _chunk_infos(self, end: int) -> list[bytes]:
         """A record for each chunk: where it is, its time, and how many messages of which connection it has."""
         chunks: list[tuple[int, list[tuple[int, int]], list[tuple[int, int]]]] = []
-        at = len(_MAGIC) + _HEAD_SIZE
+        at = len(MAGIC) + _HEAD_SIZE
         while at < end:
             self._file.seek(at)
-            fields = self._read_fields()
+            fields = read_fields(self._file)
             size = _U32.unpack(self._file.read(4))[0]
-            if fields["op"] == _CHUNK:
+            if fields["op"] == CHUNK:
                 chunks.append((at, [], []))
             else:
-                times = [(entry[0], entry[1]) for entry in _INDEX_ENTRY.iter_unpack(self._file.read(size))]
+                times = [(entry[0], entry[1]) for entry in INDEX_ENTRY.iter_unpack(self._file.read(size))]
                 self._file.seek(-size, 1)
                 chunks[-1][1].append((_U32.unpack(fields["conn"])[0], len(times)))
                 chunks[-1][2].extend((min(times), max(times)))
@@ -116,7 +116,7 @@ class BagWriter:
         return [
             _record(
                 {
-                    "op": _CHUNK_INFO,
+                    "op": CHUNK_INFO,
                     "ver": _U32.pack(1),
                     "chunk_pos": _U64.pack(place),
                     "start_time": struct.pack("<II", *min(times)),
@@ -128,20 +128,27 @@ class BagWriter:
             for place, counts, times in chunks
         ]
 
-    def _read_fields(self) -> dict[str, bytes]:
-        data = self._file.read(_U32.unpack(self._file.read(4))[0])
-        fields, at = {}, 0
-        while at < len(data):
-            end = at + 4 + _U32.unpack_from(data, at)[0]
-            name, _, value = data[at + 4 : end].partition(b"=")
-            fields[name.decode()] = value
-            at = end
-        return fields
+
+def read_fields(file: BinaryIO) -> dict[str, bytes]:
+    """The fields of the record that begins where the file stands; what follows is the length of its data."""
+    data = file.read(_U32.unpack(file.read(4))[0])
+    return fields_of(data)
+
+
+def fields_of(data: bytes) -> dict[str, bytes]:
+    """The fields of a header: of a record, or of a connection."""
+    fields, at = {}, 0
+    while at < len(data):
+        end = at + 4 + _U32.unpack_from(data, at)[0]
+        name, _, value = data[at + 4 : end].partition(b"=")
+        fields[name.decode()] = value
+        at = end
+    return fields
 
 
 def _bag_header(index: int, connections: int, chunks: int) -> bytes:
     """The first record, padded to its fixed size."""
-    fields = {"op": _BAG, "index_pos": _U64.pack(index)}
+    fields = {"op": BAG, "index_pos": _U64.pack(index)}
     fields |= {"conn_count": _U32.pack(connections), "chunk_count": _U32.pack(chunks)}
     padding = _HEAD_SIZE - len(_record(fields, b""))
     return _record(fields, b" " * padding)

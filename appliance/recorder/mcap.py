@@ -9,24 +9,25 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from rosbags.interfaces import Connection, ConnectionExtRosbag1
-from rosbags.rosbag1 import Reader
+from appliance.recorder.bag_reader import BagReader
 
 _MAGIC = b"\x89MCAP0\r\n"
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)
 _STATISTICS, _DATA_END = 0x0B, 0x0F
 _CHUNK_BYTES = 1 << 20
+_LONGEST = 1 << 32
+_OF_SENDER = ("md5sum", "callerid", "host", "latching")
 
 
 def as_mcap(bag: Path) -> Iterator[bytes]:
-    """The pieces of the MCAP file. Raises `OSError`, `rosbags.rosbag1.ReaderError` and `ValueError` for no good bag."""
-    with Reader(bag) as reader:
-        writer = _Writer()
+    """The pieces of the MCAP file. Raises `OSError`, and `ValueError` for no good bag."""
+    with BagReader.of(bag) as reader:
+        writer = _Writer(reader.connections)
         head = _MAGIC + _record(_HEADER, _text("ros1"), _text("rosrv"))
         yield head
         writer.position = len(head)
-        for connection, time, data in reader.messages():
-            writer.add(connection, time, data)
+        for place, connection in reader.messages(reader.connections.keys()):
+            writer.add(connection, place.time, reader.body(place, _LONGEST)[1])
             if len(writer.chunk) >= _CHUNK_BYTES:
                 yield writer.close_chunk()
         yield writer.close_chunk()
@@ -36,7 +37,8 @@ def as_mcap(bag: Path) -> Iterator[bytes]:
 class _Writer:
     """Collects a chunk, and what the summary says; `position` is where the next piece begins."""
 
-    def __init__(self) -> None:
+    def __init__(self, connections: Mapping[int, Mapping[str, str]]) -> None:
+        self._connections = connections
         self.position = 0
         self.chunk = bytearray()
         self._index: dict[int, list[tuple[int, int]]] = {}
@@ -47,19 +49,19 @@ class _Writer:
         self._counts: Counter[int] = Counter()
         self._times: tuple[int, int] = (0, 0)
 
-    def add(self, connection: Connection, time: int, data: bytes | memoryview) -> None:
+    def add(self, connection: int, time: int, data: bytes) -> None:
         """A message; before the first of its connection comes what describes it."""
-        channel = self._numbers.get(connection.id) or self._describe(connection)
+        channel = self._numbers.get(connection) or self._describe(connection)
         self._index.setdefault(channel, []).append((time, len(self.chunk)))
         head = struct.pack("<HIQQ", channel, self._counts[channel] & 0xFFFFFFFF, time, time)
-        self.chunk += _record(_MESSAGE, head, bytes(data))
+        self.chunk += _record(_MESSAGE, head, data)
         first, last = self._times
         self._times = (min(first, time), max(last, time)) if self._counts else (time, time)
         self._counts[channel] += 1
 
-    def _describe(self, connection: Connection) -> int:
-        package, _, kind = connection.msgtype.partition("/")
-        name, text = f"{package}/{kind.rpartition('/')[2]}", connection.msgdef.data
+    def _describe(self, connection: int) -> int:
+        header = self._connections[connection]
+        name, text = header["type"], header["message_definition"]
         if (name, text) not in self._schemas:
             number = len(self._schemas) + 1
             self._schemas[name, text] = _record(
@@ -67,17 +69,14 @@ class _Writer:
             )
             self.chunk += self._schemas[name, text]
         schema = list(self._schemas).index((name, text)) + 1
-        channel = self._numbers[connection.id] = len(self._numbers) + 1
-        of_publisher = {"md5sum": connection.digest}
-        if isinstance(connection.ext, ConnectionExtRosbag1):
-            said = {"callerid": connection.ext.callerid, "latching": str(connection.ext.latching or 0)}
-            of_publisher |= {key: value for key, value in said.items() if value is not None}
+        channel = self._numbers[connection] = len(self._numbers) + 1
+        of_sender = {"latching": "0"} | {key: header[key] for key in _OF_SENDER if key in header}
         self._channels[channel] = _record(
             _CHANNEL,
             struct.pack("<HH", channel, schema),
-            _text(connection.topic),
+            _text(header["topic"]),
             _text("ros1"),
-            _map(b"".join(_text(key) + _text(value) for key, value in of_publisher.items())),
+            _map(b"".join(_text(key) + _text(value) for key, value in of_sender.items())),
         )
         self.chunk += self._channels[channel]
         return channel

@@ -20,14 +20,19 @@ _HOUR = 3600 * 1_000_000_000
 _LONGEST_TEXT = 300
 
 
+def kinds_of(event: str, decision: str | None, severity: Severity) -> list[TriggerKind]:
+    """What a record may trigger as; empty when it is no trigger."""
+    kinds: list[TriggerKind] = [_BY_EVENT[event]] if event in _BY_EVENT else []
+    if decision == "deny":
+        kinds.append("denial")
+    if severity is Severity.ALARM:
+        kinds.append("alarm")
+    return kinds
+
+
 def trigger_of(record: Record, wanted: Collection[TriggerKind]) -> Trigger | None:
     """The record as a trigger of one of the kinds that are wanted; None when it is none."""
-    kinds: list[TriggerKind] = [_BY_EVENT[record.event]] if record.event in _BY_EVENT else []
-    if record.decision == "deny":
-        kinds.append("denial")
-    if record.severity is Severity.ALARM:
-        kinds.append("alarm")
-    for what in kinds:
+    for what in kinds_of(record.event, record.decision, record.severity):
         if what in wanted:
             text = f"{record.event}: {record.reason}" if record.reason else record.event
             return Trigger(record.time, what, record.id, text[:_LONGEST_TEXT])

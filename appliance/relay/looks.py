@@ -5,7 +5,6 @@ is bounded: `ros/reading.py` cuts long values, and a look has at most `MOST_MESS
 a look and a publisher. A topic that nobody looks into costs nothing.
 """
 
-import hashlib
 import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -14,13 +13,10 @@ from typing import Any
 from appliance.channel.messages import LookWanted, Message, MessageSeen
 from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.topic import RelayedTopic
-from appliance.ros.definitions import Definitions
-from appliance.ros.errors import DefinitionError
-from appliance.ros.reading import read_bytes, read_fields
+from appliance.ros.reading import PublisherReader
 
 MOST_LOOKS = 8
 MOST_MESSAGES = 20
-_OF_NOTHING = hashlib.md5(b"", usedforsecurity=False).hexdigest()  # the md5sum of std_msgs/Empty
 
 Tap = Callable[[Batch], None]
 
@@ -72,30 +68,11 @@ class _Reader:
     def __init__(self, topic: RelayedTopic) -> None:
         self._topic = topic
         self._header: Mapping[str, str] | None = None
-        self._definitions: Definitions | None = None
-        self._why = ""
+        self._reader = PublisherReader({})
 
     def read(self, data: bytes) -> tuple[str, dict[str, Any], str]:
         """The type, the fields, and why there are none but the first bytes."""
         header = self._topic.header or {}
-        kind = header.get("type", "")
         if header is not self._header:
-            self._header, self._definitions, self._why = header, None, ""
-            try:
-                self._definitions = _definitions(kind, header)
-            except DefinitionError as error:
-                self._why = f": {str(error)[:300]}"
-        fields = read_fields(self._definitions, kind, data) if self._definitions is not None else None
-        if fields is not None:
-            return kind, fields, ""
-        why = f"the definition in the publisher's header cannot be read{self._why}"
-        return kind, {"data": read_bytes(data)}, why
-
-
-def _definitions(kind: str, header: Mapping[str, str]) -> Definitions:
-    text = header.get("message_definition", "")
-    if not text.strip() and header.get("md5sum") != _OF_NOTHING:
-        raise DefinitionError("there is none", kind[:200])
-    definitions = Definitions.from_full_text(kind, text)
-    definitions.md5sum(kind)  # all types are there, and none contains itself
-    return definitions
+            self._header, self._reader = header, PublisherReader(header)
+        return self._reader.type, *self._reader.read(data)

@@ -4,8 +4,10 @@ What cannot be read is said (`…`): the bytes may be cut off, or a stranger's. 
 shortened, and it is said how much is left out (`… 344 more`); the result is plain values that a log can hold.
 """
 
+import hashlib
 import math
 import struct
+from collections.abc import Mapping
 from itertools import islice
 from typing import Any
 
@@ -21,6 +23,7 @@ _MOST_STEPS = 2_000
 CUT = "…"
 
 _LENGTH = struct.Struct("<I")
+_OF_NOTHING = hashlib.md5(b"", usedforsecurity=False).hexdigest()  # the md5sum of std_msgs/Empty
 
 
 class _EndError(Exception):
@@ -151,3 +154,33 @@ def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, A
         return fields
     except DefinitionError:
         return None
+
+
+class PublisherReader:
+    """Reads the messages of one publisher by the definition in its connection header, which is read once."""
+
+    def __init__(self, header: Mapping[str, str]) -> None:
+        self.type = header.get("type", "")
+        self._definitions: Definitions | None = None
+        self._why = ""
+        try:
+            self._definitions = _definitions(self.type, header)
+        except DefinitionError as error:
+            self._why = f": {str(error)[:300]}"
+
+    def read(self, data: bytes) -> tuple[dict[str, Any], str]:
+        """The fields of a message, and why there are none but the first bytes (else empty)."""
+        fields = read_fields(self._definitions, self.type, data) if self._definitions is not None else None
+        if fields is not None:
+            return fields, ""
+        why = f"the definition in the publisher's header cannot be read{self._why}"
+        return {"data": read_bytes(data)}, why
+
+
+def _definitions(kind: str, header: Mapping[str, str]) -> Definitions:
+    text = header.get("message_definition", "")
+    if not text.strip() and header.get("md5sum") != _OF_NOTHING:
+        raise DefinitionError("there is none", kind[:200])
+    definitions = Definitions.from_full_text(kind, text)
+    definitions.md5sum(kind)  # all types are there, and none contains itself
+    return definitions

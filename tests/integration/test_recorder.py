@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from appliance.api.contract import EXAMPLES
 from appliance.recorder.mcap import as_mcap
 from tests.support.appliance import ROSRV, Appliance
 from tests.support.nodes import RosSession, has_ros
@@ -121,6 +122,16 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
     assert closed["detail"]["recording"] == row["id"]
     assert closed["detail"]["sha256"] == row["sha256"] == hashlib.sha256(bag.read_bytes()).hexdigest()
     assert appliance.recorded(event="recording fetched")[0]["detail"]["who"] == "operator"
+    shown = json.loads(appliance.rosrv("record", "timeline", row["id"], "--columns", "20", "--json").stdout)
+    flows = {flow["topic"]: flow for flow in shown["topics"]}
+    assert sum(flows["/chatter"]["counts"]) == len(chatter)
+    assert [sender["node"] for sender in flows["/rude"]["senders"]] == ["/lout"]
+    assert row["triggers"][0]["record"] in {one["record"] for one in shown["events"] if one["kind"] == "drop"}
+    assert "/rude" in appliance.rosrv("record", "timeline", row["id"]).stdout
+    lines = appliance.rosrv("record", "messages", row["id"], "--topic", "/rude", "--json").stdout.splitlines()
+    assert json.loads(lines[0])["fields"]["data"].startswith("bad")
+    assert "data: bad" in appliance.rosrv("record", "messages", row["id"], "--topic", "/rude").stdout
+    assert appliance.recorded(event="recording read")[0]["detail"]["topics"] == ["/rude"]
     folder = appliance.state / "recordings" / row["id"]
     if os.geteuid() == 0:
         assert (folder.stat().st_uid, folder.stat().st_gid) == (61019, 61014)
@@ -204,18 +215,34 @@ def test_over_rest_messages_are_for_investigators(
     (tmp_path / "bag").write_bytes(bag.body)
     mcap = investigator.get(f"{path}/bag?format=mcap")
     assert (mcap.status, mcap.body) == (200, b"".join(as_mcap(tmp_path / "bag")))
+    around = f"{path}/messages?at=1970-01-01T00:00:00Z&topic=/chatter"
+    for other in (viewer, operator, admin):
+        assert other.get(around).status == 403
+        assert other.get(f"{path}/timeline").status == 200
+    read = investigator.get(around).json
+    assert (read["chosen"], read["messages"][0]["sender"]["node"]) == (0, "/voice")
+    assert read["messages"][0].keys() == EXAMPLES["RecordedMessages"]["messages"][0].keys()
+    assert viewer.get(f"{path}/timeline").json.keys() == EXAMPLES["Timeline"].keys()
+    following = investigator.get(f"{path}/messages?at={read['messages'][-1]['place']}").json
+    assert following["messages"][following["chosen"]] == read["messages"][-1]
+    assert investigator.get(f"{path}/messages?at=nonsense").status == 422
+    assert viewer.get(f"{path}/timeline?since=2100-01-01").status == 422
+    assert appliance.recorded(event="recording read")[0]["detail"]["who"] == "the-investigator"
     taken = tmp_path / "taken.bag"
-    done = subprocess.run(
-        [
-            *(ROSRV, "record", "fetch", row["id"], "--out", str(taken), "--api", str(appliance.ready["api"])),
-            *("--api-ca", str(appliance.state / "api" / "certificate.pem")),
-        ],
-        env=os.environ | {"ROSRV_TOKEN": secret},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    done = {}
+    for verb in (("fetch", row["id"], "--out", str(taken)), ("timeline", row["id"]), ("messages", row["id"])):
+        done[verb[0]] = subprocess.run(
+            [
+                *(ROSRV, "record", *verb, "--api", str(appliance.ready["api"])),
+                *("--api-ca", str(appliance.state / "api" / "certificate.pem")),
+            ],
+            env=os.environ | {"ROSRV_TOKEN": secret},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+    assert "/chatter" in done["timeline"]
+    assert "data: " in done["messages"]
     assert taken.read_bytes() == bag.body
     assert set(heard) <= set(said(ros, taken, "/chatter"))
     fetches = appliance.recorded(event="recording fetched", count=2)

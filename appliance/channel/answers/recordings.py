@@ -1,12 +1,13 @@
 """Recordings of the flight recorder: what was said before and after something happened, and where it is kept."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
 from appliance.channel.answers.field_docs import told
 
 TriggerKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "order"]
+EventKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "notice"]
 
 
 class Trigger(msgspec.Struct, frozen=True):
@@ -56,3 +57,81 @@ class Recordings(msgspec.Struct, frozen=True):
     """All recordings that are kept, the oldest first."""
 
     recordings: list[Recording]
+
+
+class Sender(msgspec.Struct, frozen=True):
+    """A node that published, and its machine; of what monitors published the host is empty."""
+
+    node: str
+    host: str
+
+
+class RecordedFlow(msgspec.Struct, frozen=True):
+    """When a topic said something: so many messages in each column of the time line."""
+
+    topic: str
+    type: str
+    senders: Annotated[list[Sender], told("who published it")]
+    counts: Annotated[list[int], told("messages in each column, in their order")]
+
+
+class EventMarks(msgspec.Struct, frozen=True):
+    """When events of a kind happened: so many in each column of the time line, those that are not listed included."""
+
+    kind: EventKind
+    counts: Annotated[list[int], told("events in each column, in their order")]
+
+
+class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
+    """What an audit record of that time says; `notice` is what is no trigger: a change by people, for example."""
+
+    time: Annotated[int, told("nanoseconds since the epoch")]
+    kind: EventKind
+    record: Annotated[str, told("id of the audit record")]
+    event: str
+    severity: str
+    decision: Annotated[str | None, told("allow, deny or would deny; null: nothing was decided")]
+    host: Annotated[str | None, told("of whom it is about")]
+    caller_id: str | None
+    resource: Annotated[str | None, told("topic, service, call or monitor")]
+    reason: Annotated[str, told("why, in words")]
+
+
+class Timeline(msgspec.Struct, frozen=True):
+    """A recording, or a part of it, in columns of equal time: what flowed, and what happened."""
+
+    id: str
+    since: Annotated[int, told("where the first column begins: nanoseconds since the epoch")]
+    until: Annotated[int, told("the last moment of the last column: nanoseconds since the epoch")]
+    topics: Annotated[
+        list[RecordedFlow], told("by their names, those of the recording without a message here too")
+    ]
+    more_topics: Annotated[int, told("topics with fewer messages that are left out, in number")]
+    marks: Annotated[list[EventMarks], told("of each kind that happened")]
+    events: Annotated[list[RecordedEvent], told("the first of them, in their order")]
+    more_events: Annotated[
+        int, told("further events of this time, which a shorter part would list, in number")
+    ]
+
+
+class RecordedMessage(msgspec.Struct, frozen=True):
+    """A message of a recording as its publisher sent it, before the monitors."""
+
+    time: Annotated[int, told("when the relay received it: nanoseconds since the epoch")]
+    place: Annotated[str, told("where it is in the recording; `at` takes it")]
+    topic: str
+    type: str
+    sender: Annotated[Sender, told("who published it")]
+    size: Annotated[int, told("bytes, without those of its length")]
+    fields: Annotated[dict[str, Any], told("as those of a message of /v1/messages")]
+    why: Annotated[str, told("why there are no fields but the first bytes; else empty")]
+
+
+class RecordedMessages(msgspec.Struct, frozen=True):
+    """Messages of a recording around a moment, in their order."""
+
+    id: str
+    messages: list[RecordedMessage]
+    chosen: Annotated[
+        int, told("position of the first one at that moment or after it; their number: there is none")
+    ]

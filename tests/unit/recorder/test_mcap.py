@@ -1,9 +1,8 @@
-"""MCAP: another library reads what was written, with types, senders and times."""
+"""MCAP: another library reads what was written, with types, senders and their hosts, and times."""
 
 from pathlib import Path
 
 import pytest
-from rosbags.rosbag1 import ReaderError
 from rosbags.rosbag2.storage_mcap import McapReader
 
 from appliance.recorder.bag import BagWriter, Message
@@ -24,6 +23,7 @@ def read(path: Path, bag: Path) -> tuple[list[tuple[str, str, int]], list[tuple[
         found = [(one.topic, time, bytes(data)) for one, time, data in reader.messages(reader.connections)]
         assert all(schema.encoding == "ros2msg" for schema in reader.schemas.values())
         assert all(channel.message_encoding == "ros2" for channel in reader.channels.values())
+        assert all(b"host\x08\0\0\x0010.0.0.1" in channel.metadata for channel in reader.channels.values())
         return connections, found
     finally:
         reader.close()
@@ -60,5 +60,5 @@ def test_a_bag_without_messages_is_a_file(tmp_path: Path) -> None:
 def test_what_is_no_bag_is_an_error(tmp_path: Path) -> None:
     """Before the first byte."""
     (tmp_path / "a.bag").write_text("no bag")
-    with pytest.raises(ReaderError):
+    with pytest.raises(ValueError, match="no bag"):
         next(as_mcap(tmp_path / "a.bag"))

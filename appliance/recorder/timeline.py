@@ -1,0 +1,231 @@
+"""A recording on a time line, and its messages around a moment: what people ask after an incident.
+
+Both are bounded, however large the recording is: a time line has so many columns, topics and events, and says what it
+leaves out; of messages so many are read. Messages are read within the bounds of `ros/reading.py`.
+
+What happened is read from the bag as well, from the audit records that the recorder has written into it: retention may
+have removed them from the log since. A publisher of the same topic has a host in its header; the recorder has none.
+"""
+
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from itertools import islice
+from pathlib import Path
+
+import msgspec
+
+from appliance.audit.record import Severity
+from appliance.channel.answers.recordings import (
+    EventKind,
+    EventMarks,
+    RecordedEvent,
+    RecordedFlow,
+    RecordedMessage,
+    RecordedMessages,
+    Recording,
+    Sender,
+    Timeline,
+)
+from appliance.recorder.bag import INDEX_ENTRY
+from appliance.recorder.bag_reader import BagReader, Place
+from appliance.recorder.recording import LOG, RECORDS
+from appliance.recorder.triggers import kinds_of
+from appliance.ros.reading import PublisherReader
+
+COLUMNS, MOST_COLUMNS = 200, 1000
+NEIGHBOURS, MOST_NEIGHBOURS = 5, 25
+MOST_TOPICS = 300
+MOST_EVENTS = 500
+_MOST_BYTES = 1 << 20  # of a message: what is read for people ends long before
+_LONGEST_RECORD = 1 << 22
+_SECOND = 1_000_000_000
+_NOTABLE = (Severity.NOTICE, Severity.WARNING, Severity.ALARM)
+
+
+class _Said(msgspec.Struct):
+    """What is taken from an audit record."""
+
+    id: str
+    event: str
+    severity: Severity
+    decision: str | None = None
+    host: str | None = None
+    caller_id: str | None = None
+    resource: str | None = None
+    reason: str = ""
+
+
+class _Columns:
+    """Equal parts of the time from `since` to `until`, both included."""
+
+    def __init__(self, since: int, until: int, number: int) -> None:
+        self.since, self.until, self.number = since, until, number
+        self._width = (until - since) // number + 1
+
+    def count(self, times: Iterable[int], counts: list[int]) -> None:
+        """Count each in its column; what is outside counts nowhere."""
+        for time in times:
+            if self.since <= time <= self.until:
+                counts[(time - self.since) // self._width] += 1
+
+    def only(self, first: int, last: int) -> int | None:
+        """The column that has all from `first` to `last`; None when there is no such."""
+        if first < self.since or last > self.until:
+            return None
+        column = (first - self.since) // self._width
+        return column if (last - self.since) // self._width == column else None
+
+
+def timeline(
+    recording: Recording,
+    bag: Path,
+    since: int | None = None,
+    until: int | None = None,
+    columns: int = COLUMNS,
+) -> Timeline:
+    """The time line from `since` to `until` (nanoseconds since the epoch; None: the recording's own ends).
+
+    Raises `OSError`, and `ValueError` where there is no such time in it or the bag is no good.
+    """
+    start = recording.began if since is None else max(since, recording.began)
+    end = recording.ended if until is None else min(until, recording.ended)
+    if start >= end:
+        raise ValueError("that is no part of the recording's time")
+    wanted = _Columns(start, end, columns)
+    with BagReader.of(bag) as reader:
+        flows, counts = _flows(reader, wanted), defaultdict[str, list[int]](lambda: [0] * columns)
+        events: list[RecordedEvent] = []
+        happened = 0
+        for event in _events(reader, start, end):
+            wanted.count((event.time,), counts[event.kind])
+            happened += 1
+            if len(events) < MOST_EVENTS:
+                events.append(event)
+    kept = sorted(flows, key=lambda flow: -sum(flow.counts))[:MOST_TOPICS]
+    return Timeline(
+        recording.id,
+        start,
+        end,
+        sorted(kept, key=lambda flow: flow.topic),
+        len(flows) - len(kept),
+        [EventMarks(kind, counts[kind]) for kind in EventKind.__args__ if kind in counts],  # type: ignore[attr-defined]
+        events,
+        happened - len(events),
+    )
+
+
+def _flows(reader: BagReader, wanted: _Columns) -> list[RecordedFlow]:
+    """When each topic said something."""
+    flows: dict[tuple[str, str], RecordedFlow] = {}
+    of: dict[int, RecordedFlow] = {}
+    for number in _of_nodes(reader):
+        header = reader.connections[number]
+        kind = (header["topic"], header["type"])
+        flow = of[number] = flows.setdefault(kind, RecordedFlow(*kind, [], [0] * wanted.number))
+        if (sender := _sender(header)) not in flow.senders:
+            flow.senders.append(sender)
+    for chunk in reader.chunks:
+        if chunk.first > wanted.until or chunk.last < wanted.since:
+            continue
+        column = wanted.only(chunk.first, chunk.last)
+        for number, entries in reader.index(chunk):
+            if number not in of:
+                continue
+            if column is not None:
+                of[number].counts[column] += len(entries) // INDEX_ENTRY.size
+            else:
+                times = (entry[0] * _SECOND + entry[1] for entry in INDEX_ENTRY.iter_unpack(entries))
+                wanted.count(times, of[number].counts)
+    return list(flows.values())
+
+
+def _events(reader: BagReader, since: int, until: int) -> Iterator[RecordedEvent]:
+    """What happened in that time, in its order."""
+    records = {
+        number
+        for number, header in reader.connections.items()
+        if header["topic"] == RECORDS and "host" not in header
+    }
+    for place, _number in reader.messages(records, since):
+        if place.time > until:
+            return
+        _size, body = reader.body(place, _LONGEST_RECORD)
+        said = msgspec.json.decode(body[4:], type=_Said)
+        kind = _kind(said)
+        if kind is not None:
+            yield RecordedEvent(
+                time=place.time,
+                kind=kind,
+                record=said.id,
+                event=said.event,
+                severity=said.severity.value,
+                decision=said.decision,
+                host=said.host,
+                caller_id=said.caller_id,
+                resource=said.resource,
+                reason=said.reason,
+            )
+
+
+def _kind(said: _Said) -> EventKind | None:
+    """What a record is on the time line; None: nothing that people look for there."""
+    kinds = kinds_of(said.event, said.decision, said.severity)
+    if kinds:
+        return kinds[0]  # type: ignore[return-value]  # those of records are both
+    if said.decision == "would deny":
+        return "denial"
+    return "notice" if said.severity in _NOTABLE else None
+
+
+def messages_around(
+    recording: Recording,
+    bag: Path,
+    at: int | Place,
+    topics: Collection[str] = (),
+    neighbours: int = NEIGHBOURS,
+) -> RecordedMessages:
+    """So many messages before a moment, and then one more than that from it on; at a place, beginning with its message.
+
+    `topics`: of these alone; empty: of all. Raises `OSError`, and `ValueError` when the bag is no good.
+    """
+    place = at if isinstance(at, Place) else Place(at, 0, 0)
+    with BagReader.of(bag) as reader:
+        wanted = {
+            number
+            for number in _of_nodes(reader)
+            if not topics or reader.connections[number]["topic"] in topics
+        }
+        before = reader.before(place, wanted, neighbours)
+        later = (found for found in reader.messages(wanted, place.time) if found[0] >= place)
+        readers: dict[int, PublisherReader] = {}
+        messages = []
+        for found, number in [*before, *islice(later, neighbours + 1)]:
+            header = reader.connections[number]
+            if number not in readers:
+                readers[number] = PublisherReader(header)
+            size, data = reader.body(found, _MOST_BYTES)
+            fields, why = readers[number].read(data)
+            messages.append(
+                RecordedMessage(
+                    found.time,
+                    str(found),
+                    header["topic"],
+                    header["type"],
+                    _sender(header),
+                    size,
+                    fields,
+                    why,
+                )
+            )
+    return RecordedMessages(recording.id, messages, len(before))
+
+
+def _of_nodes(reader: BagReader) -> Iterator[int]:
+    """The connections of publishers: all but those that the recorder itself wrote."""
+    for number, header in reader.connections.items():
+        if header["topic"] not in (RECORDS, LOG) or "host" in header:
+            yield number
+
+
+def _sender(header: Mapping[str, str]) -> Sender:
+    return Sender(header.get("callerid", ""), header.get("host", ""))

@@ -1,0 +1,160 @@
+"""The time line of a recording, and messages around a moment: read from a bag as the recorder writes it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.channel.answers.recordings import Recording, Sender
+from appliance.recorder.bag import BagWriter, Message
+from appliance.recorder.bag_reader import BagReader, Place
+from appliance.recorder.timeline import MOST_EVENTS, messages_around, timeline
+from tests.unit.recorder.test_bag import HEADER, SECOND, body
+
+BEGAN = 100 * SECOND
+RECORDING = Recording(
+    "a" * 20, BEGAN, BEGAN + 10 * SECOND - 1, [], [], 1, 1, 0, "", complete=True, why_not=""
+)
+RECORDS = {name: value for name, value in HEADER.items() if name != "host"} | {
+    "topic": "/rosrv/records",
+    "callerid": "/rosrv",
+}
+
+
+def record(number: int, **fields: Any) -> bytes:
+    """An audit record as the recorder writes it."""
+    own = {"id": f"{number:020x}", "event": "decision", "severity": "info", "reason": "so", "detail": {}}
+    return body(json.dumps(own | fields).encode())
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    """Two publishers of /chatter that say ten things a second each, in chunks that overlap; and what happened."""
+    path = tmp_path / "a.bag"
+    writer = BagWriter(path, {})
+    first = writer.connect(HEADER)
+    second = writer.connect(HEADER | {"callerid": "/other", "host": "10.0.0.2"})
+    for part in range(4):
+        for number, connection in enumerate((first, second)):
+            start = BEGAN + part * 2 * SECOND + number * SECOND // 20
+            writer.write(
+                Message(connection, start + step * SECOND // 10, body(b"%d.%d" % (part, step)))
+                for step in range(20)
+            )
+    decided = writer.connect(RECORDS)
+    writer.write([
+        Message(decided, BEGAN + SECOND, record(1, event="rest call")),
+        Message(decided, BEGAN + 2 * SECOND, record(2, event="message dropped", severity="warning")),
+        Message(decided, BEGAN + 3 * SECOND, record(3, decision="deny", severity="warning", host="10.0.0.9")),
+        Message(decided, BEGAN + 9 * SECOND, record(4, event="policy loaded", severity="notice")),
+    ])  # fmt: skip
+    writer.close()
+    return path
+
+
+def test_flows_and_events_stand_in_their_columns(bag: Path) -> None:
+    """Of both publishers together; what only looked is no event; a part of the time has its own columns."""
+    found = timeline(RECORDING, bag, columns=10)
+    [flow] = found.topics
+    assert (flow.topic, flow.counts) == ("/chatter", [20] * 8 + [0, 0])
+    assert flow.senders == [Sender("/talker", "10.0.0.1"), Sender("/other", "10.0.0.2")]
+    assert [(event.kind, event.record[-1]) for event in found.events] == [
+        ("drop", "2"), ("denial", "3"), ("notice", "4"),
+    ]  # fmt: skip
+    assert {mark.kind: mark.counts.index(1) for mark in found.marks} == {"drop": 2, "denial": 3, "notice": 9}
+    part = timeline(RECORDING, bag, BEGAN + 2 * SECOND, BEGAN + 4 * SECOND - 1, columns=4)
+    assert part.topics[0].counts == [10] * 4
+    assert [event.record[-1] for event in part.events] == ["2", "3"]
+    with pytest.raises(ValueError, match="no part"):
+        timeline(RECORDING, bag, BEGAN + 20 * SECOND)
+
+
+def test_the_columns_have_what_a_naive_count_finds(bag: Path) -> None:
+    """However many there are: nothing is counted twice, or lost at an edge."""
+    with BagReader.of(bag) as reader:
+        times = [place.time for place, number in reader.messages({0, 1})]
+    assert times == sorted(times)
+    assert len(times) == 160
+    for columns in (1, 7, 200, 1000):
+        since, until = BEGAN + 123_456_789, BEGAN + 7_654_321_987
+        width = (until - since) // columns + 1
+        naive = [0] * columns
+        for time in times:
+            if since <= time <= until:
+                naive[(time - since) // width] += 1
+        assert timeline(RECORDING, bag, since, until, columns).topics[0].counts == naive
+
+
+def test_messages_around_a_moment_are_read(bag: Path) -> None:
+    """In the order of time over all publishers, each with its sender; from one's place the next page goes on."""
+    found = messages_around(RECORDING, bag, BEGAN + 2 * SECOND, neighbours=2)
+    assert [(one.time - BEGAN, one.sender.node, one.fields["data"]) for one in found.messages] == [
+        (1_900_000_000, "/talker", "0.19"),
+        (1_950_000_000, "/other", "0.19"),
+        (2_000_000_000, "/talker", "1.0"),
+        (2_050_000_000, "/other", "1.0"),
+        (2_100_000_000, "/talker", "1.1"),
+    ]
+    assert found.chosen == 2
+    last = Place.parsed(found.messages[-1].place)
+    assert last is not None
+    following = messages_around(RECORDING, bag, last, neighbours=2)
+    assert following.messages[following.chosen] == found.messages[-1]
+    assert [one.fields["data"] for one in following.messages[:2]] == ["1.0", "1.0"]
+    assert messages_around(RECORDING, bag, 0, neighbours=3).chosen == 0
+    end = messages_around(RECORDING, bag, 2**60, neighbours=3)
+    assert (end.chosen, len(end.messages)) == (3, 3)
+    assert messages_around(RECORDING, bag, BEGAN, ["/nothing"]).messages == []
+
+
+def test_pages_of_one_moment_end(tmp_path: Path) -> None:
+    """Messages that came at one time have an order, too: whoever goes on sees each of them, once."""
+    writer = BagWriter(tmp_path / "a.bag", {})
+    number = writer.connect(HEADER)
+    writer.write(Message(number, BEGAN, body(b"%d" % step)) for step in range(9))
+    writer.close()
+    seen: list[str] = []
+    at: int | Place = 0
+    while True:
+        found = messages_around(RECORDING, tmp_path / "a.bag", at, neighbours=1)
+        seen += [one.fields["data"] for one in found.messages[found.chosen + (at != 0) :]]
+        after = Place.parsed(found.messages[-1].place)
+        assert after is not None
+        if after == at:
+            break
+        at = after
+    assert seen == [str(step) for step in range(9)]
+
+
+def test_no_publisher_makes_events(tmp_path: Path) -> None:
+    """What a node says on the recorder's own topic is a message like any other."""
+    writer = BagWriter(tmp_path / "a.bag", {})
+    forger = writer.connect(RECORDS | {"host": "10.0.0.66"})
+    writer.write([Message(forger, BEGAN, record(1, event="message dropped", severity="alarm"))])
+    writer.close()
+    found = timeline(RECORDING, tmp_path / "a.bag")
+    assert (found.events, found.marks) == ([], [])
+    assert [(flow.topic, sum(flow.counts)) for flow in found.topics] == [("/rosrv/records", 1)]
+    assert len(messages_around(RECORDING, tmp_path / "a.bag", BEGAN).messages) == 1
+
+
+def test_a_flood_of_events_is_counted(tmp_path: Path) -> None:
+    """The first are listed, all are in the columns."""
+    writer = BagWriter(tmp_path / "a.bag", {})
+    decided = writer.connect(RECORDS)
+    writer.write(
+        Message(decided, BEGAN + number, record(number, decision="deny")) for number in range(MOST_EVENTS + 7)
+    )
+    writer.close()
+    found = timeline(RECORDING, tmp_path / "a.bag")
+    assert (len(found.events), found.more_events) == (MOST_EVENTS, 7)
+    assert sum(found.marks[0].counts) == MOST_EVENTS + 7
+
+
+@pytest.mark.parametrize("torn", [b"no bag", b"#ROSBAG V2.0\n", None])
+def test_what_is_no_whole_bag_is_an_error(bag: Path, torn: bytes | None) -> None:
+    """Said, whatever is wrong with it."""
+    bag.write_bytes(bag.read_bytes()[:-50] if torn is None else torn)
+    with pytest.raises(ValueError, match="bag"):
+        timeline(RECORDING, bag)
