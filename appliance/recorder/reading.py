@@ -26,6 +26,9 @@ from appliance.ros.tcpros import decode_header
 _LENGTH = struct.Struct("<I")
 _LONGEST_HEADER = 256 << 10
 _NEEDED = frozenset({"topic", "type", "md5sum", "message_definition", "callerid", "host"})
+_LONGEST_TYPE = 256
+MOST_MESSAGES = 1 << 53
+"""No stream has so many."""
 
 _Blocks = dict[int, tuple[int, Row]]
 """The blocks of a chain by their number, each with its row."""
@@ -82,7 +85,8 @@ class RingReader:
     def read(self, since: int, until: int) -> Iterator[Found]:
         """What has come since the last call, of the time between these two (nanoseconds since the epoch).
 
-        What is later is for a later call: it may have come while this one reads.
+        What is later is for a later call: it may have come while this one reads. Where something earlier follows it,
+        the clock was set back, and it is left out.
         """
         headers: dict[int, _Blocks] = {}
         data: dict[int, _Blocks] = {}
@@ -109,7 +113,7 @@ class RingReader:
             header = decode_header(bytes(text[_LENGTH.size :]))
         except ProtocolError:
             return None
-        return header if header.keys() >= _NEEDED else None
+        return _readable(header) if header.keys() >= _NEEDED else None
 
     def _copy(self, block: int, row: Row) -> bytes | None:
         """The part of a block that counts; None if it has been taken for something else meanwhile.
@@ -150,7 +154,7 @@ class RingReader:
         batches: list[Batch] = []
         place, torn = self.places.get(stream), False
         for run in self._runs(blocks, place):
-            at = run.begins if run.broken else 0 if place is None else place.offset
+            at = done = run.begins if run.broken else 0 if place is None else place.offset
             in_doubt = (
                 run.broken
             )  # until the first record says whether what is missing is of the time asked for
@@ -162,26 +166,36 @@ class RingReader:
                 if at + RECORD.size > len(view):
                     break
                 mark, messages, size, time, first = RECORD.unpack_from(view, at)
-                if mark != MARK:
-                    torn, at = True, len(view)  # nobody knows where the next record begins
+                if mark != MARK or first > MOST_MESSAGES:
+                    torn, done = True, len(view)  # nobody knows where the next record begins
                     break
                 torn, in_doubt = torn or (in_doubt and time >= since), False
                 end = at + RECORD.size + size
                 if end > len(view):
                     break
+                body, at = view[at + RECORD.size : end], end
                 if time > until:
-                    break
+                    continue
+                done = end
                 if time >= since:
-                    frames = _frames(view[at + RECORD.size : end], messages)
+                    frames = _frames(body, messages)
                     if frames is None:
                         torn = True
                     else:
                         batches.append(Batch(time, first, frames))
-                at = end
             torn = torn or in_doubt
-            blocks_read, offset = divmod(at, self._geometry.block)
+            blocks_read, offset = divmod(done, self._geometry.block)
             self.places[stream] = Place(run.number + blocks_read, offset)
         return batches, torn
+
+
+def _readable(header: dict[str, str]) -> dict[str, str]:
+    """The header so that tools read a bag with it: a definition's comments may have any bytes, fields any text."""
+    definition = header["message_definition"].encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    plain = {name: header[name][:_LONGEST_TYPE] for name in ("type", "md5sum")}
+    if "latching" in header:
+        plain["latching"] = "1" if header["latching"] == "1" else "0"
+    return header | plain | {"message_definition": definition}
 
 
 def _frames(view: memoryview, messages: int) -> list[memoryview] | None:

@@ -197,7 +197,9 @@ class Recorder:
         if trigger.what != "order" and not self._limit.take(trigger.what, self._clock()):
             return f"this hour has its {self._rules.per_hour} recordings of this kind (recorder.per_hour)"
         self._remove_surplus(room=True)
-        began = max(self._memory, trigger.time - int(before * _SECOND))
+        began = trigger.time - int(before * _SECOND)
+        if self._memory <= trigger.time:  # else the clock was set back since
+            began = max(self._memory, began)
         ends = min(ends, began + int(self._rules.longest * _SECOND))
         progress = Progress(self._ids.next(), self._memory, began, ends, [trigger])
         self._making = self._in_progress(progress)
@@ -215,6 +217,9 @@ class Recorder:
         if self._making is None:
             return
         now, progress = self._clock(), self._making.progress
+        if now < progress.began:
+            progress.why_not = "the clock was set back while it was made"
+            now = progress.began
         if now <= progress.ends:
             self._making.step()
         elif not self._revisions_asked:

@@ -6,6 +6,8 @@ Invariants:
    life of the recorder cuts the bag there and goes on: the memory still has what was not written.
 2. What is missing is said: by topic where the numbers of messages have a gap, in words where nobody can count it.
 3. A bag has no more than `largest` bytes, the decisions of its time not counted in.
+4. The headers of its connections have no more than `_MOST_HEADERS` bytes: publishers choose them, and they stand in
+   `progress`, and again at the bag's end.
 """
 
 import hashlib
@@ -21,16 +23,16 @@ from appliance.audit.record import Severity
 from appliance.channel.answers.recordings import RecordedTopic, Recording, Trigger
 from appliance.channel.messages import RevisionsStated
 from appliance.recorder.bag import BagWriter, Message
-from appliance.recorder.reading import Found, Place, RingReader
-from appliance.recorder.shelf import ABOUT, BAG
+from appliance.recorder.reading import MOST_MESSAGES, Found, Place, RingReader
+from appliance.recorder.shelf import ABOUT, BAG, PROGRESS
 from appliance.ros.log_message import ERROR, INFO, TYPE, WARN, log_message
 from appliance.ros.standard import standard_definitions
 
 RECORDS, LOG = "/rosrv/records", "/rosrv/log"
 MOST_TRIGGERS = 200
-_PROGRESS = "progress"
 _CHUNK = 1 << 20
 _MOST_NAMED = 10
+_MOST_HEADERS = 8 << 20
 _LENGTH = struct.Struct("<I")
 _LEVELS = {Severity.WARNING: WARN, Severity.ALARM: ERROR}
 
@@ -66,13 +68,15 @@ class Progress(msgspec.Struct):
     not_there: list[tuple[int, int]] = []
     topics: list[Counted] = []
     torn: list[str] = []
+    unconnected: int = 0
+    """Messages of connections beyond `_MOST_HEADERS`."""
     why_not: str = ""
     """Why it ended before its time."""
 
 
 def load_progress(folder: Path) -> Progress:
     """How far the recording in `folder` is. Raises `OSError` and `msgspec.MsgspecError`."""
-    return msgspec.msgpack.decode((folder / _PROGRESS).read_bytes(), type=Progress)
+    return msgspec.msgpack.decode((folder / PROGRESS).read_bytes(), type=Progress)
 
 
 class RecordingInProgress:
@@ -89,6 +93,7 @@ class RecordingInProgress:
         self._largest = largest
         self._bag = BagWriter(folder / BAG, dict(enumerate(progress.connections)), progress.size)
         self._numbers = {_key(header): number for number, header in enumerate(progress.connections)}
+        self._headers = sum(map(_length, progress.connections))
         self._topics = {(row.topic, row.type, row.md5sum): row for row in progress.topics}
         places = progress.places or [{} for _ring in rings]
         self._readers = [RingReader(ring, dict(read)) for ring, read in zip(rings, places, strict=False)]
@@ -103,25 +108,31 @@ class RecordingInProgress:
             for found in reader.read(progress.began, progress.ends):
                 self._take(found, progress.following[number])
         progress.places = [reader.places for reader in self._readers]
-        new = self._folder / f"{_PROGRESS}.new"
+        new = self._folder / f"{PROGRESS}.new"
         new.write_bytes(msgspec.msgpack.encode(progress))
-        new.replace(self._folder / _PROGRESS)
+        new.replace(self._folder / PROGRESS)
 
     def _take(self, found: Found, following: dict[int, int]) -> None:
         progress, header = self.progress, found.header
+        if found.torn and found.stream not in following and header["topic"] not in progress.torn:
+            progress.torn.append(header["topic"])
+        if not found.batches:
+            return
+        if _key(header) not in self._numbers and self._headers + _length(header) > _MOST_HEADERS:
+            progress.unconnected += sum(len(batch.frames) for batch in found.batches)
+            return
+        connection = self._connection(header)
         row = self._topics.get(kind := (header["topic"], header["type"], header["md5sum"]))
         if row is None:
             row = self._topics[kind] = Counted(*kind)
             progress.topics.append(row)
-        if found.torn and found.stream not in following and row.topic not in progress.torn:
-            progress.torn.append(row.topic)
-        connection = self._connection(header)
         waiting: list[Message] = []
         size = 0
         for batch in found.batches:
-            row.missed += batch.first - following.get(found.stream, batch.first)
+            gap = max(0, batch.first - following.get(found.stream, batch.first))
+            row.missed = min(row.missed + gap, MOST_MESSAGES)
             following[found.stream] = batch.first + len(batch.frames)
-            if progress.size + size > self._largest:
+            if progress.size + size + self._headers > self._largest:
                 progress.why_not = f"it reached {self._largest} bytes, an eighth of recorder.disk"
                 row.missed += len(batch.frames)
                 continue
@@ -141,6 +152,7 @@ class RecordingInProgress:
         if number is None:
             number = self._numbers[_key(header)] = self._bag.connect(header)
             self.progress.connections.append(dict(header))
+            self._headers += _length(header)
         return number
 
     def leave(self) -> None:
@@ -179,7 +191,6 @@ class RecordingInProgress:
             about.flush()
             os.fchmod(about.fileno(), 0o640)
             os.fsync(about.fileno())
-        (self._folder / _PROGRESS).unlink(missing_ok=True)
         folder = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
         os.fsync(folder)
         os.close(folder)
@@ -192,6 +203,8 @@ class RecordingInProgress:
         missed = sum(row.missed for row in progress.topics)
         if missed:
             reasons.append(f"{missed} messages had no room (see topics)")
+        if progress.unconnected:
+            reasons.append(f"{progress.unconnected} messages of too many different connections")
         if progress.torn:
             named = ", ".join(progress.torn[:_MOST_NAMED]) + (
                 " and others" if progress.torn[_MOST_NAMED:] else ""
@@ -235,6 +248,10 @@ class RecordingInProgress:
                 self._bag.write(waiting)
                 waiting = []
         self._bag.write(waiting)
+
+
+def _length(header: dict[str, str]) -> int:
+    return sum(len(name) + len(value.encode()) for name, value in header.items())
 
 
 def _key(header: dict[str, str]) -> tuple[tuple[str, str], ...]:

@@ -4,7 +4,8 @@ Invariants:
 
 1. A folder with the name of a recording is whole: it gets that name when all that is in it is on disk.
 2. All of them together never have more than `disk` bytes: room for the largest is made before one is begun. Of the kind
-   of trigger whose recordings have most of it, the oldest goes: who causes many loses none of others.
+   of trigger whose recordings have most of it, the oldest goes: who causes many loses none of others. So it does where
+   their descriptions have more than `_MOST_DESCRIBED` bytes, for control is told of all of them in one message.
 3. `noted` in a folder says that the audit log has the recording; what was not noted is told again.
 """
 
@@ -19,8 +20,9 @@ import structlog
 
 from appliance.channel.answers.recordings import Recording
 
-BAG, ABOUT = "recording.bag", "recording.json"
+BAG, ABOUT, PROGRESS = "recording.bag", "recording.json", "progress"
 MOST_KEPT = 500
+_MOST_DESCRIBED = 32 << 20
 _NOTED = "noted"
 _ID = re.compile(r"[0-9a-f]{20}")
 _PART = re.compile(r"\.([0-9a-f]{20})\.part")
@@ -36,6 +38,7 @@ class Shelf:
         self._disk = disk
         self._seconds = seconds
         self.recordings = sorted(self._read(), key=lambda recording: recording.id)
+        self._described = {found.id: self._length(found) for found in self.recordings}
 
     def _read(self) -> Iterator[Recording]:
         for path in self._folder.iterdir():
@@ -44,6 +47,9 @@ class Shelf:
                     yield msgspec.json.decode((path / ABOUT).read_bytes(), type=Recording)
                 except (OSError, msgspec.MsgspecError) as error:
                     _log.error("a recording cannot be read", recording=path.name, error=str(error))
+
+    def _length(self, recording: Recording) -> int:
+        return (self._folder / recording.id / ABOUT).stat().st_size
 
     @property
     def largest(self) -> int:
@@ -64,9 +70,12 @@ class Shelf:
         return sorted(path for path in self._folder.iterdir() if _PART.fullmatch(path.name))
 
     def keep(self, recording: Recording) -> None:
-        """A recording is whole, and all of it on disk."""
-        self.part(recording.id).rename(self._folder / recording.id)
+        """A recording is whole, and all of it on disk; only what has no name yet needs `progress`."""
+        kept = self._folder / recording.id
+        self.part(recording.id).rename(kept)
+        (kept / PROGRESS).unlink(missing_ok=True)
         self.recordings.append(recording)
+        self._described[recording.id] = self._length(recording)
 
     def find(self, recording_id: str) -> Recording | None:
         """The recording of this id; None when there is none."""
@@ -76,6 +85,7 @@ class Shelf:
         """Take a recording away. Raises `OSError`."""
         shutil.rmtree(self._folder / recording.id)
         self.recordings.remove(recording)
+        del self._described[recording.id]
 
     def note(self, recording_id: str) -> None:
         """The audit log has it."""
@@ -101,6 +111,8 @@ class Shelf:
                 why = "recorder.disk is used up"
             elif len(self.recordings) >= MOST_KEPT:
                 why = f"there are {MOST_KEPT} recordings"
+            elif sum(self._described.values()) > _MOST_DESCRIBED:
+                why = f"the descriptions of all recordings have more than {_MOST_DESCRIBED} bytes"
             else:
                 break
             sizes = self._sizes()

@@ -53,7 +53,7 @@ class HourlyLimit:
     def take(self, what: TriggerKind, now: int) -> bool:
         """Whether a recording may begin now (nanoseconds since the epoch); then it counts."""
         begun = self._of(what)
-        while begun and begun[0] + _HOUR <= now:
+        while begun and not begun[0] <= now < begun[0] + _HOUR:  # or the clock was set back
             begun.popleft()
         if len(begun) >= self._most:
             return False

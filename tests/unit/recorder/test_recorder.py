@@ -263,3 +263,82 @@ def test_revisions_are_those_that_control_said_last(scene: Scene) -> None:
     scene.later(0, messages.RevisionsStated(4, 2))
     [recording] = scene.closed(scene.later(6))
     assert (recording.policy, recording.monitors) == (4, 2)
+
+
+def test_a_header_that_is_no_text_spoils_no_recording(scene: Scene) -> None:
+    """A definition's comments may be in Latin-1, and a field anything: the bag can be read all the same."""
+    hostile = {"message_definition": "# caf\udce9\nstring data\n", "latching": "x", "type": "t" * 10_000}
+    scene.stream = scene.writer.open("/cafe", "10.0.0.2", HEADER | hostile)
+    scene.said = 0
+    scene.say()
+    scene.happen()
+    scene.later(0.1)
+    scene.begin_anew()
+    scene.later(1)
+    [recording] = scene.closed(scene.later(6))
+    assert sorted(topic.topic for topic in recording.topics) == ["/cafe", "/chatter"]
+    assert {topic for topic, _time, _data in scene.bag(recording)} >= {"/cafe", "/chatter"}
+    with Reader(scene.folder / recording.id / "recording.bag") as reader:
+        [cafe] = [connection for connection in reader.connections if connection.topic == "/cafe"]
+    assert cafe.msgdef.data == "# caf\ufffd\nstring data\n"
+
+
+def test_a_recorder_killed_after_the_last_write_has_lost_nothing(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All is on disk but the recording's name: the next start of the appliance, whose memory is another, gives it."""
+    scene.happen()
+    scene.later(0.1)
+
+    def killed(_shelf: Shelf, _recording: Recording) -> None:
+        raise SystemExit
+
+    monkeypatch.setattr(Shelf, "keep", killed)
+    with pytest.raises(SystemExit):
+        scene.later(6)
+    monkeypatch.undo()
+    [part] = scene.folder.iterdir()
+    scene.born = scene.clock.now = BEGAN + 100 * SECOND
+    scene.recorder = scene.make_recorder()
+    [recording] = scene.closed(scene.later(0))
+    assert part.name == f".{recording.id}.part"
+    assert [data for name, _time, data in scene.bag(recording) if name == "/chatter"] == [TEXT]
+
+
+def test_a_clock_that_is_set_back_ends_a_recording_and_stops_none_that_follow(scene: Scene) -> None:
+    """An hour back, to before the memory was made: the recording ends, and the next has what was said since."""
+    scene.happen()
+    scene.later(0.1)
+    scene.clock.now -= 100 * SECOND
+    [cut] = scene.closed(scene.later(0))
+    assert (cut.complete, cut.why_not) == (False, "the clock was set back while it was made")
+    assert cut.began <= cut.ended
+    scene.say()
+    scene.happen()
+    scene.later(0.1)
+    [recording] = scene.closed(scene.later(6))
+    assert [data for name, _time, data in scene.bag(recording) if name == "/chatter"] == [TEXT]
+    assert recording.ended == scene.clock.now - int(1.1 * SECOND)
+
+
+def test_connections_that_always_come_with_another_header_are_bounded(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What they said is missing, and the recording says so; others are in it."""
+    monkeypatch.setattr("appliance.recorder.recording._MOST_HEADERS", 20_000)
+    scene.happen()
+    scene.later(0.1)
+    quiet = scene.stream
+    for number in range(30):
+        definition = f"# {number} {'x' * 5000}\nstring data\n"
+        scene.stream = scene.writer.open("/many", "10.0.0.2", HEADER | {"message_definition": definition})
+        scene.said = 0
+        scene.say()
+        scene.stream.close()
+        scene.later(0.1)
+    scene.stream, scene.said = quiet, 1
+    scene.say()
+    [recording] = scene.closed(scene.later(6))
+    assert recording.why_not == "27 messages of too many different connections"
+    assert {topic.topic: topic.messages for topic in recording.topics} == {"/chatter": 2, "/many": 3}
+    assert recording.size < 100_000

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import msgspec
+import pytest
 
 from appliance.channel.answers.recordings import Recording, Trigger, TriggerKind
 from appliance.recorder.shelf import ABOUT, Shelf
@@ -74,6 +75,18 @@ def test_who_has_most_makes_room(tmp_path: Path) -> None:
     assert not cleared(shelf, room=True)
     put(shelf, recording(8, "drop", 8 * MIB))
     assert cleared(shelf, room=True) == [(recording(3, "drop", 8 * MIB), "recorder.disk is used up")]
+
+
+def test_descriptions_have_room_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Control is told of all recordings in one message, however many topics they have."""
+    monkeypatch.setattr("appliance.recorder.shelf._MOST_DESCRIBED", 1000)
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    for number in range(1, 9):
+        put(shelf, recording(number))
+    cleared(shelf, room=True)
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    left = [(tmp_path / found.id / "recording.json").stat().st_size for found in shelf.recordings]
+    assert 0 < sum(left) <= 1000
 
 
 def test_what_is_too_old_goes(tmp_path: Path) -> None:
