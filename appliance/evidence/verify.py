@@ -18,11 +18,15 @@ program in it: take it from an appliance (`rosrv evidence verifier`).
 
 from __future__ import annotations
 
+import sys
+
+if __name__ == "__main__" and not (sys.flags.isolated or getattr(sys.flags, "safe_path", False)):
+    del sys.path[0]  # the folder that this lies in: who filled it may have put a json.py there
+
 import argparse
 import hashlib
 import json
 import subprocess
-import sys
 import tempfile
 import zipfile
 from pathlib import Path
@@ -35,6 +39,7 @@ COLUMNS = (
     "sequence", "id", "time", "version", "event", "severity", "decision", "host", "caller_id", "category", "resource",
     "rule", "rule_key", "rule_file", "rule_line", "revision", "reason", "duration_us",
 )  # fmt: skip
+MOST = 16 << 20  # bytes of a member that is read at once, or of a line
 CHAIN = {"previous", "hash", "then", "checkpoint"}
 SEALED = ("log", "number", "sequence", "hash", "time", "previous", "removed")
 Opener = Callable[[str], Any]
@@ -42,6 +47,11 @@ Opener = Callable[[str], Any]
 
 def sha256(data: bytes) -> bytes:
     return hashlib.sha256(data).digest()
+
+
+def printable(text: str) -> str:
+    """Without what a terminal would obey: a bundle may have anything in the place of a number."""
+    return "".join(one if one.isprintable() else ascii(one)[1:-1] for one in text)
 
 
 def unhexed(text: str) -> bytes:
@@ -113,7 +123,10 @@ class Verifier:
 
     def read(self, name: str) -> bytes:
         with self.open(name) as file:
-            return bytes(file.read())
+            data = bytes(file.read(MOST + 1))
+        if len(data) > MOST:
+            raise ValueError(f"{name} has more than {MOST} bytes")
+        return data
 
     def look_at_members(self) -> None:
         """Rule 1."""
@@ -202,7 +215,7 @@ class Verifier:
         # How far the chain leads, its hash there, and the first record that no checkpoint seals yet.
         place, digest, begin = 0, b"", 0
         with self.open(name) as lines:
-            for line in lines:
+            for line in iter(lambda: lines.readline(MOST), b""):
                 record = json.loads(line)
                 chain, sequence = record["chain"], record["sequence"]
                 written = json.dumps(record, separators=(",", ":")).encode() + b"\n"
@@ -288,15 +301,16 @@ def main(arguments: list[str]) -> int:
             names, opener = opened(given.bundle)
             key = Path(folder, "key")
             with given.key.open("rb") if given.key else opener("audit.pub") as file:
-                key.write_bytes(file.read())
+                key.write_bytes(file.read(MOST))
             lines = given.checkpoints.read_text().splitlines() if given.checkpoints else []
             copies = {copy["number"]: copy for copy in map(json.loads, lines)}
             verifier = Verifier(names, opener, key, copies)
         except Exception as error:
-            print(f"nothing can be verified: {error}")
+            print(printable(f"nothing can be verified: {error}"))
             return 2
         verifier.run()
-    findings, notes = [*dict.fromkeys(verifier.findings)], verifier.notes
+    findings = [*dict.fromkeys(map(printable, verifier.findings))]
+    notes = [*map(printable, verifier.notes)]
     if given.json:
         counts = {"checkpoints": verifier.checkpoints, "kept_elsewhere": verifier.agreeing}
         print(

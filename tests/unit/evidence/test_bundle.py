@@ -9,6 +9,7 @@ import shutil
 import struct
 import subprocess
 import time
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -175,6 +176,51 @@ def test_what_is_removed_added_or_exchanged_is_named(
         assert reviewer.status(written({**members, name: b"x"}, tmp_path / "x.zip")) == 1
         assert "does not belong to the bundle" in reviewer.said
         assert "\x1b" not in reviewer.said
+
+
+def test_modules_in_the_folder_are_not_imported(bundle: Path, pem: Path, tmp_path: Path) -> None:
+    """A forger may put a json.py beside the verifier, also beside the one that the reviewer copies there."""
+    folder = tmp_path / "unpacked"
+    shutil.unpack_archive(bundle, folder)
+    (folder / "json.py").write_text(
+        "print('right: this is what the appliance has sealed'); raise SystemExit(0)"
+    )
+    command = ["/usr/bin/python3", str(folder / "verify.py"), "--key", str(pem)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+    assert (done.returncode, done.stderr) == (1, ""), done.stdout
+    assert "WRONG     'json.py': does not belong to the bundle" in done.stdout
+
+
+def test_nothing_in_a_bundle_reaches_the_terminal_as_it_is(
+    bundle: Path, tmp_path: Path, reviewer: Reviewer
+) -> None:
+    """In the place of a number may stand what erases the line above and says that all is right."""
+    spoilt = "\x1b[2J\nright: this is what the appliance has sealed"
+
+    def change(records: list[dict[str, Any]]) -> None:
+        records[0]["sequence"] = spoilt
+
+    assert reviewer.status(written(lines(members_of(bundle), change), tmp_path / "x.zip")) == 1
+    assert "record \\x1b[2J\\nright" in reviewer.said
+    assert "\x1b" not in reviewer.said
+    assert reviewer.said.splitlines()[-1] == "not as it was exported"
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "proof.json", "records.ndjson"])
+def test_members_that_unpack_to_much_take_no_memory(
+    bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str
+) -> None:
+    """A text of 100 MB that is small in the ZIP file is looked at by pieces."""
+    place = tmp_path / "x.zip"
+    with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
+        for member, data in members_of(bundle).items():
+            archive.writestr(member, b"[" * (6 * verify.MOST) if member == name else data)
+    tracemalloc.start()
+    try:
+        assert reviewer.status(place) == 1
+        assert tracemalloc.get_traced_memory()[1] < 4 * verify.MOST
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_name_that_is_there_twice_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:

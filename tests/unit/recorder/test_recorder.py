@@ -19,7 +19,7 @@ from appliance.recorder.recorder import SETTLE_SECONDS, Recorder
 from appliance.recorder.ring import SMALLEST, RingWriter
 from appliance.recorder.shelf import Shelf
 from tests.support.audit import decision, settle
-from tests.unit.recorder.test_ring import HEADER, Clock, frame
+from tests.unit.recorder.test_ring import HEADER, Clock, frame, opened
 
 SECOND = 1_000_000_000
 BEGAN = 1_000 * SECOND
@@ -331,7 +331,7 @@ def test_connections_that_always_come_with_another_header_are_bounded(
     quiet = scene.stream
     for number in range(30):
         definition = f"# {number} {'x' * 5000}\nstring data\n"
-        scene.stream = scene.writer.open("/many", "10.0.0.2", HEADER | {"message_definition": definition})
+        scene.stream = opened(scene.writer, "/many", "10.0.0.2", message_definition=definition)
         scene.said = 0
         scene.say()
         scene.stream.close()
