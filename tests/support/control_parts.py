@@ -18,11 +18,15 @@ from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
 from appliance.master.graph.revocation import Revocation, revoked
+from appliance.master.reach.carried import Carried
+from appliance.master.reach.places import Places
+from appliance.master.reach.relays import RelayControl
 from appliance.master.rosmaster import RosMaster
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import Entries
 from appliance.master.upkeep.liveness import Liveness, LivenessSettings, Watchlist
 from appliance.master.upkeep.reconcile import Reconciler
+from appliance.metrics import Meter
 from appliance.policy import compile_policy
 from appliance.policy.model import Address, Decision
 from appliance.ros.uris import node_uri, parse_node_uri
@@ -30,6 +34,8 @@ from appliance.ros.xmlrpc import Limits, Value, build_call, parse_response
 from appliance.rpc.client import CallFailedError, RefusedError
 from appliance.rpc.server import HttpRequest, Peer
 from appliance.shares.pool import Standing
+from appliance.store.state import StateStore
+from tests.support.idle import idle, idle_class
 from tests.support.parameters import mirror
 from tests.support.serving import serving
 
@@ -38,13 +44,6 @@ POLICY = "[Nodes]\ndefault=*\n[Publishers]\n{}default=*\n[Subscribers]\n{}defaul
 OPEN = POLICY.format("", "")
 _INNER_PORT = 9
 _TABLES = {"Publisher": Kind.PUBLICATION, "Subscriber": Kind.SUBSCRIPTION, "Service": Kind.SERVICE}
-
-
-class Nothing:
-    """Takes every call and does nothing."""
-
-    def __getattr__(self, _name: str) -> Any:
-        return lambda *_given, **_named: None
 
 
 class Records:
@@ -56,7 +55,7 @@ class Records:
         self.strict = False
         self.obstacle: str | None = None
         self.debt = ""
-        self.meter = Nothing()
+        self.meter = Meter()
 
     def shut_out(self, _host: str) -> str:
         """As `AuditTrail`."""
@@ -93,12 +92,12 @@ class Deliveries:
         """As `Delivery`."""
 
 
-class Relays(Nothing):
+class Relays(idle_class(RelayControl)):  # type: ignore[misc]  # it is made
     """The relays: which nodes they were told of again."""
 
     def __init__(self) -> None:
         self.returned: list[str] = []
-        self.carried = Nothing()
+        self.carried = idle(Carried)
 
     def place_node(self, incarnation: Incarnation) -> None:
         """As `RelayControl`."""
@@ -303,12 +302,12 @@ class ControlParts:
         self.enactor = Noted(
             self.graph,
             self.entries,
-            store=cast(Any, Nothing()),
+            store=idle(StateStore),
             trail=trail,
             delivery=cast(Any, self.deliveries),
-            relay=cast(Any, self.relay),
+            relay=self.relay,
             faces=cast(Any, self.faces),
-            places=cast(Any, Nothing()),
+            places=idle(Places),
         )
         self.reconciler = Reconciler(
             self.rosmaster,

@@ -36,10 +36,13 @@ from appliance.master.graph.effects import (
     WithdrawNode,
 )
 from appliance.master.graph.registry import Incarnation
+from appliance.master.reach.carried import Carried
+from appliance.master.reach.delivery import Delivery
 from appliance.master.reach.relays import RelayControl
 from appliance.ros.xmlrpc import Value
 from appliance.specifications.allocation import Allocation
-from tests.support.control_parts import ControlParts, Nothing
+from tests.support.control_parts import ControlParts
+from tests.support.idle import idle
 
 # The parameters of calls after the caller's name: R a resource, V a value, A the node's API, S that of its service.
 _SHAPES = {
@@ -141,8 +144,8 @@ class Conversation:
             parts.registry,
             parts.grants,
             cast(Any, _Ports()),
-            cast(Any, Nothing()),
-            cast(Any, Nothing()),
+            idle(Delivery),
+            idle(Carried),
             allocation=Allocation(1),
             policy=lambda: parts.current,
             broken=lambda _node: None,

@@ -8,11 +8,14 @@ from typing import Any, cast
 import pytest
 
 from appliance.control.process import _restore
+from appliance.master.graph.grants import Grants
 from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
-from appliance.master.upkeep.enactor import write
+from appliance.master.reach.faces import Faces
+from appliance.master.reach.places import Places
+from appliance.master.upkeep.enactor import Enactor, write
 from appliance.ros.uris import parse_node_uri
 from appliance.store.state import StateStore
-from tests.support.control_parts import Nothing
+from tests.support.idle import idle, idle_class
 
 pytestmark = pytest.mark.anyio
 URI = "http://10.0.0.5:4000/"
@@ -23,7 +26,7 @@ def fail(reason: str) -> None:
     raise AssertionError(reason)
 
 
-class Ports(Nothing):
+class Ports(idle_class(Faces)):  # type: ignore[misc]  # it is made
     """Every port can be had again."""
 
     async def reopen(self, _incarnation: Incarnation) -> list[Durable]:
@@ -51,10 +54,10 @@ async def test_what_comes_back_is_decided_by_the_policy_in_force(tmp_path: Path)
     policies = SimpleNamespace(current="the new policy")
     parts = SimpleNamespace(
         registry=registry,
-        grants=Nothing(),
-        enactor=Nothing(),
+        grants=idle(Grants),
+        enactor=idle(Enactor),
         faces=Ports(),
-        places=Nothing(),
+        places=idle(Places),
         policy_changed=changed,
     )
     base = SimpleNamespace(sockets={}, store=store, policies=policies)

@@ -11,11 +11,15 @@ import pytest
 
 from appliance.master.calls import pipeline
 from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Registry
+from appliance.master.upkeep.enactor import Enactor
+from appliance.metrics import Meter
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.xmlrpc import Value, build_call, parse_response
 from appliance.rpc.server import HttpRequest, Peer
+from tests.support.idle import idle
 from tests.support.parameters import mirror, put
 from tests.support.serving import serving
 
@@ -42,13 +46,6 @@ write /arm/max = adm
 """
 
 
-class Anything:
-    """Takes every call; an awaited one is done at once."""
-
-    def __getattr__(self, _name: str) -> Any:
-        return lambda *_given, **_named: None
-
-
 class Records:
     """The trail: decisions as (call, resource, decision), events by name."""
 
@@ -56,7 +53,7 @@ class Records:
         self.strict = False
         self.obstacle: str | None = None
         self.debt = ""
-        self.meter = Anything()
+        self.meter = Meter()
         self.decisions: list[tuple[str, str, Decision]] = []
         self.events: list[str] = []
 
@@ -96,8 +93,8 @@ class Site:
         self.serve = serving(
             policy=lambda: policy,
             registry=Registry(),
-            graph=Anything(),
-            enactor=Anything(),
+            graph=idle(Graph),
+            enactor=idle(Enactor),
             rosmaster=self,
             mirror=self.parameters,
             trail=self.trail,

@@ -1,0 +1,36 @@
+"""Stand-ins for the parts that a test does not look at."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+T = TypeVar("T")
+
+
+def idle(part: type[T]) -> T:
+    """An object of the class `part` that does nothing; see `idle_class`."""
+    return cast(T, idle_class(part)())
+
+
+def idle_class(part: type[object]) -> Any:
+    """A class like `part` whose public methods do nothing but refuse arguments that `part`'s would not take.
+
+    So what is renamed in the product fails in its tests. Nothing is made of `part`: an object has no attributes.
+    """
+    methods = {
+        name: _idle(method)
+        for name, method in inspect.getmembers(part, inspect.isfunction)
+        if not name.startswith("_")
+    }
+    return type(f"Idle{part.__name__}", (part,), methods | {"__init__": lambda _self: None})
+
+
+def _idle(method: Callable[..., Any]) -> Callable[..., None]:
+    signature = inspect.signature(method)
+
+    @functools.wraps(method)
+    def checked(*given: Any, **named: Any) -> None:
+        signature.bind(*given, **named)
+
+    return checked
