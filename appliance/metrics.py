@@ -76,6 +76,12 @@ METRICS = (
         "what monitors did: verdict, drop, change, fault, log, publish; what several changed counts for each;"
         " `trial drop`, … of those on trial",
     ),
+    Metric(
+        "rosrv_monitor_margin",
+        "gauge",
+        ("monitor", "place", "holds"),
+        "how close a comparison of numbers at this line and column came today (UTC) while it was true, and while not",
+    ),
     Metric("rosrv_monitors", "gauge", ("state",), "monitors: enabled, trial, disabled, holding, failing"),
     Metric("rosrv_nodes", "gauge", ("state",), "nodes: live, or lost and awaited"),
     Metric("rosrv_registrations", "gauge", ("kind",), "registrations of live nodes"),

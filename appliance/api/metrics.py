@@ -118,6 +118,10 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         "rosrv_monitor_dropped_total": [((name,), count) for name, count in body.drop_at.items()],
         "rosrv_monitor_changed_total": [((name,), count) for name, count in body.change_at.items()],
         "rosrv_monitor_events_total": [((kind, name), count) for kind, name, count in body.monitors],
+        "rosrv_monitor_margin": [
+            ((name, place, "true" if holds else "false"), distance)
+            for name, place, holds, distance in body.margins
+        ],
         "rosrv_monitors": [
             (("enabled",), monitors.enabled),
             (("trial",), len(monitors.trials)),

@@ -75,6 +75,10 @@ VERBS: dict[str, Verb | Group] = {
                 "appliance.cli.monitor.running:list_monitors",
                 "Show every monitor: enabled or not, what it listens to, what it did.",
             ),
+            "margins": Verb(
+                "appliance.cli.monitor.running:margins",
+                "Show how close conditions on numbers came, today and since they were loaded.",
+            ),
             "enable": Verb(
                 "appliance.cli.monitor.running:enable",
                 "Let the events of these monitors happen again, or first on trial.",

@@ -1,12 +1,14 @@
 """What control measures, for the api, which makes Prometheus's format of it."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 from typing import TypeVar
 
 from appliance.channel.answers.hosts import Host
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import Status
+from appliance.channel.messages import MonitorRow
 from appliance.control.assembly import Parts
 from appliance.master.graph.registry import Life
 from appliance.master.reach.carried import MOST_RESOURCES, OTHERS, Carried, Traffic
@@ -14,6 +16,7 @@ from appliance.policy.model import Category
 from appliance.specifications.observed import KINDS
 
 MOST_DELAYED = 200  # topics with a histogram of their own
+MOST_MARGINS = 1000  # series
 
 _Labels = tuple[str, str]
 _Number = TypeVar("_Number", int, float)
@@ -48,6 +51,7 @@ def measures_of(parts: Parts, status: Status, hosts: list[Host], queued_deliveri
         relayed=relayed,
         delayed=delayed,
         monitors=[(*labels, count) for labels, count in done.items()],
+        margins=list(islice(_margins(parts.monitors.rows), MOST_MARGINS)),
         drop_at=_at(records.at, "drop"),
         change_at=_at(records.at, "change"),
         limited=[(*labels, count) for labels, count in carried.limited_messages.items()],
@@ -57,6 +61,14 @@ def measures_of(parts: Parts, status: Status, hosts: list[Host], queued_deliveri
         },
         connections=dict(Counter(connection.kind for connection in parts.relay.connections.values())),
     )
+
+
+def _margins(rows: Mapping[str, MonitorRow]) -> Iterator[tuple[str, str, bool, float]]:
+    """The closest approach of the day of each comparison that came up."""
+    for name, row in rows.items():
+        for margin in row.margins:
+            if margin.today is not None:
+                yield name, f"{margin.line}:{margin.column}", margin.holds, margin.today.distance
 
 
 def _at(counts: Mapping[_Labels, int], kind: str) -> dict[str, int]:

@@ -8,8 +8,10 @@ import msgspec
 from appliance.channel import admin
 from appliance.channel.answers import monitors as answers
 from appliance.channel.answers.status import MonitorsState
+from appliance.channel.messages import Approach, MarginRow
 from appliance.control.assembly import Parts
 from appliance.control.errors import UnknownThingError
+from appliance.rosmop.positions import line_of
 from appliance.specifications.files import Sources
 from appliance.specifications.monitors import Monitors, sources_of
 from appliance.specifications.monitors import Replaced as Done
@@ -188,4 +190,18 @@ def _state(monitors: Monitors, name: str) -> answers.MonitorState:
         would_drop=drops if tried else 0,
         would_change=changes if tried else 0,
         missed=row.missed if row is not None else 0,
+        margins=[]
+        if row is None
+        else [_margin(each, monitors.sources.files.get(row.file, "")) for each in row.margins],
+    )
+
+
+def _margin(row: MarginRow, text: str) -> answers.MonitorMargin:
+    def approach(sides: Approach) -> answers.Approach:
+        reached = None if row.threshold is None else (sides.right, sides.left)[row.threshold]
+        return answers.Approach(sides.time / 1e9, sides.left, sides.right, sides.distance, reached)
+
+    today = approach(row.today) if row.today is not None else None
+    return answers.MonitorMargin(
+        row.line, row.column, line_of(text, row.line), row.holds, approach(row.load), today
     )

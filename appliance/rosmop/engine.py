@@ -22,7 +22,8 @@ Theory of operation:
    what would have been done. The copies for one set are given in their order.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
@@ -86,6 +87,32 @@ class Tapped(NamedTuple):
         return self.trial.process_service(self.resource, self.part, self.data, self.time)
 
 
+class Margin(NamedTuple):
+    """How close a comparison of numbers came while it was true (`holds`) or while it was not: its two sides.
+
+    `number` counts the monitor's comparisons in the order of the text; `threshold` is the side that is a constant, 0
+    or 1 (None: neither is).
+    """
+
+    monitor: str
+    number: int
+    position: Position
+    threshold: int | None
+    holds: bool
+    left: float
+    right: float
+
+    @property
+    def distance(self) -> float:
+        """Of the sides."""
+        return abs(self.left - self.right)
+
+    @property
+    def threshold_at(self) -> float | None:
+        """Where the constant would have to stand to be reached; None where neither side is one."""
+        return None if self.threshold is None else (self.right, self.left)[self.threshold]
+
+
 class MonitorSet:
     """Specifications in force together."""
 
@@ -118,6 +145,9 @@ class MonitorSet:
         self._timed = False
         self._walks = Walks()
         self._broken = False
+        for comparison in (each for one in compiled.specifications for each in one.comparisons):
+            for left, right in (comparison.when_true, comparison.when_false):
+                compiled.namespace |= {left: math.inf, right: 0.0}
         self._index()
 
     @classmethod
@@ -130,11 +160,13 @@ class MonitorSet:
         *,
         trials: Collection[str] = (),
         trial_patience: Patience = lambda: _never,
+        margins: bool = False,
     ) -> "MonitorSet":
         """Compile files (name to text) in this order; raises `SpecificationError` with all that is wrong.
 
         `patience()` is asked when something is due: what says whether that has taken too long (`trial_patience` for
-        those on trial). With one that is named in `trials`, all that share variables with it are on trial.
+        those on trial). With one that is named in `trials`, all that share variables with it are on trial. With
+        `margins` they note how close comparisons of numbers come (`take_margins`).
         """
         files: list[tree.File] = []
         findings: list[Finding] = []
@@ -145,23 +177,20 @@ class MonitorSet:
                 findings += error.findings
         if findings:
             raise SpecificationError([*findings, *findings_of(files, definitions)])
-        compiled = compile_files(files, definitions)
+        compiled = compile_files(files, definitions, margins=margins)
         uses = {one.name: one.uses for one in compiled.specifications}
         groups = [group for group in sharing(uses) if not group.isdisjoint(trials)]
         if not groups:
             return cls(compiled, files, on_fault, patience)
-        tried = [cls._trial(_part(files, group), definitions, on_fault, trial_patience) for group in groups]
-        others = compile_files(_part(files, set(uses).difference(*groups)), definitions)
+        tried = []
+        for group in groups:
+            own = _part(files, group)
+            trial = cls(compile_files(own, definitions, margins=margins), own, on_fault, trial_patience)
+            for monitor in trial._monitors:
+                monitor.context.most = TRIAL_BUDGET
+            tried.append(trial)
+        others = compile_files(_part(files, set(uses).difference(*groups)), definitions, margins=margins)
         return cls(replace(others, warnings=compiled.warnings), files, on_fault, patience, tried)
-
-    @classmethod
-    def _trial(
-        cls, files: Sequence[tree.File], definitions: Definitions, on_fault: OnFault, patience: Patience
-    ) -> "MonitorSet":
-        trial = cls(compile_files(files, definitions), files, on_fault, patience)
-        for monitor in trial._monitors:
-            monitor.context.most = TRIAL_BUDGET
-        return trial
 
     # What there is
 
@@ -282,6 +311,19 @@ class MonitorSet:
         monitor = self.monitor(name)
         _come_home(monitor)
         return self._compiled.namespace[monitor.code.variables[variable]]
+
+    def take_margins(self) -> Iterator[Margin]:
+        """How close the comparisons of numbers came since this was asked last: of each that came up in this time, the
+        nearest while it was true and the nearest while it was not.
+        """
+        namespace = self._compiled.namespace
+        for monitor in self.monitors:
+            for number, one in enumerate(monitor.code.comparisons):
+                for holds, sides in ((True, one.when_true), (False, one.when_false)):
+                    left, right = (namespace[name] for name in sides)
+                    if not math.isinf(left):
+                        namespace[sides[0]] = math.inf
+                        yield Margin(monitor.name, number, one.position, one.threshold, holds, left, right)
 
     # What is done to them
 

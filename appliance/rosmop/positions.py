@@ -29,6 +29,12 @@ class Position:
         return f"{self.file}:{self.line}:{self.column}"
 
 
+def line_of(text: str, number: int) -> str:
+    """A line of a specification, counted from 1, without its comment."""
+    lines = text.splitlines()[number - 1 : number]
+    return lines[0].partition("//")[0].strip() if lines else ""
+
+
 @dataclass(frozen=True)
 class Finding:
     """One thing to tell the author of a specification: where, how grave, what, and what to write instead."""

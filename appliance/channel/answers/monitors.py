@@ -15,6 +15,30 @@ Tag = Annotated[
 RvState = tuple[int, int, list[tuple[str, str, int, int]]]
 
 
+class Approach(msgspec.Struct, frozen=True):
+    """How near the sides of a comparison of numbers came to each other."""
+
+    time: Annotated[Moment, told("when, to the second")]
+    left: Annotated[float, told("its left side then")]
+    right: float
+    distance: float
+    threshold_at: Annotated[
+        float | None,
+        told("where the constant would have to stand to be reached; null where neither side is one"),
+    ]
+
+
+class MonitorMargin(msgspec.Struct, frozen=True):
+    """How close a comparison of numbers came while it was true (`holds`), or while it was not."""
+
+    line: int
+    column: int
+    condition: Annotated[str, told("the line of the specification that it stands in")]
+    holds: bool
+    since_load: Annotated[Approach, told("since the monitor was loaded or its relay began")]
+    today: Annotated[Approach | None, told("since midnight (UTC); null while it did not come up today")]
+
+
 class MonitorState(msgspec.Struct, frozen=True):
     """A running monitor; counters since it was loaded or its relay began."""
 
@@ -40,6 +64,9 @@ class MonitorState(msgspec.Struct, frozen=True):
     missed: Annotated[
         int, told("messages that it was not given on trial, or not to the end: its counts are not complete")
     ] = 0
+    margins: Annotated[
+        list[MonitorMargin], told("of its comparisons of numbers that came up, in the order of the text")
+    ] = []
 
 
 class Monitors(msgspec.Struct, frozen=True):

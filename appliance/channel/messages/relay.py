@@ -383,6 +383,33 @@ class MonitorsReported(Message):
     lost: int = 0
 
 
+class Approach(msgspec.Struct, frozen=True, array_like=True):
+    """The sides of a comparison when they were nearest; `time` is nanoseconds since the epoch, to the second."""
+
+    left: float
+    right: float
+    time: int
+
+    @property
+    def distance(self) -> float:
+        """Of the sides."""
+        return abs(self.left - self.right)
+
+
+class MarginRow(msgspec.Struct, frozen=True, array_like=True):
+    """How close a comparison came while it was true (`holds`) or while it was not: since `load`, and `today` (UTC).
+
+    `threshold` is the side that is a constant, 0 or 1; None if neither is.
+    """
+
+    line: int
+    column: int
+    holds: bool
+    threshold: int | None
+    load: Approach
+    today: Approach | None
+
+
 class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     """The state and counters of one running monitor; counters since it was loaded or the relay started.
 
@@ -402,6 +429,7 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     faults: int
     trial: bool = False
     missed: int = 0
+    margins: list[MarginRow] = []
 
 
 class MonitorsCounted(Message):

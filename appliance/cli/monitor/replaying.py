@@ -2,7 +2,7 @@
 
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -20,11 +20,11 @@ from appliance.cli.monitor.running import WIDE
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.progress import progress
 from appliance.cli.running import Appliance, speaks
-from appliance.learning.margins import Compared, Comparison
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet, sharing
+from appliance.rosmop.engine import Margin, MonitorSet, sharing
 from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.positions import Position, line_of
 from appliance.rosmop.syntax.errors import SpecificationError
 
 _KINDS = ("drop", "change", "verdict", "warning", "fault")
@@ -84,22 +84,18 @@ def replay_monitor(
         for bag in bags:
             with closing(open_bag(bag)) as reader:
                 known = definitions_of(reader).extended(definitions)
-                monitors = _only(chosen, MonitorSet.load(texts, known))
+                monitors = _only(chosen, MonitorSet.load(texts, known, margins=margins))
                 for text in refusals(monitors, reader, topics or ["*"]):
                     raise usage_error(f"{bag}: {text}")
                 monitors.write_module()
                 messages += report.of(monitors, reader, bag, topics or ["*"])
-                if margins:
-                    compared = Compared(texts, known)
-                    watched = _only(chosen, compared.monitors())
-                    report.measure(compared, watched, replay(watched, reader, None, topics or ["*"]), bag)
     except SpecificationError as error:
         for finding in error.findings:
             typer.echo(printable(str(finding)), err=True)
         raise typer.Exit(1) from None
     if not as_json:
         report.show()
-    report.show_margins()
+    report.show_margins(texts)
     if not as_json:
         say(f"{counted(messages, 'message')} of {counted(len(bags), 'recording')}")
 
@@ -133,7 +129,7 @@ def _only(chosen: str | None, monitors: MonitorSet) -> MonitorSet:
 class _Closest(NamedTuple):
     """How close a comparison came, and when."""
 
-    distance: float
+    margin: Margin
     bag: Path
     time: int
     number: int | None
@@ -146,7 +142,7 @@ class _Report:
         self._most = most
         self._as_json = as_json
         self._counts: Counter[tuple[str, str, str]] = Counter()
-        self._closest: dict[tuple[Comparison, bool], _Closest] = {}
+        self._closest: dict[tuple[Position, int, bool], _Closest] = {}
 
     def of(self, monitors: MonitorSet, reader: Reader, bag: Path, topics: Sequence[str]) -> int:
         """A recording; how many messages there were."""
@@ -156,34 +152,32 @@ class _Report:
                 given += replayed.topic is not None
                 for found in _found(replayed.outcome):
                     self._say(bag, replayed, found)
+                for margin in monitors.take_margins():
+                    known = self._closest.get(key := (margin.position, margin.number, not margin.holds))
+                    if known is None or margin.distance < known.margin.distance:
+                        self._closest[key] = _Closest(margin, bag, replayed.outcome.time, replayed.index)
                 if not number % _TOLD_EVERY:
                     told(given)
         return given
 
-    def measure(
-        self, compared: Compared, monitors: MonitorSet, messages: Iterator[Replayed], bag: Path
-    ) -> None:
-        """How close the comparisons come in a recording."""
-        for replayed in messages:
-            for key, distance in compared.distances(monitors).items():
-                if key not in self._closest or distance < self._closest[key].distance:
-                    self._closest[key] = _Closest(distance, bag, replayed.outcome.time, replayed.index)
-
-    def show_margins(self) -> None:
+    def show_margins(self, texts: Mapping[str, str]) -> None:
         """How close each comparison came, while it was true and while it was not."""
-        for one, truth in sorted(self._closest, key=lambda key: (key[0].position, not key[1])):
-            distance, bag, time, number = self._closest[one, truth]
+        for _key, (margin, bag, time, number) in sorted(self._closest.items()):
+            position = margin.position
             if self._as_json:
                 say_json({
-                    "kind": "margin", "monitor": one.specification, "file": one.position.file,
-                    "line": one.position.line, "column": one.position.column, "holds": truth,
-                    "distance": distance, "bag": str(bag), "time": time / BILLION, "index": number,
+                    "kind": "margin", "monitor": margin.monitor, "file": position.file,
+                    "line": position.line, "column": position.column, "holds": margin.holds,
+                    "distance": margin.distance, "left": margin.left, "right": margin.right,
+                    "threshold_at": margin.threshold_at, "bag": str(bag), "time": time / BILLION, "index": number,
                 })  # fmt: skip
             else:
                 place = "" if number is None else f" #{number}"
-                word = "true" if truth else "false"
+                line = line_of(texts[position.file], position.line)
                 where = f"{bag} {time / BILLION:.3f}{place}"
-                say(f"{one.position}: {one.line}: {word} by {distance:.6g} at the closest ({where})")
+                word = "true" if margin.holds else "false"
+                sides = f"{margin.left:.6g} against {margin.right:.6g}"
+                say(f"{position}: {line}: {word} by {margin.distance:.6g} at the closest, {sides} ({where})")
 
     def _say(self, bag: Path, replayed: Replayed, found: _Found) -> None:
         where, outcome = replayed.topic or replayed.outcome.timer or "", replayed.outcome

@@ -1,4 +1,4 @@
-"""`rosrv monitor list|enable|disable|load|remove|reload|resume`: the monitors of the running appliance."""
+"""`rosrv monitor list|margins|enable|disable|load|remove|reload|resume`: the monitors of the running appliance."""
 
 import sys
 from collections.abc import Collection
@@ -6,15 +6,17 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from msgspec import to_builtins
 from msgspec.structs import asdict
 from rich.console import Console
 from rich.table import Column, Table
+from rich.text import Text
 
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitors import MonitorState, Replaced, Switched
 from appliance.cli import completion
-from appliance.cli.output import Json, counted, printable, say, say_json
+from appliance.cli.output import Json, counted, printable, say, say_json, usage_error
 from appliance.cli.running import Appliance, body_or_exit, speaks
 from appliance.cli.trials import ConfirmWithin, say_deadline, seconds_within
 
@@ -60,6 +62,48 @@ def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
         else ""
     )
     say(f"revision {body.revision} of the specifications{source}, by {body.who}{differs}")
+
+
+@speaks
+def margins(
+    appliance: Appliance,
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[MONITOR…]", show_default=False, autocompletion=completion.monitors),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Show how close conditions on numbers came, today and since they were loaded.
+
+    Of each comparison the nearest while it was true and the nearest while it was not; every message counts. AT is where
+    its constant would have to stand to be reached by the nearest since it was loaded.
+
+    Example: rosrv monitor margins safeTrigger
+    """
+    rows = appliance.ask_or_exit(admin.MonitorsWanted(), as_json=as_json).monitors
+    unknown = sorted(set(names or ()) - {row.name for row in rows})
+    if unknown:
+        raise usage_error(f"no monitor is called {', '.join(unknown)}", "rosrv monitor")
+    found = [(row, margin) for row in rows if not names or row.name in names for margin in row.margins]
+    if as_json:
+        for row, margin in found:
+            say_json({"monitor": row.name, "file": row.file, **to_builtins(margin)})
+        return
+    if not found:
+        say("no comparison of numbers has come up yet")
+        return
+    table = Table(
+        "monitor", "line", Column("condition", overflow="fold"), "was", "today", "since load", "at",
+        box=None, padding=(0, 2, 0, 0), header_style="dim",
+    )  # fmt: skip
+    for row, margin in found:
+        load, today = margin.since_load, margin.today
+        table.add_row(
+            row.name, f"{row.file}:{margin.line}", Text(printable(margin.condition)), str(margin.holds).lower(),
+            "-" if today is None else f"{today.distance:.6g}", f"{load.distance:.6g}",
+            "-" if load.threshold_at is None else f"{load.threshold_at:.6g}",
+        )  # fmt: skip
+    Console(highlight=False, width=None if sys.stdout.isatty() else WIDE).print(table)
 
 
 @speaks

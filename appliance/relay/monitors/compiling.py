@@ -100,6 +100,7 @@ class Compiler:
                 _patience,
                 trials=message.trials,
                 trial_patience=lambda: _patience(_TRIAL_TICKS_SECONDS),
+                margins=True,
             )
             monitors.write_module()
             return monitors

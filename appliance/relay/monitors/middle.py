@@ -28,6 +28,7 @@ from appliance.channel.messages import (
 from appliance.relay.loop import Loop, Timer
 from appliance.relay.monitors.compiling import Compiler, Result
 from appliance.relay.monitors.lane import LONGEST, TOO_LONG, Lane, dropped
+from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.places import NOWHERE, Place
 from appliance.relay.monitors.telling import Telling, refusal
@@ -78,8 +79,9 @@ class Middle:
         self._compiler = Compiler(loop, self.compiled)
         self.observations = Observations(loop, reporter, self._rows)
         self._changed = changed
-        self.telling = Telling(self.observations, publish)
-        self._on_trial = Telling(self.observations, lambda _published: None, "trial ")
+        self._margins = Margins()
+        self.telling = Telling(self.observations, publish, self._margins)
+        self._on_trial = Telling(self.observations, lambda _published: None, self._margins, "trial ")
         self.trials = Trials(loop, self.now, self._on_trial)
 
     # --- what control states ---
@@ -110,9 +112,12 @@ class Middle:
         if before is None:
             outcome = result.start(now, restarted=message.restarted)
         else:
-            outcome = result.succeed(before, now, self.trials.settle())
+            incomplete = self.trials.settle()
+            self._margins.take(before, now)
+            outcome = result.succeed(before, now, incomplete)
         self.monitors, self._stated, self.blocked = result, message, ""
         began = list(result.began)
+        self._margins.keep([one.name for one in (*result.monitors, *result.tried)], began)
         for monitor in result.monitors:
             monitor.held = monitor.held or (
                 monitor.code.hold and monitor.name in message.moved and monitor.name in began
@@ -240,6 +245,8 @@ class Middle:
         self.spent = 0.0
         self.telling.tick(self.now())
         self.trials.tick()
+        if self.monitors is not None:
+            self._margins.take(self.monitors, self.now())
         self.observations.tick()
 
     def close(self) -> None:

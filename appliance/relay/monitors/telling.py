@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from appliance.channel.messages import MonitorRow
 from appliance.relay.counts import Counts
+from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.places import NOWHERE, Place, Sighting
 from appliance.rosmop.monitor import Monitor
@@ -33,8 +34,13 @@ class Telling:
     """
 
     def __init__(
-        self, observations: Observations, publish: Callable[[Published], None], prefix: str = ""
+        self,
+        observations: Observations,
+        publish: Callable[[Published], None],
+        margins: Margins,
+        prefix: str = "",
     ) -> None:
+        self._margins = margins
         self._observations = observations
         self._publish = publish
         self._prefix = prefix
@@ -214,9 +220,9 @@ class Telling:
     def rows(self, monitors: Iterable[Monitor], time: int) -> list[MonitorRow]:
         """The state and counters of these monitors."""
         self._sum_up(time)
-        return [self._row(monitor) for monitor in monitors]
+        return [self._row(monitor, time) for monitor in monitors]
 
-    def _row(self, monitor: Monitor) -> MonitorRow:
+    def _row(self, monitor: Monitor, time: int) -> MonitorRow:
         counters = self._counter(monitor.name)
         return MonitorRow(
             monitor.name,
@@ -231,6 +237,7 @@ class Telling:
             monitor.faults,
             bool(self._prefix),
             counters.missed,
+            self._margins.rows(monitor.name, time),
         )
 
     def _verdicts(self, outcome: Outcome, place: Place, sighting: Sighting | None) -> None:

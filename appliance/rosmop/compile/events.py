@@ -198,7 +198,7 @@ def _body(
     when = trigger.when
     with scope.nested() as conditions:
         if when is not None:
-            with scope.at(when):
+            with scope.at(when), scope.looking():
                 try:
                     test = condition(value_of(scope, when))
                     scope.add(form.Require(scope.lines.site, test))

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 
 from appliance.rosmop.compile import calls, initializers, members, operators, storing, vector_members
 from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
+from appliance.rosmop.compile.margins import noted
 from appliance.rosmop.compile.places import CharacterPlace, Value, Variable, VariablePlace
 from appliance.rosmop.compile.provided import CONSTANTS
 from appliance.rosmop.compile.scope import Scope
@@ -213,12 +214,13 @@ def _step(scope: Scope, node: tree.Expression) -> Value:
 def _binary(scope: Scope, node: tree.Expression) -> Value:
     assert isinstance(node, tree.Binary)
     operands, site = (value_of(scope, node.left), value_of(scope, node.right)), scope.site(node)
-    return folded(
+    value = folded(
         operands,
         lambda left, right: operators.binary(
             node.operator, operators.Operands(scope, node.position, left, right, site)
         ),
     )
+    return noted(scope, node, *operands, value)
 
 
 def _assign(scope: Scope, node: tree.Expression) -> Value:

@@ -222,7 +222,9 @@ def _enter(scope: Scope, node: tree.Node, loop: Loop) -> None:
 def _leave_unless(scope: Scope, node: tree.Expression) -> None:
     with scope.at(node):
         site = scope.lines.site
-        scope.add(form.If(site, form.Not(condition(value_of(scope, node))), (form.Break(site),), ()))
+        with scope.looking():
+            left = form.Not(condition(value_of(scope, node)))
+        scope.add(form.If(site, left, (form.Break(site),), ()))
 
 
 def body(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> tuple[form.Statement, ...]:

@@ -51,11 +51,13 @@ def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
 
 def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) -> Group:
     variables: list[str] = []
+    noted: list[str] = []
     properties: list[tuple[int, int]] = []
     topics: dict[str, list[tuple[int, int]]] = {}
     for number in numbers:
         specification = specifications[number]
         variables += specification.variables.values()
+        noted += (name for comparison in specification.comparisons for name in comparison.variables)
         properties += [
             (number, index)
             for index, each in enumerate(specification.properties)
@@ -76,7 +78,7 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
                 ),
             )
         )
-    component = form.Component(tuple(variables), len(properties), tuple(rows))
+    component = form.Component(tuple(variables), len(properties), tuple(rows), tuple(noted))
     return Group(component, numbers, tuple(properties), tuple(map(tuple, topics.values())))
 
 

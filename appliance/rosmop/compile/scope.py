@@ -40,6 +40,24 @@ class HelperFunction:
     calls: frozenset[str] = frozenset()
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """A comparison of a specification. `when_true` and `when_false` are variables of the code (double) for its sides.
+
+    The left one is infinite until it came up. `threshold`: the side that is a constant, 0 or 1; None if neither is.
+    """
+
+    position: Position
+    threshold: int | None
+    when_true: tuple[str, str]
+    when_false: tuple[str, str]
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """All of them."""
+        return (*self.when_true, *self.when_false)
+
+
 @dataclass(eq=False)
 class SpecificationNames:
     """What one specification declares, and the code's name for its context."""
@@ -52,6 +70,8 @@ class SpecificationNames:
     """Names of variables and functions whose declarations are refused: to use them is no further mistake."""
     uses: set[str] = field(default_factory=set)
     """The other specifications whose variables are used."""
+    comparisons: dict[tree.Binary, Comparison] = field(default_factory=dict)
+    """Those that are noted."""
 
 
 @dataclass(eq=False)
@@ -87,8 +107,9 @@ class Statements:
 class Shared:
     """What all functions of all specifications share while they are compiled."""
 
-    def __init__(self, module: Module, messages: Messages) -> None:
+    def __init__(self, module: Module, messages: Messages, *, margins: bool = False) -> None:
         self.module = module
+        self.margins = margins
         self.messages = messages
         self.values = Values(messages)
         self.functions: dict[str, form.Function] = {}
@@ -142,6 +163,7 @@ class Scope:
         self.changes_shared = False  # a shared variable was
         self.calls: set[str] = set()  # the helper functions that are called
         self.recursive = False
+        self.notes = shared.margins and role != "init"  # comparisons are noted
         self.misdeclared: set[str] = set()  # local names whose declarations are refused
         self._blocks: list[dict[str, Variable]] = [{}]
 
@@ -241,6 +263,15 @@ class Scope:
             yield
         finally:
             self.lines.site = before
+
+    @contextmanager
+    def looking(self) -> Iterator[None]:
+        """Comparisons inside are not noted."""
+        before, self.notes = self.notes, False
+        try:
+            yield
+        finally:
+            self.notes = before
 
     def add(self, statement: form.Statement) -> None:
         """Append a statement."""

@@ -20,7 +20,7 @@ from appliance.rosmop.compile.functions import (
 from appliance.rosmop.compile.lint import lint_property, unused_events
 from appliance.rosmop.compile.module import Module, TooComplexError
 from appliance.rosmop.compile.python import NAMESPACE
-from appliance.rosmop.compile.scope import Publication, Shared, SpecificationNames
+from appliance.rosmop.compile.scope import Comparison, Publication, Shared, SpecificationNames
 from appliance.rosmop.ir import form
 from appliance.rosmop.logics.catalogue import compile_property
 from appliance.rosmop.logics.interface import CompiledProperty, FormulaError
@@ -64,6 +64,8 @@ class SpecificationCode:
     variables: Mapping[str, str]
     uses: frozenset[str]
     """The other specifications whose variables it uses."""
+    comparisons: tuple[Comparison, ...] = ()
+    """Those that are noted, in the order of the text."""
 
 
 @dataclass(eq=False)
@@ -81,9 +83,12 @@ class Compiled:
     """The same in the intermediate form, by name."""
 
 
-def compile_files(files: Sequence[tree.File], definitions: Definitions) -> Compiled:
-    """Compile a set of files; raises `SpecificationError` with everything that is wrong."""
-    shared, turn = Shared(Module(), Messages(definitions)), Turn()
+def compile_files(files: Sequence[tree.File], definitions: Definitions, *, margins: bool = False) -> Compiled:
+    """Compile a set of files; raises `SpecificationError` with everything that is wrong.
+
+    With `margins` the comparisons of numbers are noted (`margins.py`).
+    """
+    shared, turn = Shared(Module(), Messages(definitions), margins=margins), Turn()
     module, messages = shared.module, shared.messages
     pairs = [(file, specification) for file in files for specification in file.specifications]
     compiled = _compile_all(shared, turn, pairs)
@@ -204,6 +209,7 @@ def _compile(
         known,
         variables,
         uses,
+        tuple(sorted(names.comparisons.values(), key=lambda comparison: comparison.position)),
     )
 
 

@@ -110,9 +110,10 @@ def module_of(
     writer = Writer(functions, shared, values)
     cells = []
     for component in components:
-        room = component.properties + len(component.variables)
-        cells.append(Cells(writer.take(8 * room), component.properties))
-        shared |= dict.fromkeys(component.variables, cells[-1])
+        variables = (*component.variables, *component.noted)
+        room = component.properties + len(variables)
+        cells.append(Cells(writer.take(8 * room), component.properties, frozenset(component.noted)))
+        shared |= dict.fromkeys(variables, cells[-1])
     effects = writer.take(16 * (MAX_EFFECTS + 2))
     feeds: dict[str, Feed] = {}
     walks, tables = [], _Tables(writer)
@@ -178,7 +179,9 @@ class _Walk:
                 raise NotScalarError("a verdict with each message")
         self._budgets = sorted({writer.budget(writer.functions[event.function].context) for event in events})
         self._counters = writer.take(16 * len(events))
-        assigned = sorted({name for written in self._written for name in written.assigned})
+        assigned = sorted(
+            {name for written in self._written for name in written.assigned}.difference(cells.noted)
+        )
         self._undo = tuple((cells.variables[name][0], writer.take(8)) for name in assigned)
         self._log = writer.take(16 * sum(written.writes for written in self._written))
         properties = {

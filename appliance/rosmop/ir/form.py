@@ -657,8 +657,11 @@ class Event:
 class Component:
     """Specifications that share topics or variables, and nothing with others: the variables of each of them, how many
     properties with tables they have, and their topics with the events on each, in order.
+
+    `noted` are variables more, in which is noted what nothing depends on and the same message notes again.
     """
 
     variables: tuple[str, ...]
     properties: int
     topics: tuple[tuple[str, tuple[Event, ...]], ...]
+    noted: tuple[str, ...] = ()

@@ -88,11 +88,12 @@ def _is_signed(kind: Type) -> bool:
 @dataclass
 class Cells:
     """Where the state of specifications that share topics or variables stands: 8 bytes for each property's state, then
-    for each variable that is used.
+    for each variable that is used. Those that are `noted` only are not undone.
     """
 
     base: int
     properties: int
+    noted: frozenset[str] = frozenset()
     variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
     """Where each stands, and its type; in the order of the places."""
 

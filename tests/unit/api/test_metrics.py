@@ -48,6 +48,7 @@ def body(
         nodes={"live": 2, "lost": 1},
         registrations={"publication": 3},
         monitors=[("drop", "safeTrigger", 4)],
+        margins=[("safeTrigger", "8:35", False, 0.025)],
         relayed={"/a\"\\\n": [1, 2, 3]},
         delayed={"/a": [5, 4, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0.25]},
         drop_at={"/b": 5}, change_at={"/b": 6, "(others)": 1},
@@ -88,6 +89,8 @@ def test_values_are_what_was_counted() -> None:
     assert samples["rosrv_decisions_total", (("category", "publish"), ("outcome", "deny"))] == 2
     assert samples["rosrv_decision_seconds_count", ()] == 2
     assert samples["rosrv_monitor_events_total", (("kind", "drop"), ("monitor", "safeTrigger"))] == 4
+    place = (("holds", "false"), ("monitor", "safeTrigger"), ("place", "8:35"))
+    assert samples["rosrv_monitor_margin", place] == 0.025
     assert samples["rosrv_monitors", (("state", "disabled"),)] == 1
     assert samples["rosrv_decision_seconds_bucket", (("le", "0.00025"),)] == 0
     assert samples["rosrv_decision_seconds_bucket", (("le", "0.0005"),)] == 1

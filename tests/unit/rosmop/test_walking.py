@@ -39,9 +39,9 @@ def frames(bodies: Iterable[bytes]) -> bytes:
 class Fed:
     """A set with its module, and the same whose functions the interpreter runs, both started."""
 
-    def __init__(self, *texts: str, on_fault: OnFault = "drop") -> None:
+    def __init__(self, *texts: str, on_fault: OnFault = "drop", margins: bool = False) -> None:
         sources = {f"{place}.rv": text for place, text in enumerate(texts)}
-        self.monitors = MonitorSet.load(sources, definitions(), on_fault)
+        self.monitors = MonitorSet.load(sources, definitions(), on_fault, margins=margins)
         self.interpreter = beside(self.monitors)
         self.monitors.write_module()
         for one in (self.monitors, self.interpreter):
@@ -72,7 +72,7 @@ class Fed:
         return expected
 
     def state(self) -> list[str]:
-        """Variables and states of properties."""
+        """Variables, states of properties, and how close comparisons came since it was asked last."""
         return _state(self.monitors)
 
     def _fed(self, given: bytes, topic: str, time: int) -> bytes:
@@ -110,7 +110,7 @@ def _state(monitors: MonitorSet) -> list[str]:
         names = monitors._compiled.namespace
         state += [f"{name} {names.get(code)!r}" for name, code in monitor.code.variables.items()]
         state += [str(one.run.state) for one in monitor.properties if isinstance(one.run, FiniteRun)]
-    return state
+    return [*state, *map(str, monitors.take_margins())]
 
 
 def event(
@@ -126,9 +126,12 @@ def event(
 @FEW
 @given(seed=st.integers(0, 1 << 30), wild=st.lists(st.binary(max_size=80), max_size=4))
 def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> None:
-    """Actions, conditions, helper functions, loops, properties; messages of several topics, and bytes that are none."""
+    """Actions, conditions, helper functions, loops, properties; messages of several topics, and bytes that are none.
+
+    How close comparisons came is the same, too, where that is noted.
+    """
     try:
-        fed = Fed(*Specifications(seed).texts(), on_fault=("drop", "pass")[seed % 2])
+        fed = Fed(*Specifications(seed).texts(), on_fault=("drop", "pass")[seed % 2], margins=seed % 4 > 1)
     except SpecificationError:
         return  # a draw that means nothing
     messages = Messages(seed)
@@ -157,7 +160,7 @@ def test_most_of_that_is_taken_together_and_everything_comes_up() -> None:
 def test_one_by_one_they_are_told_as_the_interpreter_tells_them(seed: int, wild: list[bytes]) -> None:
     """What a recording's messages come to, whichever of the two takes them."""
     try:
-        fed = Fed(*Specifications(seed).texts(), on_fault=("drop", "pass")[seed % 2])
+        fed = Fed(*Specifications(seed).texts(), on_fault=("drop", "pass")[seed % 2], margins=seed % 4 > 1)
     except SpecificationError:
         return  # a draw that means nothing
     messages = Messages(seed)

@@ -93,16 +93,19 @@ def test_how_close_conditions_came(tmp_path: Path) -> None:
     plain = invoke("replay", path, "--bag", bags[0], "--bag", bags[1])
     shown = invoke("replay", path, "--bag", bags[0], "--bag", bags[1], "--margins")
     assert shown.output.startswith(plain.output.rsplit("\n", 2)[0])
-    assert f"{path}:2:35: bool high(int n) {{ return n > 7; }}: true by 2 at the closest" in shown.output
+    assert (
+        f"{path}:2:35: bool high(int n) {{ return n > 7; }}: true by 2 at the closest, 9 against 7 ("
+        in shown.output
+    )
     found = [
-        (one["line"], one["holds"], one["distance"], Path(one["bag"]).name, one["index"])
+        (one["line"], one["holds"], one["distance"], one["threshold_at"], Path(one["bag"]).name, one["index"])
         for one in records(invoke("replay", path, "--bag", bags[0], "--bag", bags[1], "--margins", "--json"))
         if one["kind"] == "margin"
     ]
     assert sorted(found) == [
-        (2, False, 1.0, "two.bag", 0),
-        (2, True, 2.0, "one.bag", 1),
-        (5, False, 0.0, "one.bag", 2),
+        (2, False, 1.0, 6.0, "two.bag", 0),
+        (2, True, 2.0, 9.0, "one.bag", 1),
+        (5, False, 0.0, 5.0, "one.bag", 2),
     ]
 
 

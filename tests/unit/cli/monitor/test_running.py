@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from appliance.channel.admin import AdminAnswer, encode
-from appliance.channel.answers.monitors import Monitors, Replaced
+from appliance.channel.answers.monitors import Monitors, MonitorState, Replaced
 from appliance.cli.main import app
 from tests.support.answers import example
 
@@ -55,6 +55,50 @@ def write(path: Path, text: str | bytes) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     return path
+
+
+@pytest.fixture
+def close(tmp_path: Path) -> Path:
+    """A state directory at which an appliance answers once, with a monitor that came close."""
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener.bind(str(tmp_path / "admin.sock"))
+    listener.listen()
+    nearest = {"time": 5.0, "left": -0.475, "right": -0.45, "distance": 0.025, "threshold_at": -0.475}
+    margin = {"line": 8, "column": 35, "condition": "if (P > -0.45) {", "since_load": nearest}
+    rows = [
+        example(MonitorState, name="gun", file="a.rv", margins=[margin]),
+        example(MonitorState, name="other"),
+    ]
+
+    def serve() -> None:
+        with listener, listener.accept()[0] as peer, peer.makefile("rb") as lines:
+            lines.readline()
+            peer.sendall(encode(AdminAnswer(True, example(Monitors, monitors=rows))) + b"\n")
+
+    threading.Thread(target=serve, daemon=True).start()
+    return tmp_path
+
+
+@pytest.mark.parametrize("names", [(), ("gun",)])
+def test_how_close_a_condition_came_is_a_row(close: Path, names: tuple[str, ...]) -> None:
+    """Today, since the load, and where the constant would have to stand."""
+    shown = CliRunner().invoke(app, ["monitor", "margins", *names, "--state", str(close)])
+    assert shown.exit_code == 0
+    row = shown.output.splitlines()[1].split()
+    assert row == ["gun", "a.rv:8", "if", "(P", ">", "-0.45)", "{", "false", "-", "0.025", "-0.475"]
+
+
+def test_margins_for_a_script_and_of_none(close: Path) -> None:
+    """One object each; a monitor that there is not is named."""
+    shown = CliRunner().invoke(app, ["monitor", "margins", "--json", "--state", str(close)])
+    (found,) = map(json.loads, shown.output.splitlines())
+    assert (found["monitor"], found["since_load"]["threshold_at"], found["today"]) == ("gun", -0.475, None)
+
+
+def test_margins_of_a_monitor_that_there_is_not(close: Path) -> None:
+    """Exit status 2."""
+    shown = CliRunner().invoke(app, ["monitor", "margins", "gnu", "--state", str(close)])
+    assert (shown.exit_code, "no monitor is called gnu" in shown.output) == (2, True)
 
 
 def load(state: Path, *arguments: object) -> tuple[int, str]:

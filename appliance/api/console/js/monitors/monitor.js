@@ -38,7 +38,7 @@ export function MonitorPage({ name, row, monitors }) {
   if (!row) return html`${head}<section class="panel"><${Empty} icon="monitors" title="This monitor is not loaded">It may have been removed. What it did is still in the <${Link} to=${`/console/audit?category=monitor&text=${encodeURIComponent(name)}`}>audit log</${Link}>.</${Empty}></section>`;
   return html`${head}
     <div class="policy-grid"><div class="stack"><${Verdicts} name=${name} row=${row} />${error ? html`<${Failure} error=${error} retry=${again} />` : !value ? html`<section class="panel"><${Loading} /></section>` : html`<${Specification} key=${value.revision} monitor=${value} monitors=${monitors} />`}</div>
-      <div class="stack">${value && html`<${About} monitor=${value} path=${path} />`}<${History} path=${path} row=${row} /></div></div>
+      <div class="stack">${value && html`<${About} monitor=${value} path=${path} />`}<${Margins} row=${row} /><${History} path=${path} row=${row} /></div></div>
     ${removing && html`<${Remove} name=${name} row=${row} path=${path} monitors=${monitors} close=${() => setRemoving(false)} />`}`;
 }
 
@@ -87,6 +87,16 @@ function About(/** @type {{monitor: any, path: string}} */ { monitor, path }) {
       : !monitor.properties.length ? html`<${Empty} icon="monitors" title="No property">This monitor acts in its events alone.</${Empty}>`
       : html`<div class="panel-body stack">${monitor.properties.map((/** @type {any} */ one, /** @type {number} */ index) => html`<div key=${index} class="stack-tight"><div class="row"><${Badge} word=${one.logic} tone="note" /><span class="muted small">handles ${one.handled.join(", ") || "nothing"}</span></div><pre class="bytes"><${Given} value=${one.formula} most=${1500} /></pre>${monitor.certificates[index] && html`<p class="muted small"><${Given} value=${monitor.certificates[index].replace(/^\w+: /, "")} most=${200} /></p>`}</div>`)}
         ${monitor.properties.some((/** @type {any} */ one) => one.drawn) && html`<${Picture} path=${path} name=${monitor.name} />`}</div>`}</${Tabs}></section>`;
+}
+
+/** How close its conditions on numbers came; `At` is where the constant would have to stand to be reached. */
+function Margins(/** @type {{row: any}} */ { row }) {
+  if (!row.margins.length) return null;
+  const number = (/** @type {number | null | undefined} */ value) => value === null || value === undefined ? "–" : Number(value.toPrecision(6)).toString();
+  return html`<section class="panel" aria-labelledby="margins"><div class="panel-head"><h2 id="margins">How close it came</h2></div>
+    <div class="table-wrap"><table class="table"><thead><tr><th>Condition</th><th>Was</th><th class="number">Today</th><th class="number">Since load</th><th class="number">At</th></tr></thead>
+      <tbody>${row.margins.map((/** @type {any} */ one) => html`<tr key=${`${one.line}:${one.column}${one.holds}`}><td><code><${Given} value=${one.condition} most=${120} /></code><div class="muted small">line ${one.line}</div></td><td>${one.holds ? "true" : "false"}</td>
+        <td class="number">${number(one.today?.distance)}</td><td class="number">${number(one.since_load.distance)}<div class="muted small"><${Moment} at=${one.since_load.time} /></div></td><td class="number">${number(one.since_load.threshold_at)}</td></tr>`)}</tbody></table></div></section>`;
 }
 
 /** The automata, as an image: what is in it is never part of the page. */
