@@ -18,23 +18,25 @@ RvState = tuple[int, int, list[tuple[str, str, int, int]]]
 class Approach(msgspec.Struct, frozen=True):
     """How near the sides of a comparison of numbers came to each other."""
 
-    time: Annotated[Moment, told("when, to the second")]
-    left: Annotated[float, told("its left side then")]
-    right: float
-    distance: float
+    time: Annotated[Moment, told("when, to the second: seconds since the epoch")]
+    left: Annotated[float, told("its left side then, in the unit of its specification")]
+    right: Annotated[float, told("its right side, in that unit")]
+    distance: Annotated[float, told("of the sides, in that unit")]
     threshold_at: Annotated[
         float | None,
-        told("where the constant would have to stand to be reached; null where neither side is one"),
+        told(
+            "where the constant would have to stand to be reached, in that unit; null where neither side is one"
+        ),
     ]
 
 
 class MonitorMargin(msgspec.Struct, frozen=True):
     """How close a comparison of numbers came while it was true (`holds`), or while it was not."""
 
-    line: int
-    column: int
+    line: Annotated[int, told("of the specification, from 1")]
+    column: Annotated[int, told("in that line, from 1")]
     condition: Annotated[str, told("the line of the specification that it stands in")]
-    holds: bool
+    holds: Annotated[bool, told("what it said then")]
     since_load: Annotated[Approach, told("since the monitor was loaded or its relay began")]
     today: Annotated[Approach | None, told("since midnight (UTC); null while it did not come up today")]
 

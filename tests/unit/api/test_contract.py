@@ -21,7 +21,15 @@ from tests.support.answers import example
 _OF_CHANGES = {"/v1/policy", "/v1/hosts", "/v1/hosts/{name}", "/v1/monitors", "/v1/monitors/{name}"}
 _UNITS = ("seconds", "days")
 _IN_NAME = (*_UNITS, "_us", "_per_second", "_seconds")
-_IN_WORDS = (*_UNITS, "microseconds", "milliseconds", "nanoseconds", "RFC 3339", "until the certificate ends")
+_IN_WORDS = (
+    *_UNITS,
+    "microseconds",
+    "milliseconds",
+    "nanoseconds",
+    "RFC 3339",
+    "unit",
+    "until the certificate ends",
+)
 
 
 @pytest.fixture(scope="module")

@@ -56,8 +56,8 @@ def test_live_and_offline_agree_on_the_same_messages(world: Trying, tried: tuple
     publisher.send(b"".join(map(string, WORDS[2:])))
     kept = WORDS if tried else ("a", "four", "late", "late")
     world.gets(subscriber, b"".join(map(string, kept)))
-    world.until(lambda: not world.engine._middle.trials._waiting)
-    world.engine._middle.tick()
+    world.until(lambda: not world.engine.middle.trials.waiting)
+    world.engine.middle.tick()
     rows = world.row("near").margins
     expected = offline()
     assert len(expected) == 4
@@ -74,11 +74,11 @@ def test_it_is_kept_with_the_monitor_and_begins_anew_with_another_text(world: Tr
     world.gets(subscriber, string("four"))
     other = NEAR.replace("near()", "other()").replace("/chatter", "/elsewhere")
     world.state_trials(NEAR, other, revision=2)
-    world.engine._middle.tick()
+    world.engine.middle.tick()
     (first, _second) = world.row("near").margins
     assert (first.load.left, first.load.right) == (2.0, 2.2)
     world.state_trials(NEAR.replace("2.2", "2.3"), revision=3)
-    world.engine._middle.tick()
+    world.engine.middle.tick()
     assert world.row("near").margins == []
 
 
