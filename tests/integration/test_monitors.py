@@ -170,6 +170,37 @@ def test_a_monitor_on_trial_says_what_it_would_do_until_it_is_promoted(
     assert {one["detail"]["who"] for one in appliance.recorded("--event", "monitor on trial")} == {"operator"}
 
 
+WATCH = """
+watch() {
+    std_msgs::String missing;
+    raise_alarm() { missing.data = "no answer"; PUBLISH(/alarm, std_msgs/String, missing); }
+    event asked() /chatter std_msgs/String '{}' { }
+    event answered() /answers std_msgs/String '{}' { }
+    pattern: globally: asked causes answered within 200ms enforced by raise_alarm
+    @enforced { ROS_WARN("nobody answered"); }
+}
+"""
+
+
+def test_what_was_due_is_published_at_the_deadline(
+    appliance: Appliance, ros: RosSession, tmp_path: Path
+) -> None:
+    """By the appliance, on record; and `check` says so beforehand."""
+    spec = tmp_path / "watch.rv"
+    spec.write_text(WATCH)
+    said = "enforced: at the deadline raise_alarm publishes what was due (/alarm)"
+    assert said in appliance.rosrv("monitor", "check", str(spec), state=False).stdout
+    appliance.rosrv("monitor", "load", str(spec))
+    alarm = ros.listener("rospy", "/alarm")
+    ros.listener("rospy", "/chatter")
+    ros.talker("rospy", "/chatter", name="voice")
+    alarmed = alarm.wait_for(event="received", data="no answer")
+    assert alarmed["publisher"] == "/rosrv"
+    verdict = appliance.recorded(event="monitor verdict")[0]["detail"]
+    assert (verdict["monitor"], verdict["category"]) == ("watch", "enforced")
+    assert appliance.recorded(event="monitor published", resource="/alarm")
+
+
 def test_a_bad_specification_is_refused_with_its_place_and_changes_nothing(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:

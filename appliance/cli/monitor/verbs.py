@@ -63,9 +63,10 @@ def check(
     errors = sum(finding.severity == "error" for finding in findings)
     if not as_json:
         _summarise(findings, errors, monitors)
-        for name, lines in certificates.items():
-            for line in lines:
-                say(f"{name}: {line}")
+        for monitor in monitors.monitors if monitors is not None else ():
+            for line, each in zip(certificates[monitor.name], monitor.properties, strict=True):
+                say(f"{monitor.name}: {line}")
+                say(f"{monitor.name}: {each.code.property.logic}: {each.code.enforcement}")
     if monitors is not None:
         properties = [each.code.property for monitor in monitors.monitors for each in monitor.properties]
         _draw(properties, dot, svg)

@@ -158,13 +158,27 @@ def declare_functions(shared: Shared, names: SpecificationNames, specification: 
         except SpecificationError as error:
             shared.findings += error.findings
             names.misdeclared.add(node.name)
-    known = names.functions
-    called = {name: {*_called(function.node.body)} & known.keys() for name, function in known.items()}
-    for name, function in known.items():
+    called = _calls(names)
+    for name, function in names.functions.items():
         reached = _reached(called[name], called)
         function.recursive = name in reached
         if function.references:
-            function.names = frozenset().union(*(_free_names(known[one].node) for one in {name, *reached}))
+            function.names = frozenset().union(
+                *(_free_names(names.functions[one].node) for one in {name, *reached})
+            )
+
+
+def _calls(names: SpecificationNames) -> dict[str, set[str]]:
+    """The functions of the specification that each of them calls."""
+    known = names.functions
+    return {name: {*_called(function.node.body)} & known.keys() for name, function in known.items()}
+
+
+def topics_of(names: SpecificationNames, function: str) -> list[str]:
+    """What a function publishes, and those that it calls."""
+    reached = _reached({function}, _calls(names))
+    found = (node for name in reached for node in _nodes(names.functions[name].node.body))
+    return sorted({node.topic for node in found if isinstance(node, tree.Publish)})
 
 
 def _signature(shared: Shared, names: SpecificationNames, node: tree.Function) -> HelperFunction:

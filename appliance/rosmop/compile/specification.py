@@ -9,6 +9,12 @@ from functools import partial
 from typing import Any, TypeVar
 
 from appliance.ros.definitions import Definitions
+from appliance.rosmop.compile.enforcing import (
+    blocking_refused,
+    enforcement,
+    topics_of_remedy,
+    with_remedy,
+)
 from appliance.rosmop.compile.events import EventCode, compile_event
 from appliance.rosmop.compile.functions import (
     compile_function,
@@ -40,11 +46,15 @@ IGNORED_MODIFIERS = frozenset({"unsynchronized", "decentralized", "perthread", "
 
 @dataclass(frozen=True)
 class PropertyCode:
-    """A compiled property: its monitor, and for each category that is handled the name of the function."""
+    """A compiled property: its monitor, and for each category that is handled the name of the function.
+
+    `enforcement` says whether and how a violation can be prevented.
+    """
 
     property: CompiledProperty
     handlers: Mapping[str, str]
     order: tuple[str, ...]
+    enforcement: str
 
 
 @dataclass(frozen=True)
@@ -264,17 +274,20 @@ def _property(
         shared.findings += error.findings
         return None
     handlers: dict[str, str] = {}
-    for handler in node.handlers:
+    published = _noted(shared, partial(topics_of_remedy, names, compiled))
+    if published is None:
+        return None
+    for handler in with_remedy(compiled, node):
         text = _handler_refused(compiled, handlers, handler)
         if text is not None:
             shared.findings.append(Finding(handler.position, "error", text))
             continue
-        refused = _blocking_refused(compiled, specification, handler.category)
+        refused = blocking_refused(compiled, specification, handler.category)
         function = _noted(shared, partial(compile_handler, shared, names, handler, refused))
         if function is not None:
             handlers[handler.category] = function
     shared.findings += lint_property(compiled, node)
-    return PropertyCode(compiled, handlers, tuple(handlers))
+    return PropertyCode(compiled, handlers, tuple(handlers), enforcement(compiled, specification, published))
 
 
 def _handler_refused(
@@ -285,19 +298,6 @@ def _handler_refused(
     if handler.category not in compiled.categories:
         known = nearest(handler.category, compiled.categories)
         return f"{compiled.logic} has no category {shown(handler.category)} here{known}"
-    return None
-
-
-def _blocking_refused(
-    compiled: CompiledProperty, specification: tree.Specification, category: str
-) -> str | None:
-    """Why a handler cannot drop the message that brought it about."""
-    refused = compiled.blocking_refused(category)
-    if refused is not None:
-        return refused
-    for index, event in enumerate(specification.events):
-        if isinstance(event.trigger, tree.TimerTrigger) and category in compiled.categories_after(index):
-            return f"the timer {shown(event.name)} can bring @{category} about, and it has no message to drop"
     return None
 
 

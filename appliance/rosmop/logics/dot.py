@@ -54,7 +54,7 @@ def _name(compiled: CompiledProperty, state: int) -> str:
     if isinstance(compiled, TimedMachine):
         size = len(compiled.automaton)
         return compiled.automaton.name(compiled.automaton.initial if state == 2 * size else state % size)
-    return MODES[state] if isinstance(compiled, TimedPattern) else str(state)
+    return MODES[state % len(MODES)] if isinstance(compiled, TimedPattern) else str(state)
 
 
 def _quoted(text: str) -> str:

@@ -81,6 +81,9 @@ class CompiledProperty(ABC):
     expiry = "deadline"
     """What the passing of a run's deadline is called in records (``timeout`` for machines)."""
 
+    remedy: str | None = None
+    """The function of the specification that publishes what was due when a deadline passes (`enforced by`)."""
+
     def __init__(self, source: Source, categories: Sequence[str]) -> None:
         self.source = source
         self.logic = source.logic

@@ -52,7 +52,7 @@ def analyse(compiled: CompiledProperty, handled: Sequence[str]) -> list[Fact]:
         if category not in traces
     ]
     violation = _VIOLATION.get(compiled.logic)
-    if violation is not None and violation not in traces:
+    if violation is not None and violation not in traces and compiled.remedy is None:
         facts.append(Fact("never violated", violation, "no trace violates this property"))
     category = violation or _FAILURE.get(compiled.logic)
     firsts = [(trace, state) for trace, state in graph.edges[graph.initial] if trace[0] != TIME]
@@ -124,8 +124,12 @@ def _machine_graph(compiled: TimedMachine) -> Graph:
 
 
 def _pattern_graph(compiled: TimedPattern) -> Graph:
-    """The modes. Where no deadline is waited for, an event may still come too late for the time bound."""
+    """The modes; with a remedy each also as it is entered by that.
+
+    Where no deadline is waited for, an event may still come too late for the time bound.
+    """
     edges = []
+    size = len(compiled.expiries) if compiled.at_expiry else 0
     for mode, expiry in enumerate(compiled.expiries):
         row: list[tuple[tuple[str, ...], int]] = []
         for event, name in enumerate(compiled.events):
@@ -133,6 +137,10 @@ def _pattern_graph(compiled: TimedPattern) -> Graph:
             if expiry is None:
                 row.append(((TIME, name), compiled.late[mode][event][0]))
         if expiry is not None:
-            row.append(((TIME,), expiry))
+            row.append(((TIME,), size + expiry))
         edges.append(tuple(row))
-    return Graph(MODES.index(compiled.pattern.initial()), tuple(edges), compiled.verdicts)
+    told = tuple((*compiled.at_expiry, *verdict) for verdict in compiled.verdicts)
+    initial = MODES.index(compiled.pattern.initial())
+    if not size:
+        return Graph(initial, tuple(edges), compiled.verdicts)
+    return Graph(initial, (*edges, *edges), (*compiled.verdicts, *told))

@@ -23,6 +23,9 @@ The category is ``violation`` once the property is certainly violated, ``validat
 violate it any more. Both are for good. A pattern that waits (``some``, ``causes``) may be silent for ever:
 silence violates nothing unless there is a time bound, and validates nothing.
 
+``some c within t enforced by f`` and ``… causes d within t enforced by f``: when the deadline passes, ``f`` publishes
+what was due, which counts as having come. The category is ``enforced`` then.
+
 Theory of operation. A run is in a *mode*: the scope is waited for, is over, or is open and *quiet* or
 *stirred*. What stirs is: for ``some`` and ``requires`` that the good event came, for ``causes`` that an
 answer is due, for ``forbids`` that the first event came. With the time of one event this is the whole
@@ -44,6 +47,9 @@ Mode = Literal["waiting", "quiet", "stirred", "over", "violated"]
 MODES: tuple[Mode, ...] = ("waiting", "quiet", "stirred", "over", "violated")
 _DUE: dict[str, Mode] = {"some": "quiet", "causes": "stirred"}
 """The mode in which something has to come yet."""
+_DONE: dict[str, Mode] = {"some": "stirred", "causes": "quiet"}
+"""The mode in which it has come."""
+ENFORCED: Categories = ("enforced",)
 
 
 @dataclass(frozen=True)
@@ -57,6 +63,7 @@ class Pattern:
     first: int | None
     second: int
     within_ns: int | None
+    enforced: bool = False
 
     def initial(self) -> Mode:
         """The mode of a fresh run."""
@@ -125,19 +132,22 @@ class Pattern:
             return mode
         if self.kind == "no" and mode == "quiet" and (self.opens is None or self.closes is None):
             return "over"
-        return "violated" if mode == _DUE.get(self.kind) else mode
+        if mode != _DUE.get(self.kind):
+            return mode
+        return _DONE[self.kind] if self.enforced else "violated"
 
 
 def verdicts(pattern: Pattern, events: int) -> dict[Mode, Categories]:
     """The verdict of each mode: what is certain in it, whatever follows.
 
-    What is due can always still come, unless the event that is waited for closes the scope.
+    What is due can always still come (be published, too), unless the event that is waited for closes the scope.
     """
     unmet = {"violated", _DUE.get(pattern.kind, "violated")}
     found: dict[Mode, Categories] = {}
     for mode in MODES:
         possible = _reachable(pattern, mode, events)
-        certain = mode == "violated" or (mode in unmet and pattern.closes == pattern.second)
+        hopeless = pattern.closes == pattern.second and not pattern.enforced
+        certain = mode == "violated" or (mode in unmet and hopeless)
         found[mode] = VIOLATION if certain else UNDECIDED if possible & unmet else VALIDATION
     return found
 
@@ -168,11 +178,13 @@ class TimedPattern(CompiledProperty):
 
     ``in_time[mode][event]`` is the move while at most ``pattern.within_ns`` has passed since the clock
     started, ``late`` the move after that; ``expiries[mode]`` is the mode after the deadline, or None where
-    there is none.
+    there is none; ``at_expiry`` is told then, before the verdict.
     """
 
-    def __init__(self, source: Source, pattern: Pattern) -> None:
-        super().__init__(source, ("violation", "validation"))
+    def __init__(self, source: Source, pattern: Pattern, remedy: str | None) -> None:
+        self.at_expiry = () if remedy is None else ENFORCED
+        super().__init__(source, ("violation", "validation", *self.at_expiry))
+        self.remedy = remedy
         self.pattern = pattern
         self.within_ns = pattern.within_ns or 0
         known = verdicts(pattern, len(source.events))
@@ -209,7 +221,8 @@ class TimedPattern(CompiledProperty):
         """What a deadline decides is decided when no message comes."""
         super().blocking_refused(category)
         kind = self.pattern.kind
-        if kind in ("requires", "forbids") or (kind == "no" and category == "violation"):
+        comes_along = kind == "no" or self.pattern.enforced
+        if kind in ("requires", "forbids") or (category == "violation" and comes_along):
             return None
         return (
             f"`{kind} … within` is decided by a deadline, when the message that would have to be stopped "
@@ -220,13 +233,16 @@ class TimedPattern(CompiledProperty):
 class TimedPatternRun:
     """A run: the mode, and the instant that the time bound counts from."""
 
-    __slots__ = ("_expiries", "_in_time", "_late", "_verdicts", "_within", "deadline", "mode", "now", "since")
+    __slots__ = (
+        "_at_expiry", "_expiries", "_in_time", "_late", "_verdicts", "_within", "deadline", "mode", "now", "since",
+    )  # fmt: skip
 
     def __init__(self, compiled: TimedPattern, time_ns: int) -> None:
         self._verdicts = compiled.verdicts
         self._in_time = compiled.in_time
         self._late = compiled.late
         self._expiries = compiled.expiries
+        self._at_expiry = compiled.at_expiry
         self._within = compiled.within_ns
         self.now = self.since = time_ns
         self.deadline: int | None = None
@@ -256,7 +272,7 @@ class TimedPatternRun:
             raise ValueError("this run has no deadline")
         self.now = self.deadline
         self._enter(mode)
-        return self._verdicts[mode]
+        return (*self._at_expiry, *self._verdicts[mode])
 
 
 def compile_pattern(source: Source) -> CompiledProperty:
@@ -265,17 +281,38 @@ def compile_pattern(source: Source) -> CompiledProperty:
     opens, closes = _read_scope(reader)
     reader.expect(":", "`:` after the scope")
     kind, first, second = _read_body(reader)
-    within = None
+    within = remedy = None
     if reader.token.text == "within":
         reader.take()
         within = reader.duration("a time bound")
+    if reader.token.text == "enforced":
+        remedy = _read_remedy(reader, kind, within)
     if reader.token.kind != "end":
-        raise reader.unexpected("`within` and a duration, or the end of the pattern")
+        expected = "`within` and a duration" if within is None else "`enforced by` and a function"
+        raise reader.unexpected(f"{expected}, or the end of the pattern")
     reader.finish()
     index = {name: number for number, name in enumerate(source.events)}
     known = [None if token is None else index[token.text] for token in (opens, closes, first)]
-    pattern = Pattern(kind, known[0], known[1], known[2], index[second.text], within)
-    return TimedPattern(source, pattern) if within is not None else _untimed(source, pattern)
+    pattern = Pattern(kind, known[0], known[1], known[2], index[second.text], within, remedy is not None)
+    return TimedPattern(source, pattern, remedy) if within is not None else _untimed(source, pattern)
+
+
+def _read_remedy(reader: TokenReader, kind: str, within: int | None) -> str:
+    word = reader.take()
+    if kind not in _DUE:
+        reader.note(
+            word,
+            f"`{kind}` leaves nothing due that could be published: what violates it comes with a message;"
+            " write `@violation { DROP; }`",
+        )
+    elif within is None:
+        reader.note(
+            word, "`enforced by` needs to know when it is due; write `within` and a duration before it"
+        )
+    if reader.token.text != "by":
+        raise reader.unexpected("`by` and the function that publishes what is due")
+    reader.take()
+    return reader.expect("name", "the function that publishes what is due").text
 
 
 def _untimed(source: Source, pattern: Pattern) -> FiniteProperty:

@@ -70,8 +70,9 @@ def records(result: Result) -> list[dict[str, Any]]:
 def test_a_right_file(tmp_path: Path) -> None:
     """A right specification is said to be right; exit status 0."""
     result = invoke("check", write(tmp_path, "a.rv", GOOD))
-    said, proof = result.stdout.splitlines()
+    said, proof, enforcement = result.stdout.splitlines()
     assert (result.exit_code, said) == (0, "1 specification right")
+    assert enforcement.startswith("counter: ere: ")
     assert proof == "counter: ere: proved: its automaton is what is written (3 cases followed)"
 
 

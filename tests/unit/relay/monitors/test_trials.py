@@ -228,6 +228,19 @@ def test_it_hears_a_topic_that_nobody_subscribes_to_and_its_ticks(world: Trying)
     assert world.event("trial log", monitor="s").text == "tick"
 
 
+def test_what_it_would_have_published_at_a_deadline_is_told(world: Trying) -> None:
+    """Without another message."""
+    text = """s() { std_msgs::String said; warn() { said.data = "late"; PUBLISH(/alarm, std_msgs/String, said); }
+        event e() /chatter std_msgs/String '{}' { } event done() /done std_msgs/String '{}' { }
+        pattern: globally: e causes done within 10ms enforced by warn @violation { } }"""
+    world.state_trials(text, tried=("s",))
+    publisher = world.upstream(TYPED)
+    publisher.send(string("fire"))
+    published = world.event("trial publish", monitor="s")
+    assert (published.resource, published.after) == ("/alarm", string("late")[4:])
+    assert world.event("trial verdict", monitor="s").detail["category"] == "enforced"
+
+
 def test_requests_and_replies_pass_as_they_are(world: Trying) -> None:
     """What it would have refused is told."""
     text = """s() { event ask(bool on) service /mode std_srvs/SetBool request '{data:on}' { if (on) { return; } }

@@ -6,6 +6,7 @@ from itertools import product
 
 import pytest
 
+from appliance.rosmop.logics.interface import CompiledProperty
 from tests.unit.rosmop.logics.driving import compiled, play, refusal, seeded, told
 
 Timed = tuple[tuple[int, str], ...]
@@ -213,6 +214,59 @@ def test_enforceable() -> None:
         "until a: no b": False,
     }.items():
         assert (compiled("pattern", text).blocking_refused("violation") is not None) == refused, text
+
+
+def test_what_is_published_counts_as_having_come() -> None:
+    """With the remedies put into the trace as answers, the pattern without them says the same of all short traces."""
+    for scope, closes in (("globally", ""), ("after c", ""), ("until c", "c"), ("after c until b", "b")):
+        for body in ("some a", "b causes a", "some b", "a causes b"):
+            if body[-1] == closes:
+                continue
+            text = f"{scope}: {body} within 2 ns"
+            enforced, plain = compiled("pattern", f"{text} enforced by f"), compiled("pattern", text)
+            for times in ((0, 1, 3), (1, 2, 2), (2, 2, 5), (0, 4, 9)):
+                for events in product("abc", repeat=3):
+                    trace = list(zip(times, events, strict=True))
+                    record = play(enforced.start(0), "abc", trace, 30)
+                    remedies = [time for time, told in record if "enforced" in told]
+                    check_remedies(plain, trace, remedies, body[-1])
+                    told = [(time, tuple(one for one in told if one != "enforced")) for time, told in record]
+                    answered = with_answers(trace, remedies, body[-1])
+                    assert first(told) == first(play(plain.start(0), "abc", answered, 30)), (text, trace)
+
+
+def with_answers(trace: list[tuple[int, str]], remedies: list[int], answer: str) -> list[tuple[int, str]]:
+    """The trace with an answer at each remedy, behind what happened at that time."""
+    return sorted([*trace, *((time, answer) for time in remedies)], key=lambda one: one[0])
+
+
+def check_remedies(
+    plain: CompiledProperty, trace: list[tuple[int, str]], remedies: list[int], answer: str
+) -> None:
+    """Each comes when, without it, the deadline would have violated the pattern."""
+    for place, time in enumerate(remedies):
+        before = [one for one in with_answers(trace, remedies[:place], answer) if one[0] <= time]
+        assert play(plain.start(0), "abc", before, time + 1)[-1] == (time, ("violation",)), (trace, remedies)
+
+
+def first(record: list[tuple[int, tuple[str, ...]]]) -> tuple[int, tuple[str, ...]] | None:
+    """The first verdict, which is for good."""
+    return next((one for one in record if one[1]), None)
+
+
+def test_a_heartbeat_that_stops_is_answered_once() -> None:
+    """What is published asks for no answer itself."""
+    run = compiled("pattern", "globally: a causes a within 3 ns enforced by f").start(0)
+    assert play(run, "a", [(0, "a"), (2, "a"), (20, "a")], 50) == [
+        (0, ()), (2, ()), (5, ("enforced",)), (20, ()), (23, ("enforced",)),
+    ]  # fmt: skip
+
+
+def test_what_cannot_be_enforced_by_publishing() -> None:
+    """Where nothing is due, and where nobody knows when."""
+    assert "leaves nothing due" in refusal("pattern", "globally: no a within 1s enforced by f")[0]
+    assert "needs to know when" in refusal("pattern", "globally: some a enforced by f")[0]
+    assert "expected `by`" in refusal("pattern", "globally: some a within 1s enforced f")[0]
 
 
 @pytest.mark.parametrize(

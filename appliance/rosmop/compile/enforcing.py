@@ -1,0 +1,102 @@
+"""Whether a property can be enforced: what handlers may drop, and what is published when it is due (`enforced by`)."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from appliance.rosmop.compile.functions import topics_of
+from appliance.rosmop.compile.scope import SpecificationNames
+from appliance.rosmop.logics.interface import CompiledProperty
+from appliance.rosmop.logics.lint import Graph, graph_of, shortest_trace_to
+from appliance.rosmop.logics.pattern import ENFORCED
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types.messages import nearest, shown
+
+_TAKES = {
+    "pattern": "it takes `enforced by f` behind `within`, with a function f that publishes what is due",
+    "mtl": "it takes a `pattern: … causes … within … enforced by f`, with a function f that publishes what is due",
+}
+
+
+def blocking_refused(
+    compiled: CompiledProperty, specification: tree.Specification, category: str
+) -> str | None:
+    """Why a handler cannot drop the message that brought it about."""
+    refused = compiled.blocking_refused(category)
+    if refused is not None:
+        return refused
+    for index, event in enumerate(specification.events):
+        if isinstance(event.trigger, tree.TimerTrigger) and category in compiled.categories_after(index):
+            return f"the timer {shown(event.name)} can bring @{category} about, and it has no message to drop"
+    return None
+
+
+def enforcement(
+    compiled: CompiledProperty, specification: tree.Specification, published: Sequence[str]
+) -> str:
+    """Whether the property can be kept from being violated, by what, or what it would take.
+
+    `published` are the topics of its remedy.
+    """
+    if compiled.remedy is not None:
+        topics = ", ".join(published)
+        return f"enforced: at the deadline {compiled.remedy} publishes what was due ({topics})"
+    category = "violation" if "violation" in compiled.categories else "fail"
+    graph = graph_of(compiled)
+    if graph is not None and shortest_trace_to(compiled, category) is None:
+        return f"nothing to enforce: no trace leads to @{category}"
+    refused = blocking_refused(compiled, specification, category)
+    if refused is None:
+        brings = _bringing(graph, category) if graph is not None else compiled.events
+        named = ", ".join(event for event in compiled.events if event in brings)
+        return f"can be enforced: @{category} may drop the message that brings it about ({named})"
+    takes = "it takes an event on a topic for the timer"
+    if compiled.blocking_refused(category) is not None:
+        takes = _TAKES[compiled.logic]
+    return f"cannot be enforced by dropping: {refused}; {takes}"
+
+
+def _bringing(graph: Graph, category: str) -> set[str]:
+    """The events that lead to the category from where it is not yet."""
+    return {
+        trace[-1]
+        for state, ways in enumerate(graph.edges)
+        if category not in graph.verdicts[state]
+        for trace, target in ways
+        if category in graph.verdicts[target]
+    }
+
+
+def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> list[str]:
+    """What the remedy of a property publishes; raises `SpecificationError` if it is none."""
+    name = compiled.remedy
+    if name is None:
+        return []
+    place = compiled.source.finding(compiled.formula.rindex(name), "").position
+    function = names.functions.get(name)
+    if function is None:
+        if name in names.misdeclared:
+            raise SpecificationError(())
+        raise SpecificationError.at(
+            place, f"there is no function {shown(name)}{nearest(name, names.functions)}"
+        )
+    if function.parameters:
+        raise SpecificationError.at(place, f"{shown(name)} takes parameters; nobody gives them at a deadline")
+    topics = topics_of(names, name)
+    if not topics:
+        raise SpecificationError.at(place, f"{shown(name)} publishes nothing; write `PUBLISH(…)` in it")
+    return topics
+
+
+def with_remedy(compiled: CompiledProperty, node: tree.Property) -> list[tree.Handler]:
+    """The handlers of a property; that of `enforced` calls the remedy first."""
+    handlers = list(node.handlers)
+    if compiled.remedy is None:
+        return handlers
+    at = node.position
+    call = tree.Evaluate(at, tree.Call(at, tree.Name(at, (compiled.remedy,)), ()))
+    mine = [place for place, handler in enumerate(handlers) if (handler.category,) == ENFORCED]
+    for place in mine:
+        body = handlers[place].body
+        handlers[place] = replace(handlers[place], body=replace(body, statements=(call, *body.statements)))
+    return handlers if mine else [*handlers, tree.Handler(at, ENFORCED[0], tree.Block(at, (call,)))]
