@@ -37,7 +37,7 @@ test: check ## check, and the tests with real ROS nodes (root: they make network
 
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
-	$(PYTEST) tests/system tests/proofs/test_insertion_at_large.py tests/proofs/test_past.py --quiet --durations=15
+	$(PYTEST) tests/system tests/proofs/test_insertion_at_large.py tests/proofs/test_past.py tests/proofs/test_events.py --quiet --durations=15
 
 test-package: ## what is installed: the package's life in a virtual machine, image and archive built, the wheel
 	@scripts/setup --system
@@ -65,7 +65,7 @@ release: ## everything anew, with provenance and checksums that KEY=FILE signs
 bench: setup ## measure: every program in benchmarks/
 	@for program in benchmarks/*.py; do echo "== $$program"; $(BIN)/python -m "benchmarks.$$(basename "$$program" .py)"; done
 
-prove: ## check what is proved: the proofs in Coq, the model of the insertion, its mutants and traces (docs/assurance.md)
+prove: ## check what is proved: the proofs in Coq, the code of events, the model of the insertion, its mutants and traces (docs/assurance.md)
 	@scripts/setup --proofs
 	$(PYTEST) tests/proofs tests/integration/test_insertion_traces.py -n auto --dist loadfile --quiet --durations=5
 

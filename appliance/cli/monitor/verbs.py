@@ -4,6 +4,7 @@ Exit status: 0 right (warnings or not), whatever the verdicts; 1 a specification
 """
 
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -44,13 +45,24 @@ def check(
     *,
     as_json: Json = False,
     msg: _Folders = None,
+    prove: Annotated[
+        bool,
+        typer.Option(
+            "--prove", help="Also prove that the relay's code of each event does what the event means"
+        ),
+    ] = False,
     dot: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata for Graphviz")] = None,
     svg: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata as a picture")] = None,
 ) -> None:
     """Report every error and warning with its place; exit status 1 if there is an error.
 
+    `--prove` needs the package z3-solver, takes up to a few seconds for each event, and says of each what is proved;
+    exit status 1 if code of one does something else.
+
     Example: rosrv monitor check monitors/*.rv
     """
+    if prove and find_spec("z3") is None:
+        raise usage_error("--prove needs the package z3-solver: pip install 'rosrv-appliance[prove]'")
     try:
         monitors = _load(files, msg or [])
         certificates, wrong = certificates_of(monitors.monitors)
@@ -70,6 +82,10 @@ def check(
     if monitors is not None:
         properties = [each.code.property for monitor in monitors.monitors for each in monitor.properties]
         _draw(properties, dot, svg)
+        if prove:
+            from appliance.cli.monitor.proving import say_proofs  # noqa: PLC0415  its package may be missing
+
+            errors += say_proofs(monitors, as_json=as_json)
     raise typer.Exit(1 if errors else 0)
 
 

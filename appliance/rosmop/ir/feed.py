@@ -100,6 +100,8 @@ class FeedModule:
     feeds: Mapping[str, Feed]
     cells: Sequence[Cells]
     throttles: Mapping[tuple[str, int], int]
+    budgets: Mapping[str, int]
+    """Where the budget of each specification stands, by its context."""
 
 
 def module_of(
@@ -128,7 +130,7 @@ def module_of(
     frames = writer.take(AREA + _SLACK)
     memory = -(-(frames + AREA + _SLACK) // _PAGE) * _PAGE
     code = _assembled(writer, walks, feeds, tables, memory)
-    return FeedModule(code, memory, frames, effects, feeds, cells, writer.throttles)
+    return FeedModule(code, memory, frames, effects, feeds, cells, writer.throttles, writer.budgets)
 
 
 class _Tables:

@@ -133,7 +133,7 @@ class Writer:
         self.shared = shared
         self.written: list[Written] = []
         self._numbers: dict[tuple[object, ...], Written] = {}
-        self._budgets: dict[str, int] = {}
+        self.budgets: dict[str, int] = {}
         self.throttles: dict[tuple[str, int], int] = {}
         """Where it stands when output at a site of a specification was last due."""
         self._used = FIRST
@@ -183,9 +183,9 @@ class Writer:
 
     def budget(self, context: str) -> int:
         """Where the budget of a specification stands."""
-        if context not in self._budgets:
-            self._budgets[context] = self.take(8)
-        return self._budgets[context]
+        if context not in self.budgets:
+            self.budgets[context] = self.take(8)
+        return self.budgets[context]
 
     def throttle(self, context: str, site: int) -> int:
         """Where it stands when output at a site was last due."""

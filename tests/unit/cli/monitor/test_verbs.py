@@ -106,6 +106,37 @@ def test_warnings_alone_are_no_failure(tmp_path: Path) -> None:
     assert {record["severity"] for record in records(result)} == {"warning"}
 
 
+PROVED = """s() { int n = 0; double d = 0;
+    event e(float level) /battery sensor_msgs/BatteryState '{voltage:level}' when (level < 11.5) { n++; }
+    event f(double x) /odom nav_msgs/Odometry '{pose.pose.position.x:x}' { d = sin(x); }
+}"""
+
+
+def test_what_is_proved_is_said_of_every_event(tmp_path: Path) -> None:
+    """With `--prove`; what is not proved has its reason, and is no error."""
+    file = write(tmp_path, "a.rv", PROVED)
+    result = invoke("check", file, "--prove")
+    assert (result.exit_code, result.stdout.splitlines()) == (
+        0,
+        [
+            "1 specification right",
+            "s.e on /battery: equal",
+            "s.f on /odom: no module: messages of this topic are judged in Python",
+        ],
+    )
+    assert records(invoke("check", file, "--prove", "--json"))[0] == {
+        "topic": "/battery", "event": "s.e", "proof": "equal", "differs": False,
+    }  # fmt: skip
+
+
+def test_proving_without_the_prover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exit status 2, with what to install, before anything is judged."""
+    monkeypatch.setattr("appliance.cli.monitor.verbs.find_spec", lambda name: None)
+    result = invoke("check", write(tmp_path, "a.rv", PROVED), "--prove")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "--prove needs the package z3-solver: pip install 'rosrv-appliance[prove]'" in result.stderr
+
+
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     """A missing file is a mistake of the command line: exit status 2."""
     result = invoke("check", tmp_path / "none.rv")

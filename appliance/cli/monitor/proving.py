@@ -1,0 +1,22 @@
+"""What `rosrv monitor check --prove` says: of each event on a topic, whether its module is proved to be the same."""
+
+import time
+
+from appliance.cli.output import say, say_json
+from appliance.rosmop.compile.specification import compile_files
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.prove.equality import findings_of
+
+
+def say_proofs(monitors: MonitorSet, *, as_json: bool) -> int:
+    """Write them; how many events' code does something else than the event means."""
+    different = 0
+    for found in findings_of(compile_files(monitors.files, monitors.definitions), time.monotonic):
+        different += found.differs
+        if as_json:
+            say_json(
+                {"topic": found.topic, "event": found.event, "proof": found.answer, "differs": found.differs}
+            )
+        else:
+            say(f"{found.event} on {found.topic}: {found.answer}", "red" if found.differs else "")
+    return different

@@ -1,0 +1,180 @@
+"""The bytes of a module as functions: their types, local variables, and instructions in a tree.
+
+Only the instructions are known that modules of events are written with; any other is an `UnknownInstructionError`.
+"""
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+
+class UnknownInstructionError(Exception):
+    """The module has something that is not known here."""
+
+
+@dataclass(frozen=True, slots=True)
+class Instruction:
+    """`operands` are its constants; blocks have their `body`, and `if` what is done `otherwise`."""
+
+    name: str
+    operands: tuple[int | float, ...] = ()
+    body: "tuple[Instruction, ...]" = ()
+    otherwise: "tuple[Instruction, ...]" = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """A function: the types of its parameters, of its result and of its further variables ("i32", "f64", …)."""
+
+    parameters: tuple[str, ...]
+    result: str
+    made: tuple[str, ...]
+    body: tuple[Instruction, ...]
+
+
+_TYPES = {0x7F: "i32", 0x7E: "i64", 0x7D: "f32", 0x7C: "f64"}
+_COMPARED = "eq ne lt_s lt_u gt_s gt_u le_s le_u ge_s ge_u"
+_COMPARED_FLOATS = "eq ne lt gt le ge"
+_CALCULATED = "clz ctz popcnt add sub mul div_s div_u rem_s rem_u and or xor shl shr_s shr_u"
+_CALCULATED_FLOATS = "abs neg ceil floor trunc nearest sqrt add sub mul div min max copysign"
+_CONVERTED = """i32.wrap_i64 i32.trunc_f32_s i32.trunc_f32_u i32.trunc_f64_s i32.trunc_f64_u i64.extend_i32_s
+    i64.extend_i32_u i64.trunc_f32_s i64.trunc_f32_u i64.trunc_f64_s i64.trunc_f64_u f32.convert_i32_s f32.convert_i32_u
+    f32.convert_i64_s f32.convert_i64_u f32.demote_f64 f64.convert_i32_s f64.convert_i32_u f64.convert_i64_s
+    f64.convert_i64_u f64.promote_f32 i32.reinterpret_f32 i64.reinterpret_f64 f32.reinterpret_i32 f64.reinterpret_i64
+    i32.extend8_s i32.extend16_s"""
+_ACCESSES = """i32.load i64.load f32.load f64.load i32.load8_s i32.load8_u i32.load16_s i32.load16_u i64.load8_s
+    i64.load8_u i64.load16_s i64.load16_u i64.load32_s i64.load32_u i32.store i64.store f32.store f64.store i32.store8
+    i32.store16"""
+_TRUNCATED = """i32.trunc_sat_f32_s i32.trunc_sat_f32_u i32.trunc_sat_f64_s i32.trunc_sat_f64_u i64.trunc_sat_f32_s
+    i64.trunc_sat_f32_u i64.trunc_sat_f64_s i64.trunc_sat_f64_u"""
+
+
+def _plain() -> dict[int, str]:
+    """The codes of what has no operands, as the standard lists them (WebAssembly 1.0, section 5.4)."""
+    found = {
+        0x00: "unreachable",
+        0x0F: "return",
+        0x1A: "drop",
+        0x1B: "select",
+        0x45: "i32.eqz",
+        0x50: "i64.eqz",
+    }
+    rows = (
+        (0x46, "i32", _COMPARED), (0x51, "i64", _COMPARED), (0x5B, "f32", _COMPARED_FLOATS),
+        (0x61, "f64", _COMPARED_FLOATS), (0x67, "i32", _CALCULATED), (0x79, "i64", _CALCULATED),
+        (0x8B, "f32", _CALCULATED_FLOATS), (0x99, "f64", _CALCULATED_FLOATS),
+    )  # fmt: skip
+    for first, kind, names in rows:
+        found |= {first + place: f"{kind}.{name}" for place, name in enumerate(names.split())}
+    return found | {0xA7 + place: name for place, name in enumerate(_CONVERTED.split())}
+
+
+_PLAIN: Mapping[int, str] = MappingProxyType(_plain())
+_MEMORY = MappingProxyType({0x28 + place: name for place, name in enumerate(_ACCESSES.split())})
+_TRUNCATING = MappingProxyType(dict(enumerate(_TRUNCATED.split())))
+_NUMBERED = MappingProxyType({0x0C: "br", 0x0D: "br_if", 0x10: "call", 0x20: "local.get", 0x21: "local.set"})
+_BLOCKS = MappingProxyType({0x02: "block", 0x03: "loop", 0x04: "if"})
+_ELSE, _END = 0x05, 0x0B
+_FLOATS = MappingProxyType(
+    {0x43: ("f32.const", struct.Struct("<f")), 0x44: ("f64.const", struct.Struct("<d"))}
+)
+
+
+class _Reader:
+    def __init__(self, data: bytes) -> None:
+        self._data = data
+        self.at = 0
+
+    def byte(self) -> int:
+        self.at += 1
+        return self._data[self.at - 1]
+
+    def unsigned(self) -> int:
+        value = shift = 0
+        while True:
+            byte = self.byte()
+            value |= (byte & 0x7F) << shift
+            shift += 7
+            if byte < 0x80:
+                return value
+
+    def signed(self) -> int:
+        begun = self.at
+        value = self.unsigned()
+        bits = 7 * (self.at - begun)
+        return value - (value >> bits - 1 << bits)
+
+    def take(self, size: int) -> bytes:
+        self.at += size
+        return self._data[self.at - size : self.at]
+
+    def types(self) -> tuple[str, ...]:
+        return tuple(_TYPES[self.byte()] for _ in range(self.unsigned()))
+
+    def block(self) -> tuple[tuple[Instruction, ...], int]:
+        """Instructions up to an `else` or `end`, and which of the two it is."""
+        found: list[Instruction] = []
+        while True:
+            code = self.byte()
+            if code in (_ELSE, _END):
+                return tuple(found), code
+            found.append(self._instruction(code))
+
+    def _instruction(self, code: int) -> Instruction:
+        if code in _PLAIN:
+            return Instruction(_PLAIN[code])
+        if code in _MEMORY:
+            self.unsigned()  # what the address is a multiple of: a hint
+            return Instruction(_MEMORY[code], (self.unsigned(),))
+        if code in _NUMBERED:
+            return Instruction(_NUMBERED[code], (self.unsigned(),))
+        if code in _BLOCKS:
+            self.byte()  # the type of its value
+            body, end = self.block()
+            otherwise = self.block()[0] if end == _ELSE else ()
+            return Instruction(_BLOCKS[code], (), body, otherwise)
+        if code in (0x41, 0x42):
+            return Instruction("i32.const" if code == 0x41 else "i64.const", (self.signed(),))
+        if code in _FLOATS:
+            name, layout = _FLOATS[code]
+            return Instruction(name, layout.unpack(self.take(layout.size)))
+        number = self.unsigned() if code == 0xFC else -1
+        if number in _TRUNCATING:
+            return Instruction(_TRUNCATING[number])
+        raise UnknownInstructionError(f"the instruction {code:#04x}")
+
+
+def functions_of(module: bytes) -> tuple[list[Code], dict[str, int]]:
+    """The functions of a module without imports, and the numbers of those that it exports.
+
+    Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` where the module ends too early.
+    """
+    reader = _Reader(module)
+    reader.take(8)
+    types: list[tuple[tuple[str, ...], tuple[str, ...]]] = []
+    chosen: list[int] = []
+    exports: dict[str, int] = {}
+    found: list[Code] = []
+    while reader.at < len(module):
+        section, size = reader.byte(), reader.unsigned()
+        end = reader.at + size
+        for _ in range(reader.unsigned() if section in (1, 3, 7, 10) else 0):
+            if section == 1:
+                reader.byte()
+                types.append((reader.types(), reader.types()))
+            elif section == 3:
+                chosen.append(reader.unsigned())
+            elif section == 7:
+                name, kind, number = reader.take(reader.unsigned()).decode(), reader.byte(), reader.unsigned()
+                exports |= {name: number} if not kind else {}
+            else:
+                reader.unsigned()
+                parameters, results = types[chosen[len(found)]]
+                made: list[str] = []
+                for _ in range(reader.unsigned()):
+                    count = reader.unsigned()
+                    made += [_TYPES[reader.byte()]] * count
+                found.append(Code(parameters, results[0], tuple(made), reader.block()[0]))
+        reader.at = end
+    return found, exports

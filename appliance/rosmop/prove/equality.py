@@ -1,0 +1,261 @@
+"""Whether events and the module that was written of them can differ: the question for z3, and its answer.
+
+An event and its function in the module are equal if, for every message of up to `AREA` bytes and every state, the
+function leaves the message to Python (which then judges it anew), or
+
+- the form neither faults nor puts anything out,
+- both say the same of whether the event happened, dropped the message, changed it,
+- and the bytes of the message, the variables and what is left of the budget are the same.
+
+Where it leaves the message, the walk takes back what it has done: each variable that it has written stands among those
+that are taken back, and each byte in the log (`module_terms.py`).
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import z3
+
+from appliance.rosmop.compile.program import groups
+from appliance.rosmop.compile.specification import Compiled
+from appliance.rosmop.ir import form
+from appliance.rosmop.ir.feed import AREA, FeedModule, module_of
+from appliance.rosmop.ir.values import Values
+from appliance.rosmop.prove.decoding import Instruction, functions_of
+from appliance.rosmop.prove.form_terms import Meaning, wrapped
+from appliance.rosmop.prove.module_terms import Done, Execution
+from appliance.rosmop.prove.terms import (
+    DOUBLE,
+    SINGLE,
+    Beginning,
+    DiffersError,
+    NotProvedError,
+    Result,
+    Term,
+    abstracted,
+    as_bits,
+    both,
+    either,
+    opposite,
+)
+from appliance.rosmop.runtime.context import BUDGET
+from appliance.rosmop.runtime.times import MAX_TIME
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
+
+EQUAL = "equal"
+PATIENCE = 1.0
+"""Seconds for each event."""
+
+_NOW = 16  # where the time stands in the module
+_HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE = 1, 2, 4, 8
+_LATEST = 1 << 62
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is known of an event on a topic. `answer` is `EQUAL`, or says why it is not known to be, or what differs.
+
+    `differs`: the two are not equal, which is a defect of what writes modules.
+    """
+
+    topic: str
+    event: str
+    answer: str
+    differs: bool = False
+
+
+def findings_of(
+    compiled: Compiled, clock: Callable[[], float], patience: float = PATIENCE
+) -> Iterator[Finding]:
+    """What is known of every event of a set on a topic, in their order; `patience` in seconds of the clock for each."""
+    found = list(groups(compiled.specifications))
+    values = Values(compiled.messages)
+    module = module_of(compiled.functions, [group.component for group in found], values)
+    validation = Validation(compiled.functions, values, module, clock, patience)
+    for group in found:
+        for (topic, events), numbers in zip(group.component.topics, group.events, strict=True):
+            for place, (each, (number, index)) in enumerate(zip(events, numbers, strict=True)):
+                specification = compiled.specifications[number]
+                name = f"{specification.name}.{specification.events[index].name}"
+                yield validation.finding(topic, name, each.function, place)
+
+
+class Validation:
+    """The module of a set beside the form. Raises `UnknownInstructionError` for a module that cannot be read."""
+
+    def __init__(
+        self,
+        functions: Mapping[str, form.Function],
+        values: Values,
+        module: FeedModule,
+        clock: Callable[[], float],
+        patience: float = PATIENCE,
+    ) -> None:
+        self._forms = functions
+        self._values = values
+        self._module = module
+        self._clock = clock
+        self._patience = patience
+        self.codes, self._exports = functions_of(module.code)
+
+    def finding(self, topic: str, event: str, function: str, place: int) -> Finding:
+        """What is known of the event that is at this place among those of a topic."""
+        feed = self._module.feeds.get(topic)
+        if feed is None:
+            return Finding(topic, event, "no module: messages of this topic are judged in Python")
+        numbers = list(_called(self.codes[self._exports[feed.name]].body))
+        try:
+            return Finding(topic, event, self._compared(function, numbers[place], topic))
+        except DiffersError as error:
+            return Finding(topic, event, f"not equal: {error}", differs=True)
+        except NotProvedError as error:
+            return Finding(topic, event, str(error))
+
+    def _compared(self, name: str, number: int, topic: str) -> str:
+        begin, cells, known = self._beginning()
+        meant = Meaning(self._forms, self._values, begin, name).result()
+        done = Execution(self.codes, number, begin.message, begin.size, cells).done()
+        self._check_undone(done, topic)
+        left = either(done.trapped, done.bits == _ELSEWHERE)
+        unknown = either(*meant.unknown.values())
+        wrong = {
+            "it looks beyond the message": done.outside,
+            "it goes on where the form faults or puts something out": both(opposite(left), meant.left),
+        }
+        others = {
+            "whether it happened": _bit(done.bits, _HAPPENED) != meant.happened,
+            "whether the message is dropped": _bit(done.bits, _DROPPED) != meant.dropped,
+            "whether the message is changed": _bit(done.bits, _CHANGED) != meant.changed,
+            "the message": done.message != meant.message,
+            "no other bits": z3.UGT(done.bits, _HAPPENED | _DROPPED | _CHANGED),
+            **{
+                f"the variable at {place}": opposite(_same(done.cells[place], value))
+                for place, value in self._ends(meant)
+            },
+        }
+        decided = both(opposite(left), opposite(meant.left), opposite(unknown))
+        wrong |= {text: both(decided, condition) for text, condition in others.items()}
+        answer = self._first(known, wrong)
+        if answer is not None:
+            return answer
+        begun = self._clock()
+        for what, condition in meant.unknown.items():
+            if self._asked([*known, opposite(left), opposite(meant.left), condition], begun)[0] != z3.unsat:
+                return f"uses {what}"
+        return EQUAL
+
+    def _first(self, known: Sequence[Term], wrong: Mapping[str, Term]) -> str | None:
+        """Why they are not known to be equal; None if they are. Raises `DiffersError`."""
+        open_ones = {
+            text: condition for text, condition in wrong.items() if not z3.is_false(z3.simplify(condition))
+        }
+        begun = self._clock()
+        if (
+            not open_ones
+            or self._asked(abstracted([*known, either(*open_ones.values())]), begun)[0] == z3.unsat
+        ):
+            return None
+        undecided = False
+        for text, condition in open_ones.items():
+            question = [*known, condition]
+            answer, guess = self._asked(abstracted(question), begun)
+            if answer != z3.unsat:
+                if guess is not None and _holds(question, guess):
+                    raise DiffersError(f"{text}, for {_example(guess)}")
+                answer, model = self._asked(question, begun)
+                if model is not None:
+                    raise DiffersError(f"{text}, for {_example(model)}")
+                undecided = undecided or answer != z3.unsat
+        return "not decided in time" if undecided else None
+
+    def _asked(self, conditions: Sequence[Term], begun: float) -> tuple[Any, Any]:
+        """Whether they can hold together, and how; `begun` is when the first question about the event was asked."""
+        rest = int(1000 * (begun + self._patience - self._clock()))
+        if rest <= 0:
+            return z3.unknown, None
+        solver = z3.Solver()
+        solver.set("timeout", rest)
+        solver.add(*conditions)
+        answer = solver.check()
+        return answer, solver.model() if answer == z3.sat else None
+
+    def _beginning(self) -> tuple[Beginning, dict[int, Term], list[Term]]:
+        """What every event may begin with; the same as the module's cells; and what is known of it."""
+        now, size = z3.BitVec("now", 64), z3.BitVec("size", 32)
+        known = [now >= 0, now < _LATEST, z3.ULE(size, AREA)]
+        cells: dict[int, Term] = {_NOW: now}
+        variables: dict[str, Term] = {}
+        for component in self._module.cells:
+            for name, (address, kind) in component.variables.items():
+                variables[name] = cells[address] = _variable(name, kind)
+                if isinstance(kind, kinds.Time | kinds.Duration):
+                    most = MAX_TIME + (1 << 32)
+                    known += [variables[name] >= -most, variables[name] <= most]
+        budgets = {context: z3.BitVec(f"budget of {context}", 64) for context in self._module.budgets}
+        for context, address in self._module.budgets.items():
+            known += [budgets[context] >= 0, budgets[context] <= BUDGET]
+            cells[address] = budgets[context]
+        throttles = {key: z3.BitVec(f"output of {key}", 64) for key in self._module.throttles}
+        for key, address in self._module.throttles.items():
+            known.append(throttles[key] >= 0)
+            cells[address] = throttles[key]
+        message = z3.Array("message", z3.BitVecSort(32), z3.BitVecSort(8))
+        return Beginning(message, size, now, variables, budgets, throttles), cells, known
+
+    def _ends(self, meant: Result) -> Iterator[tuple[int, Term]]:
+        """What each cell must hold at the end."""
+        for component in self._module.cells:
+            for name, (address, _) in component.variables.items():
+                yield address, meant.variables[name]
+        for context, address in self._module.budgets.items():
+            yield address, meant.budgets[context]
+
+    def _check_undone(self, done: Done, topic: str) -> None:
+        taken_back = {address for address, _ in self._module.feeds[topic].undo}
+        for address in sorted(done.stored - taken_back - set(self._module.budgets.values())):
+            raise DiffersError(f"what it writes at {address} is not taken back")
+
+
+def _called(instructions: Sequence[Instruction]) -> Iterator[int]:
+    """The functions that are called, in the order of the text."""
+    for each in instructions:
+        if each.name == "call":
+            yield int(each.operands[0])
+        yield from _called(each.body)
+        yield from _called(each.otherwise)
+
+
+def _holds(conditions: Sequence[Term], guess: Any) -> bool:
+    """Whether a message and a state are an example, too, with what costly operations are in truth."""
+    values = [(one(), guess[one]) for one in guess.decls() if one.arity() == 0]
+    known = [
+        (one, value) for one, value in values if value is not None and not isinstance(value, z3.FuncInterp)
+    ]
+    return all(z3.is_true(z3.simplify(z3.substitute(condition, *known))) for condition in conditions)
+
+
+def _example(model: Any) -> str:
+    """A message and a state, as short as they are."""
+    return ", ".join(f"{one} = {model[one]}" for one in model.decls() if one.arity() == 0)
+
+
+def _same(held: Term, value: Term) -> Term:
+    """Whether a cell holds a value; a truth may be one by its bits."""
+    return held == (as_bits(value) if z3.is_bool(value) and not z3.is_bool(held) else value)
+
+
+def _bit(bits: Term, which: int) -> Term:
+    return bits & which != 0
+
+
+def _variable(name: str, kind: Type) -> Term:
+    """A variable of the set, with any value of its type."""
+    if isinstance(kind, kinds.Bool):
+        return z3.Bool(name)
+    if isinstance(kind, kinds.Floating):
+        return z3.FP(name, DOUBLE if kind.bits == 64 else SINGLE)
+    if isinstance(kind, kinds.Integer) and kind.bits <= 32:
+        return wrapped(z3.BitVec(name, 32), kind)
+    return z3.BitVec(name, 64)

@@ -1,0 +1,793 @@
+"""What the form of an event means, as terms: `ir/interpreter.py` line by line, for every message at once.
+
+- Positions and counts are 64 bits here and any number there: a function without loops adds up a few products of a
+  count below 2**32 and a size, and never comes to more. Times are 64 bits, too, and sums of two of them fit.
+- Of numbers of 32 bits the interpreter rounds the double that comes of `+ - * /`. That is the float that the operation
+  has itself: a double has more than twice as many digits, so that rounding twice is rounding once.
+- What it measures of the values that a specification holds, once in a megabyte that it says it will make, is left out.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import z3
+
+from appliance.rosmop.ir import form
+from appliance.rosmop.ir.interpreter import CHARGED, SHORT
+from appliance.rosmop.ir.values import Values, struct_code, struct_size
+from appliance.rosmop.prove.terms import (
+    DOUBLE,
+    MIXED,
+    NEAREST,
+    SINGLE,
+    Beginning,
+    NotProvedError,
+    Result,
+    State,
+    Term,
+    as_bits,
+    both,
+    choice,
+    either,
+    floating,
+    integer,
+    merged,
+    number_at,
+    opposite,
+    with_number,
+)
+from appliance.rosmop.runtime import times
+from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, UNMEASURED
+from appliance.rosmop.runtime.wire import MAX_EMPTY
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
+
+_MESSAGE, _DROPPED, _CHANGED, _BUDGET = "message", "dropped", "changed", "budget"
+
+
+@dataclass(frozen=True)
+class _View:
+    """A string, vector or message as it stood in the bytes: from where, and how many elements."""
+
+    message: Term
+    start: Term
+    count: Term
+
+
+class UnknownError(Exception):
+    """What is not said here."""
+
+
+def is_signed(kind: Type) -> bool:
+    """Whether numbers of the type may be negative."""
+    return not isinstance(kind, kinds.Integer) or kind.signed
+
+
+def width(kind: Type) -> int:
+    """The bits of the vector that holds a number of this type."""
+    return 32 if isinstance(kind, kinds.Integer) and kind.bits <= 32 else 64
+
+
+def wrapped(value: Term, kind: kinds.Integer) -> Term:
+    """Only the bits of this type, as the vector holds them."""
+    if kind.bits >= 32:
+        return value
+    return (z3.SignExt if kind.signed else z3.ZeroExt)(32 - kind.bits, z3.Extract(kind.bits - 1, 0, value))
+
+
+class Meaning:
+    """One event. `functions` are those of its set, `values` the types of its messages."""
+
+    def __init__(
+        self, functions: Mapping[str, form.Function], values: Values, beginning: Beginning, name: str
+    ) -> None:
+        self._functions = functions
+        self._values = values
+        self._beginning = beginning
+        self._function = functions[name]
+        self._left: list[Term] = []
+        self._unknown: dict[str, list[Term]] = {}
+        self._exits: list[tuple[State, Term]] = []
+        self._returned: list[tuple[State, Term]] | None = None
+        self._calls = 0
+        self._call = 0
+        self._shared: Sequence[str] = self._function.shared
+
+    def result(self) -> Result:
+        """What it comes to. Raises `NotProvedError` for a loop."""
+        begin, no = self._beginning, z3.BoolVal(False)
+        budget = begin.budgets[self._function.context]
+        slots: dict[Any, Any] = {_MESSAGE: begin.message, _DROPPED: no, _CHANGED: no, _BUDGET: budget}
+        slots |= {("shared", name): value for name, value in begin.variables.items()}
+        state = State(z3.BoolVal(True), slots)
+        self._block(self._function.body, state)
+        self._left.append(state.alive)  # nothing comes to the end without leaving
+        happened, end = no, slots
+        for left, value in self._exits:
+            happened = choice(left.alive, value, happened)
+            end = merged(left.alive, left, State(opposite(left.alive), end))
+        unknown = {name: either(*conditions) for name, conditions in self._unknown.items()}
+        variables = {name: end["shared", name] for name in begin.variables}
+        return Result(
+            either(*self._left), unknown, happened, end[_DROPPED], end[_CHANGED], end[_MESSAGE], variables,
+            {**begin.budgets, self._function.context: end[_BUDGET]},
+        )  # fmt: skip
+
+    # Ends
+
+    def _leave_to_python(self, state: State, condition: Term) -> None:
+        """A fault, or what no module does: the message is judged anew, by others."""
+        self._left.append(both(state.alive, condition))
+        state.require(opposite(condition))
+
+    def _ignore(self, state: State, what: str) -> None:
+        self._unknown.setdefault(what, []).append(state.alive)
+        state.alive = z3.BoolVal(False)
+
+    def _exit(self, state: State, happened: bool) -> None:
+        self._exits.append((state.where(z3.BoolVal(True)), z3.BoolVal(happened)))
+        state.alive = z3.BoolVal(False)
+
+    # Statements
+
+    def _block(self, statements: Sequence[form.Statement], state: State) -> None:
+        for statement in statements:
+            if z3.is_false(state.alive):
+                return
+            method = _STATEMENTS.get(type(statement))
+            try:
+                if method is None:
+                    raise UnknownError(type(statement).__name__)
+                method(self, statement, state)
+            except UnknownError as error:
+                self._ignore(state, str(error))
+
+    def _evaluate(self, node: form.Evaluate, state: State) -> None:
+        self._value(node.value, state)
+
+    def _if(self, node: form.If, state: State) -> None:
+        test = self._value(node.test, state)
+        yes, no = state.where(test), state.where(opposite(test))
+        self._block(node.yes, yes)
+        self._block(node.no, no)
+        state.join(test, yes, no)
+
+    def _repeat(self, node: form.Statement, state: State) -> None:
+        del node, state
+        raise NotProvedError("not loop-free")
+
+    def _select(self, node: form.Select, state: State) -> None:
+        value = self._value(node.value, state)
+        number = integer(node.default, 32)
+        for wanted, index in reversed(node.table):
+            number = z3.If(value == integer(wanted, value.size()), integer(index, 32), number)
+        state.slots[self._call, node.name] = number
+
+    def _return(self, node: form.Return, state: State) -> None:
+        if node.references or self._returned is None:
+            raise UnknownError("references")
+        value = None if node.value.type == kinds.VOID else self._value(node.value, state)
+        self._returned.append((state.where(z3.BoolVal(True)), value))
+        state.alive = z3.BoolVal(False)
+
+    def _leave(self, node: form.Leave, state: State) -> None:
+        self._exit(state, bool(node.happened))
+
+    def _charge(self, node: form.Charge, state: State) -> None:
+        self._spend(integer(node.instructions, 64), state)
+
+    def _spend(self, instructions: Term, state: State) -> None:
+        state.slots[_BUDGET] = state.slots[_BUDGET] - instructions
+        self._leave_to_python(state, state.slots[_BUDGET] < 0)
+
+    def _allocate(self, node: form.Allocate, state: State) -> None:
+        if node.size is not None:
+            self._make(integer(node.size, 64), state)
+            return
+        size = z3.ZeroExt(32, self._beginning.size)
+        many = size > CHARGED
+        yes, no = state.where(many), state.where(opposite(many))
+        self._make(size, yes)
+        state.join(many, yes, no)
+
+    def _make(self, size: Term, state: State) -> None:
+        self._leave_to_python(state, z3.UGT(size, UNMEASURED))
+        self._spend(z3.UDiv(size, integer(BYTES_PER_INSTRUCTION, 64)), state)
+
+    def _drop(self, node: form.Drop, state: State) -> None:
+        del node
+        state.slots[_DROPPED] = z3.BoolVal(True)
+
+    def _acts(self, node: form.Statement | form.Expression, state: State) -> None:
+        """What comes out of it, or is told, is for Python."""
+        del node
+        self._leave_to_python(state, z3.BoolVal(True))
+
+    def _nothing(self, node: form.Statement, state: State) -> None:
+        """Only `Whole` asks for it."""
+
+    def _require(self, node: form.Require, state: State) -> None:
+        test = self._value(node.test, state)
+        self._exit(state.where(opposite(test)), False)
+        state.require(test)
+
+    def _not_past(self, node: form.NotPast, state: State) -> None:
+        self._leave_to_python(state, state.slots[self._call, node.count] <= node.index)
+
+    # Fields of the message
+
+    def _position(self, at: form.Spot, state: State) -> Term:
+        offset = integer(at.offset, 64)
+        return offset if at.base is None else state.slots[self._call, at.base] + offset
+
+    def _place(self, at: form.Spot, state: State) -> Term:
+        """The same where it is known to be within the message."""
+        offset = integer(at.offset, 32)
+        return offset if at.base is None else z3.Extract(31, 0, state.slots[self._call, at.base]) + offset
+
+    def _within(self, at: form.Spot, size: int, state: State) -> None:
+        short = z3.ULT(z3.ZeroExt(32, self._beginning.size), self._position(at.plus(size), state))
+        self._leave_to_python(state, short)
+
+    def _length(self, at: form.Spot, state: State) -> Term:
+        self._within(at, 4, state)
+        return z3.ZeroExt(32, number_at(state.slots[_MESSAGE], self._place(at, state), 4))
+
+    def _after_text(self, node: form.AfterText, state: State) -> None:
+        length = self._length(node.at, state)
+        state.slots[self._call, node.name] = self._position(node.at.plus(4), state) + length
+
+    def _count(self, node: form.Count, state: State) -> None:
+        state.slots[self._call, node.name] = self._counted(node.at, node.least, state)
+
+    def _counted(self, at: form.Spot, least: int, state: State) -> Term:
+        count = self._length(at, state)
+        room = z3.ZeroExt(32, self._beginning.size) - self._position(at.plus(4), state)
+        many = z3.UGT(count * least, room) if least else z3.UGT(count, MAX_EMPTY)
+        self._leave_to_python(state, many)
+        return count
+
+    def _after_elements(self, node: form.AfterElements, state: State) -> None:
+        count = (
+            integer(node.count, 64) if isinstance(node.count, int) else state.slots[self._call, node.count]
+        )
+        state.slots[self._call, node.name] = self._position(node.at, state) + count * node.size
+
+    def _read_numbers(self, node: form.ReadNumbers, state: State) -> None:
+        self._within(node.at, max(offset + self._size(kind) for _, kind, offset in node.fields), state)
+        for name, kind, offset in node.fields:
+            place = self._place(node.at.plus(offset), state)
+            state.slots[self._call, name] = self._number(state.slots[_MESSAGE], place, kind)
+
+    def _number(self, message: Term, place: Term, kind: Type) -> Term:
+        if isinstance(kind, kinds.Time | kinds.Duration):
+            extend = z3.ZeroExt if kind == kinds.TIME else z3.SignExt
+            seconds, rest = (extend(32, number_at(message, place + more, 4)) for more in (0, 4))
+            return seconds * integer(times.BILLION, 64) + rest
+        bits = number_at(message, place, self._size(kind))
+        if isinstance(kind, kinds.Bool):
+            return bits != 0
+        if isinstance(kind, kinds.Floating):
+            return z3.fpBVToFP(bits, DOUBLE if kind.bits == 64 else SINGLE)
+        if not isinstance(kind, kinds.Integer):
+            raise UnknownError(f"a value of type {kind}")
+        missing = width(kind) - bits.size()
+        return bits if not missing else (z3.SignExt if kind.signed else z3.ZeroExt)(missing, bits)
+
+    def _size(self, kind: Type) -> int:
+        """The bytes of every value of a type in a message."""
+        code = struct_code(kind)
+        if code is not None:
+            return struct_size(code)
+        if isinstance(kind, kinds.Record):
+            return sum(map(self._size, self._values.fields(kind)))
+        if isinstance(kind, kinds.Vector) and kind.length is not None:
+            return kind.length * self._size(kind.element)
+        raise UnknownError(f"a value of type {kind} in a vector or message")
+
+    def _read_value(self, node: form.ReadValue, state: State) -> None:
+        kind, start = node.type, self._position(node.at, state)
+        count, size = integer(1, 64), 1
+        if isinstance(kind, kinds.String):
+            count = self._length(node.at, state)
+            start = self._position(node.at.plus(4), state)
+            self._leave_to_python(state, z3.UGT(start + count, z3.ZeroExt(32, self._beginning.size)))
+        elif isinstance(kind, kinds.Vector) and kind.length is None:
+            size = self._size(kind.element)
+            count = self._counted(node.at, size, state)
+            start = self._position(node.at.plus(4), state)
+        else:
+            size = self._size(kind)
+            self._within(node.at, size, state)
+            if isinstance(kind, kinds.Vector):
+                count, size = integer(kind.length or 0, 64), self._size(kind.element)
+        state.slots[self._call, node.name] = _View(state.slots[_MESSAGE], start, count)
+        state.slots[self._call, node.end] = start + count * size
+
+    def _write_back(self, node: form.WriteBack, state: State) -> None:
+        dropped = state.slots[_DROPPED]
+        self._exit(state.where(dropped), True)
+        state.require(opposite(dropped))
+        puts = []
+        for write in node.writes:
+            flag = state.slots[self._call, write.flag]
+            if write.end is not None:
+                self._ignore(state.where(flag), "a string or vector that is written")
+                state.require(opposite(flag))
+                continue
+            wanted = state.where(flag)
+            bits = self._packed(self._value(write.value, wanted), write.value.type, wanted)
+            state.alive = either(wanted.alive, state.where(opposite(flag)).alive)
+            puts.append((flag, bits, self._place(write.at, state)))
+        for flag, bits, place in puts:
+            message = state.slots[_MESSAGE]
+            differs = both(flag, number_at(message, place, bits.size() // 8) != bits)
+            state.slots[_MESSAGE] = choice(differs, with_number(message, place, bits), message)
+            state.slots[_CHANGED] = either(state.slots[_CHANGED], differs)
+
+    def _packed(self, value: Term, kind: Type, state: State) -> Term:
+        """The bytes of a number. Which bits a NaN has is for Python to say."""
+        if isinstance(kind, kinds.Floating):
+            self._leave_to_python(state, z3.fpIsNaN(value))
+            return z3.fpToIEEEBV(value)
+        if isinstance(kind, kinds.Bool):
+            return as_bits(value, 8)
+        if isinstance(kind, kinds.Integer):
+            return z3.Extract(kind.bits - 1, 0, value)
+        seconds, rest = self._parts(value)
+        least, most = (0, 1 << 32) if kind == kinds.TIME else (-(1 << 31), 1 << 31)
+        self._leave_to_python(state, either(seconds < least, seconds >= most))
+        return z3.Concat(z3.Extract(31, 0, rest), z3.Extract(31, 0, seconds))
+
+    def _parts(self, value: Term) -> tuple[Term, Term]:
+        """`divmod(value, 10**9)`: the rest has the sign of the divisor."""
+        billion = integer(times.BILLION, 64)
+        rest = z3.SRem(value, billion)
+        rest = z3.If(rest < 0, rest + billion, rest)
+        return (value - rest) / billion, rest
+
+    # Expressions
+
+    def _value(self, node: form.Expression, state: State) -> Any:
+        method = _EXPRESSIONS.get(type(node))
+        if method is None:
+            raise UnknownError(type(node).__name__)
+        return method(self, node, state)
+
+    def _literal(self, node: form.Literal, state: State) -> Any:
+        del state
+        if node.value is None:
+            return None
+        if isinstance(node.value, bytes | str):
+            raise UnknownError("a constant string")
+        if isinstance(node.type, kinds.Floating):
+            return floating(node.value, node.type.bits)
+        return self._whole_number(int(node.value), node.type)
+
+    def _whole_number(self, value: int, kind: Type) -> Term:
+        return z3.BoolVal(bool(value)) if isinstance(kind, kinds.Bool) else integer(value, width(kind))
+
+    def _zero(self, node: form.Zero, state: State) -> Any:
+        if isinstance(node.type, kinds.Floating):
+            return self._literal(form.Literal(node.type, 0.0), state)
+        if not isinstance(node.type, kinds.Bool | kinds.Integer | kinds.Time | kinds.Duration):
+            raise UnknownError(f"a zero of type {node.type}")
+        return self._whole_number(0, node.type)
+
+    def _read(self, node: form.Read, state: State) -> Any:
+        own, shared = (self._call, node.name), ("shared", node.name)
+        value = state.slots.get(own if own in state.slots else shared)
+        if value is None or value is MIXED:
+            raise UnknownError(f"a variable of type {node.type}")
+        return value
+
+    def _assign(self, node: form.Assign, state: State) -> Any:
+        value = self._value(node.value, state)
+        where: int | str = "shared" if node.name in self._shared else self._call
+        if where == "shared" and node.name not in self._beginning.variables:
+            raise UnknownError(f"a variable of type {node.type}")
+        state.slots[where, node.name] = value
+        return value
+
+    def _convert(self, node: form.Convert, state: State) -> Any:
+        return self._converted(self._value(node.value, state), node.value.type, node.type)
+
+    def _converted(self, value: Term, source: Type, target: Type) -> Term:
+        if isinstance(target, kinds.Bool):
+            if isinstance(source, kinds.Floating):
+                return opposite(z3.fpIsZero(value))
+            return value if isinstance(source, kinds.Bool) else value != 0
+        if isinstance(source, kinds.Bool):
+            source, value = kinds.INT, as_bits(value)
+        if isinstance(target, kinds.Floating):
+            sort = DOUBLE if target.bits == 64 else SINGLE
+            if isinstance(source, kinds.Floating):
+                return value if source.bits == target.bits else z3.fpFPToFP(NEAREST, value, sort)
+            return (z3.fpSignedToFP if is_signed(source) else z3.fpUnsignedToFP)(NEAREST, value, sort)
+        if not isinstance(target, kinds.Integer):
+            raise UnknownError(f"a conversion to {target}")
+        if isinstance(source, kinds.Floating):
+            return self._truncated(self._converted(value, source, kinds.Floating(64)), target)
+        if width(target) > value.size():
+            value = (z3.SignExt if is_signed(source) else z3.ZeroExt)(32, value)
+        return wrapped(value if width(target) == value.size() else z3.Extract(31, 0, value), target)
+
+    def _truncated(self, value: Term, target: kinds.Integer) -> Term:
+        """Toward zero, at most the limits; of what is narrower than 32 bits within those of `int` first."""
+        whole = target if target.bits >= 32 else kinds.INT
+        bits = whole.bits
+        least, most = floating(whole.least, 64), floating(whole.most, 64)
+        cut = (z3.fpToSBV if whole.signed else z3.fpToUBV)(z3.RTZ(), value, z3.BitVecSort(bits))
+        high = z3.If(z3.fpGEQ(value, most), integer(whole.most, bits), cut)
+        low = z3.If(z3.fpLEQ(value, least), integer(whole.least, bits), high)
+        result = z3.If(z3.fpIsNaN(value), integer(0, bits), low)
+        if whole is not target:
+            result = z3.If(result < target.least, integer(target.least, 32), result)
+            result = z3.If(result > target.most, integer(target.most, 32), result)
+        return result
+
+    def _arithmetic(self, node: form.Arithmetic, state: State) -> Any:
+        left, right = self._value(node.left, state), self._value(node.right, state)
+        kind, operator = node.type, node.operator
+        if isinstance(kind, kinds.Floating):
+            return _OF_FLOATS[operator](NEAREST, left, right)
+        assert isinstance(kind, kinds.Integer)  # noqa: S101  numbers that are calculated with are one of the two
+        if operator in "/%":
+            self._leave_to_python(state, right == 0)
+            if operator == "/":
+                result = left / right if kind.signed else z3.UDiv(left, right)
+            else:
+                result = z3.SRem(left, right) if kind.signed else z3.URem(left, right)
+        elif operator in ("<<", ">>"):
+            missing = left.size() - right.size()
+            amount = z3.ZeroExt(32, right) if missing > 0 else z3.Extract(31, 0, right) if missing else right
+            amount = amount & (kind.bits - 1)
+            result = (
+                left << amount
+                if operator == "<<"
+                else left >> amount
+                if kind.signed
+                else z3.LShR(left, amount)
+            )
+        else:
+            result = _OF_INTEGERS[operator](left, right)
+        return wrapped(result, kind)
+
+    def _unary(self, node: form.Unary, state: State) -> Any:
+        value = self._value(node.value, state)
+        if isinstance(node.type, kinds.Floating):
+            return z3.fpAbs(value) if node.operator == "abs" else z3.fpNeg(value)
+        if node.operator == "~":
+            result = ~value
+        elif node.operator == "-":
+            result = -value
+        else:
+            result = z3.If(value < 0, -value, value) if is_signed(node.type) else value
+        return wrapped(result, node.type) if isinstance(node.type, kinds.Integer) else result
+
+    def _moment(self, node: form.Moment, state: State) -> Any:
+        left, right = self._value(node.left, state), self._value(node.right, state)
+        return self._limited(node.type, left + right if node.operator == "+" else left - right, state)
+
+    def _moment_of(self, node: form.MomentOf, state: State) -> Any:
+        seconds, rest = self._value(node.seconds, state), self._value(node.nanoseconds, state)
+        return self._of_parts(node.type, seconds, rest, state)
+
+    def _of_parts(self, kind: Type, seconds: Term, rest: Term, state: State) -> Term:
+        """Exact: seconds beyond 2**33 are out of range with whatever nanoseconds, of which there are few enough, and
+        within 64 bits what overflows is told from what does not by the sum in 72.
+        """
+        far = either(seconds >= 1 << 33, seconds <= -(1 << 33), rest >= 1 << 62, rest <= -(1 << 62))
+        known = state.where(far)
+        self._ignore(known, "a time of more than 2**33 seconds in parts")
+        state.require(opposite(far))
+        product = seconds * integer(times.BILLION, 64)
+        exact = z3.SignExt(8, product) + z3.SignExt(8, rest)
+        limited = self._limited(kind, exact, state)
+        return z3.Extract(63, 0, limited)
+
+    def _limited(self, kind: Type, moment: Term, state: State) -> Term:
+        limits = (0, times.MAX_TIME) if kind == kinds.TIME else (times.MIN_DURATION, times.MAX_DURATION)
+        self._leave_to_python(state, either(moment < limits[0], moment > limits[1]))
+        return moment
+
+    def _compare(self, node: form.Compare, state: State) -> Any:
+        kind = node.left.type
+        if isinstance(kind, kinds.Vector | kinds.Record):
+            raise UnknownError(f"a comparison of values of type {kind}")
+        left, right = self._value(node.left, state), self._value(node.right, state)
+        return _compared(node.operator, left, right, kind)
+
+    def _compare_texts(self, node: form.CompareTexts, state: State) -> Any:
+        given, known = (
+            (node.right, node.left) if isinstance(node.left, form.Literal) else (node.left, node.right)
+        )
+        text = known.value if isinstance(known, form.Literal) else None
+        if node.operator not in ("==", "!=") or not node.short or not isinstance(text, bytes):
+            raise UnknownError("a comparison of strings")
+        view = self._value(given, state)
+        if not isinstance(view, _View) or len(text) > SHORT:
+            raise UnknownError("a comparison of strings")
+        place = z3.Extract(31, 0, view.start)
+        letters = [number_at(view.message, place + more, 1) == one for more, one in enumerate(text)]
+        same = both(view.count == len(text), *letters)
+        return same if node.operator == "==" else opposite(same)
+
+    def _logical(self, node: form.Logical, state: State) -> Any:
+        left = self._value(node.left, state)
+        looked_at = left if node.operator == "and" else opposite(left)
+        yes, no = state.where(looked_at), state.where(opposite(looked_at))
+        right = self._value(node.right, yes)
+        state.join(looked_at, yes, no)
+        return both(left, right) if node.operator == "and" else either(left, right)
+
+    def _not(self, node: form.Not, state: State) -> Any:
+        return opposite(self._value(node.value, state))
+
+    def _conditional(self, node: form.Conditional, state: State) -> Any:
+        test = self._value(node.test, state)
+        yes, no = state.where(test), state.where(opposite(test))
+        one, other = self._value(node.yes, yes), self._value(node.no, no)
+        state.join(test, yes, no)
+        return choice(test, one, other)
+
+    def _sequence(self, node: form.Sequence, state: State) -> Any:
+        return [self._value(item, state) for item in node.items][node.chosen]
+
+    def _discard(self, node: form.Discard, state: State) -> None:
+        self._value(node.value, state)
+
+    def _now(self, node: form.Now, state: State) -> Any:
+        del node, state
+        return self._beginning.now
+
+    def _throttle(self, node: form.Throttle, state: State) -> Any:
+        """Output that is due is noted, and so for Python; of what is not due nothing comes."""
+        last = self._beginning.throttles.get((self._function.context, node.site))
+        if last is None:
+            raise UnknownError("output at most so often")
+        seconds = self._converted(self._value(node.seconds, state), node.seconds.type, kinds.Floating(64))
+        more = z3.fpMul(NEAREST, seconds, floating(1e9, 64))
+        until = z3.fpAdd(NEAREST, z3.fpSignedToFP(NEAREST, last, DOUBLE), more)
+        # A whole number is below another if it is below the next whole one.
+        whole = z3.fpRoundToIntegral(z3.RTP(), until)
+        first, limit = z3.fpToSBV(z3.RTZ(), whole, z3.BitVecSort(64)), floating(2.0**63, 64)
+        now = self._beginning.now
+        before = z3.If(z3.fpGEQ(whole, limit), True, both(z3.fpGEQ(whole, z3.fpNeg(limit)), now < first))
+        self._leave_to_python(state, opposite(both(last <= now, before)))
+        return z3.BoolVal(False)
+
+    def _accumulate(self, node: form.Expression, state: State) -> Any:
+        del node, state
+        raise NotProvedError("not loop-free")
+
+    def _log(self, node: form.Log, state: State) -> None:
+        self._acts(node, state)
+
+    def _item(self, node: form.Item, state: State) -> Any:
+        view = self._value(node.base, state)
+        if not isinstance(view, _View) or not isinstance(node.base.type, kinds.Record):
+            raise UnknownError("a part of a value")
+        before = self._values.fields(node.base.type)[: node.number]
+        return self._part(view, sum(map(self._size, before)), node.type)
+
+    def _part(self, view: _View, offset: Term | int, kind: Type) -> Any:
+        """What stands so many bytes behind the beginning of a value."""
+        start = view.start + offset
+        if isinstance(kind, kinds.Record):
+            return _View(view.message, start, integer(1, 64))
+        if isinstance(kind, kinds.Vector) and kind.length is not None:
+            return _View(view.message, start, integer(kind.length, 64))
+        return self._number(view.message, z3.Extract(31, 0, start), kind)
+
+    def _copy(self, node: form.Copy, state: State) -> Any:
+        view, kind = self._value(node.value, state), node.type
+        if isinstance(kind, kinds.Vector) and struct_code(kind.element) is not None:
+            self._make(view.count * self._values.width(kind.element), state)
+        elif not isinstance(kind, kinds.Record) or any(
+            not struct_code(one) for one in self._values.fields(kind)
+        ):
+            raise UnknownError(f"a copy of type {kind}")
+        return view
+
+    def _call_function(self, node: form.Call, state: State) -> Any:
+        name, arguments = node.function, node.arguments
+        if name in ("a_part",):
+            return self._with_part(node, state)
+        values = [self._value(argument, state) for argument in arguments]
+        kind = arguments[0].type if arguments else kinds.VOID
+        if name in _OF_VIEWS and isinstance(values[0], _View):
+            return _OF_VIEWS[name](values[0].count)
+        if name == "l_element" and isinstance(values[0], _View) and isinstance(kind, kinds.Vector):
+            index = values[1]
+            self._leave_to_python(state, z3.UGE(index, values[0].count))
+            return self._part(values[0], index * self._size(kind.element), node.type)
+        rounded = name.removesuffix("f") if kind == kinds.Floating(32) else name
+        if (
+            isinstance(kind, kinds.Floating)
+            and rounded in _ROUNDED
+            and (rounded != name) == (kind.bits == 32)
+        ):
+            return _ROUNDED[rounded](values[0])
+        if isinstance(kind, kinds.Floating) and name in _QUESTIONS:
+            return _QUESTIONS[name](values[0])
+        if name in ("h_min", "h_max"):
+            return self._chosen(
+                _compared("<" if name == "h_min" else ">", values[1], values[0], kind), values
+            )
+        if name in ("h_fmin", "h_fmax") and kind == kinds.Floating(64):
+            less = (z3.fpLT if name == "h_fmin" else z3.fpGT)(values[1], values[0])
+            return self._chosen(either(z3.fpIsNaN(values[0]), less), values)
+        if name in _OF_MOMENTS:
+            value = _OF_MOMENTS[name](self, values[0])
+            if isinstance(node.type, kinds.Integer) and width(node.type) == 32:
+                return z3.Extract(31, 0, value)
+            return value
+        if name in ("k_after", "k_before"):
+            return values[0] + values[1] if name == "k_after" else values[0] - values[1]
+        raise UnknownError(name.partition("_")[2])
+
+    def _chosen(self, second: Term, values: Sequence[Term]) -> Term:
+        return z3.If(second, values[1], values[0])
+
+    def _with_part(self, node: form.Call, state: State) -> Term:
+        moment, part, new = node.arguments
+        assert isinstance(part, form.Literal)  # noqa: S101  the name of a part
+        old = self._value(moment, state)
+        value = self._converted(self._value(new, state), new.type, kinds.Integer(64, True, "long"))
+        seconds, rest = self._parts(old)
+        one, other = (value, rest) if part.value == "sec" else (seconds, value)
+        return self._of_parts(node.type, one, other, state)
+
+    def _invoke(self, node: form.Invoke, state: State) -> Any:
+        if node.depth is not None:
+            raise UnknownError("recursion")
+        function = self._functions[node.function]
+        values = [self._value(argument, state) for argument in node.arguments]
+        outer = self._call, self._shared, self._returned
+        self._calls += 1
+        self._call, self._shared, self._returned = self._calls, function.shared, []
+        state.slots |= {
+            (self._call, name): value for name, value in zip(function.parameters, values, strict=False)
+        }
+        inner = state.where(z3.BoolVal(True))
+        try:
+            self._block(function.body, inner)
+            ends = [*self._returned, (inner, None)]
+        finally:
+            self._call, self._shared, self._returned = outer
+        ends = [(end, value) for end, value in ends if not z3.is_false(end.alive)]
+        if not ends:
+            state.alive = z3.BoolVal(False)
+            return MIXED
+        end, result = ends[-1]
+        for before, value in ends[-2::-1]:
+            result = choice(before.alive, value, result)
+            end = State(either(before.alive, end.alive), merged(before.alive, before, end))
+        state.alive, state.slots = end.alive, end.slots
+        return result
+
+
+def _compared(operator: str, left: Term, right: Term, kind: Type) -> Term:
+    """A comparison of numbers, truths or times."""
+    if isinstance(kind, kinds.Bool) and operator not in ("==", "!="):
+        left, right = map(as_bits, (left, right))
+    if isinstance(kind, kinds.Floating):
+        result: Term = _COMPARED_FLOATS[operator](left, right)
+        return opposite(result) if operator == "!=" else result
+    return (_COMPARED if is_signed(kind) else _COMPARED_UNSIGNED)[operator](left, right)
+
+
+_COMPARED: Mapping[str, Callable[[Term, Term], Term]] = MappingProxyType(
+    {
+        "==": lambda left, right: left == right,
+        "!=": lambda left, right: opposite(left == right),
+        "<": lambda left, right: left < right,
+        ">": lambda left, right: left > right,
+        "<=": lambda left, right: left <= right,
+        ">=": lambda left, right: left >= right,
+    }
+)
+_COMPARED_UNSIGNED = MappingProxyType(
+    {**_COMPARED, "<": z3.ULT, ">": z3.UGT, "<=": z3.ULE, ">=": z3.UGE},
+)
+_COMPARED_FLOATS = MappingProxyType(
+    {"==": z3.fpEQ, "!=": z3.fpEQ, "<": z3.fpLT, ">": z3.fpGT, "<=": z3.fpLEQ, ">=": z3.fpGEQ}
+)
+_OF_INTEGERS: Mapping[str, Callable[[Term, Term], Term]] = MappingProxyType(
+    {
+        "+": lambda left, right: left + right,
+        "-": lambda left, right: left - right,
+        "*": lambda left, right: left * right,
+        "&": lambda left, right: left & right,
+        "|": lambda left, right: left | right,
+        "^": lambda left, right: left ^ right,
+    }
+)
+_OF_FLOATS = MappingProxyType({"+": z3.fpAdd, "-": z3.fpSub, "*": z3.fpMul, "/": z3.fpDiv})
+_OF_VIEWS: Mapping[str, Callable[[Term], Term]] = MappingProxyType(
+    {"l_len": lambda count: count, "l_empty": lambda count: count == 0, "l_last": lambda count: count - 1}
+)
+_ROUNDED: Mapping[str, Callable[[Term], Term]] = MappingProxyType(
+    {
+        "h_sqrt": lambda value: z3.fpSqrt(NEAREST, value),
+        "h_fabs": z3.fpAbs,
+        "h_floor": lambda value: z3.fpRoundToIntegral(z3.RTN(), value),
+        "h_ceil": lambda value: z3.fpRoundToIntegral(z3.RTP(), value),
+        "h_trunc": lambda value: z3.fpRoundToIntegral(z3.RTZ(), value),
+        "h_rint": lambda value: z3.fpRoundToIntegral(NEAREST, value),
+        "h_nearbyint": lambda value: z3.fpRoundToIntegral(NEAREST, value),
+    }
+)
+_QUESTIONS: Mapping[str, Callable[[Term], Term]] = MappingProxyType(
+    {
+        "h_isnan": z3.fpIsNaN,
+        "h_isinf": z3.fpIsInf,
+        "h_isfinite": lambda value: opposite(either(z3.fpIsNaN(value), z3.fpIsInf(value))),
+    }
+)
+_OF_MOMENTS: Mapping[str, Callable[[Meaning, Term], Term]] = MappingProxyType(
+    {
+        "m_is_zero": lambda _, value: value == 0,
+        "m_whole": lambda _, value: value,
+        "m_sec": lambda meaning, value: meaning._parts(value)[0],
+        "m_nsec": lambda meaning, value: meaning._parts(value)[1],
+    }
+)
+
+_STATEMENTS: Mapping[type[Any], Callable[[Meaning, Any, State], None]] = MappingProxyType(
+    {
+        form.Evaluate: Meaning._evaluate,
+        form.If: Meaning._if,
+        form.Loop: Meaning._repeat,
+        form.ForEach: Meaning._repeat,
+        form.Skip: Meaning._repeat,
+        form.Select: Meaning._select,
+        form.Return: Meaning._return,
+        form.Leave: Meaning._leave,
+        form.Charge: Meaning._charge,
+        form.Allocate: Meaning._allocate,
+        form.Drop: Meaning._drop,
+        form.Publish: Meaning._acts,
+        form.AfterText: Meaning._after_text,
+        form.Count: Meaning._count,
+        form.AfterElements: Meaning._after_elements,
+        form.NotPast: Meaning._not_past,
+        form.ReadNumbers: Meaning._read_numbers,
+        form.ReadValue: Meaning._read_value,
+        form.Require: Meaning._require,
+        form.Pending: Meaning._nothing,
+        form.WriteBack: Meaning._write_back,
+    }
+)
+
+_EXPRESSIONS: Mapping[type[Any], Callable[[Meaning, Any, State], Any]] = MappingProxyType(
+    {
+        form.Literal: Meaning._literal,
+        form.Zero: Meaning._zero,
+        form.Read: Meaning._read,
+        form.Assign: Meaning._assign,
+        form.Convert: Meaning._convert,
+        form.Arithmetic: Meaning._arithmetic,
+        form.Unary: Meaning._unary,
+        form.Moment: Meaning._moment,
+        form.MomentOf: Meaning._moment_of,
+        form.Compare: Meaning._compare,
+        form.CompareTexts: Meaning._compare_texts,
+        form.Logical: Meaning._logical,
+        form.Not: Meaning._not,
+        form.Conditional: Meaning._conditional,
+        form.Sequence: Meaning._sequence,
+        form.Discard: Meaning._discard,
+        form.Item: Meaning._item,
+        form.Copy: Meaning._copy,
+        form.Call: Meaning._call_function,
+        form.Accumulate: Meaning._accumulate,
+        form.Invoke: Meaning._invoke,
+        form.Log: Meaning._log,
+        form.Throttle: Meaning._throttle,
+        form.Now: Meaning._now,
+    }
+)

@@ -1,0 +1,220 @@
+"""What both sides begin with and are compared by: terms of z3, and states that branches are merged in.
+
+- A message is an array of bytes, addressed in 32 bits, with a `size` that no frame exceeds.
+- A number of the language is a bit vector of 32 bits (narrower ones extended by their sign, or zeros) or of 64, a
+  truth, or an IEEE number; of NaN there is one, with bits that nobody may ask for.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
+
+import z3
+
+Term = Any
+"""A term of z3, which has no types of its own for Python."""
+
+DOUBLE, SINGLE = z3.Float64(), z3.Float32()
+NEAREST = z3.RNE()
+
+
+class NotProvedError(Exception):
+    """Why nothing can be said about an event."""
+
+
+class _Mixed:
+    """What a place holds that had different kinds of things in two branches: nobody may look at it."""
+
+
+MIXED = _Mixed()
+
+
+class DiffersError(Exception):
+    """What a module does that no form means."""
+
+
+def integer(value: int, bits: int) -> Term:
+    """A constant."""
+    return z3.BitVecVal(value, bits)
+
+
+def floating(value: float, bits: int) -> Term:
+    """A constant, to the last bit."""
+    number = int.from_bytes(struct.pack("<d" if bits == 64 else "<f", value), "little")
+    return z3.simplify(z3.fpBVToFP(integer(number, bits), DOUBLE if bits == 64 else SINGLE))
+
+
+def both(*conditions: Term) -> Term:
+    """All of them, shorter where that is known."""
+    rest = [one for one in conditions if not z3.is_true(one)]
+    if any(z3.is_false(one) for one in rest):
+        return z3.BoolVal(False)
+    return z3.BoolVal(True) if not rest else rest[0] if len(rest) == 1 else z3.And(*rest)
+
+
+def either(*conditions: Term) -> Term:
+    """Any of them, shorter where that is known."""
+    rest = [one for one in conditions if not z3.is_false(one)]
+    if any(z3.is_true(one) for one in rest):
+        return z3.BoolVal(True)
+    return z3.BoolVal(False) if not rest else rest[0] if len(rest) == 1 else z3.Or(*rest)
+
+
+def opposite(condition: Term) -> Term:
+    """Its negation."""
+    if z3.is_not(condition):
+        return condition.arg(0)
+    known = z3.is_true(condition) or z3.is_false(condition)
+    return z3.BoolVal(z3.is_false(condition)) if known else z3.Not(condition)
+
+
+def choice(test: Term, yes: Term, no: Term) -> Term:
+    """`test ? yes : no`, of terms and of what is made of them; what only one has is that."""
+    if z3.is_true(test) or no is None or yes is no:
+        return yes
+    if z3.is_false(test) or yes is None:
+        return no
+    if is_dataclass(yes) and not isinstance(yes, type) and type(yes) is type(no):
+        parts = {one.name: choice(test, getattr(yes, one.name), getattr(no, one.name)) for one in fields(yes)}
+        return replace(yes, **parts)
+    if isinstance(yes, z3.ExprRef) and isinstance(no, z3.ExprRef):
+        if z3.is_bool(yes) != z3.is_bool(no):
+            yes, no = (as_bits(one) if z3.is_bool(one) else one for one in (yes, no))
+        if yes.sort() == no.sort():
+            return yes if yes.eq(no) else z3.If(test, yes, no)
+    elif isinstance(yes, int | str) and yes == no:
+        return yes
+    return MIXED
+
+
+def as_bits(truth: Term, bits: int = 32) -> Term:
+    """A truth as a number."""
+    return z3.If(truth, integer(1, bits), integer(0, bits))
+
+
+def number_at(message: Term, position: Term, size: int) -> Term:
+    """So many bytes from a position on, little-endian."""
+    every = [z3.Select(message, position + integer(more, 32) if more else position) for more in range(size)]
+    return every[0] if size == 1 else z3.Concat(*reversed(every))
+
+
+def with_number(message: Term, position: Term, value: Term) -> Term:
+    """The message with these bytes."""
+    for more in range(value.size() // 8):
+        place = position + integer(more, 32) if more else position
+        message = z3.Store(message, place, z3.Extract(8 * more + 7, 8 * more, value))
+    return message
+
+
+@dataclass
+class State:
+    """What holds at a place of a function: when it is reached (`alive`), and what has which value (`slots`)."""
+
+    alive: Term
+    slots: dict[Any, Any]
+
+    def where(self, condition: Term) -> "State":
+        """A branch of it."""
+        return State(both(self.alive, condition), dict(self.slots))
+
+    def require(self, condition: Term) -> None:
+        """Go on only so."""
+        self.alive = both(self.alive, condition)
+
+    def join(self, test: Term, yes: "State", no: "State") -> None:
+        """Go on behind two branches."""
+        whole = yes.alive.eq(both(self.alive, test)) and no.alive.eq(both(self.alive, opposite(test)))
+        self.alive = self.alive if whole else either(yes.alive, no.alive)
+        self.slots = merged(test, yes, no)
+
+
+def merged(test: Term, yes: State, no: State) -> dict[Any, Any]:
+    """The values behind two branches; a branch that has ended has none."""
+    if z3.is_false(no.alive):
+        return yes.slots
+    if z3.is_false(yes.alive):
+        return no.slots
+    return {key: choice(test, yes.slots.get(key), no.slots.get(key)) for key in {**yes.slots, **no.slots}}
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What an event begins with: the message and its size, the time, and variables by name, budgets by context and
+    times of output by context and site.
+    """
+
+    message: Term
+    size: Term
+    now: Term
+    variables: Mapping[str, Term]
+    budgets: Mapping[str, Term]
+    throttles: Mapping[tuple[str, int], Term]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What an event has come to: `left` it is not decided here (a fault, what is put out), and why nobody knows
+    (`unknown`, by name). The rest counts where it is neither.
+    """
+
+    left: Term
+    unknown: Mapping[str, Term]
+    happened: Term
+    dropped: Term
+    changed: Term
+    message: Term
+    variables: Mapping[str, Term]
+    budgets: Mapping[str, Term]
+
+
+_SMALL = 1 << 10
+_COSTLY = frozenset(
+    getattr(z3, f"Z3_OP_{name}")
+    for name in (
+        "FPA_ADD", "FPA_SUB", "FPA_MUL", "FPA_DIV", "FPA_SQRT", "FPA_ROUND_TO_INTEGRAL", "FPA_TO_FP",
+        "FPA_TO_FP_UNSIGNED", "FPA_TO_UBV", "FPA_TO_SBV", "FPA_TO_IEEE_BV", "BMUL", "BSDIV", "BUDIV", "BSREM", "BUREM",
+        "BSDIV_I", "BUDIV_I", "BSREM_I", "BUREM_I",
+    )
+)  # fmt: skip
+
+
+def abstracted(terms: Sequence[Term]) -> list[Term]:
+    """The same with the results of costly operations as anything, the same for the same operands.
+
+    What cannot hold then cannot hold at all.
+    """
+    known: dict[int, Term] = {}
+    kept: list[Term] = []  # as long as their numbers are used
+    begin = [z3.simplify(term) for term in terms]
+    waiting = list(begin)
+    while waiting:
+        term = waiting[-1]
+        parts = term.children()
+        missing = [part for part in parts if part.get_id() not in known]
+        if missing:
+            waiting += missing
+            continue
+        waiting.pop()
+        if term.get_id() in known:
+            continue
+        new = [known[part.get_id()] for part in parts]
+        result = (
+            term.decl()(*new) if any(not one.eq(part) for one, part in zip(new, parts, strict=True)) else term
+        )
+        if term.decl().kind() in _COSTLY and not _is_cheap(term.decl().kind(), new):
+            sorts = [*(one.sort() for one in new), result.sort()]
+            result = z3.Function(" ".join(map(str, (term.decl(), *sorts))), *sorts)(*new)
+        kept.append(term)
+        known[term.get_id()] = result
+    return [known[term.get_id()] for term in begin]
+
+
+def _is_cheap(kind: int, operands: Sequence[Term]) -> bool:
+    """Of constants, or a product with a small one."""
+    small = any(z3.is_bv_value(one) and one.as_long() < _SMALL for one in operands)
+    return (kind == z3.Z3_OP_BMUL and small) or all(map(_is_number, operands))
+
+
+def _is_number(term: Term) -> bool:
+    return bool(z3.is_bv_value(term) or z3.is_fp_value(term) or z3.is_fprm_value(term))

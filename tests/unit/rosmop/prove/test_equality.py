@@ -1,0 +1,110 @@
+"""What is written of an event is proved to be what it means; a module that is wrong anywhere is found."""
+
+import itertools
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from appliance.ros.definitions import Definitions
+from appliance.ros.standard import standard_definitions
+from appliance.rosmop.prove.equality import EQUAL, findings_of
+from tests.support.module_mutants import FAULTY, compiled, event, faulty
+
+MONITORS = Path(__file__).parents[4] / "monitors"
+
+
+def answers(text: str, known: Definitions | None = None) -> dict[str, str]:
+    """What is known of each event of a specification, with as much time as it needs."""
+    return {one.event: one.answer for one in findings_of(compiled(text, known), time.monotonic, patience=60)}
+
+
+PYTHON = "no module: messages of this topic are judged in Python"
+SHIPPED = {
+    "logging": {
+        "logging.batteryState": EQUAL, "logging.position": EQUAL, "logging.turretMovement": "not loop-free",
+        "logging.shot": PYTHON,
+    },
+    "obstacle_avoidance": {
+        "obstacleAvoidance.speed": EQUAL, "obstacleAvoidance.scan": "not loop-free", "obstacleAvoidance.drive": PYTHON,
+    },
+    "safe_triggering": {"safeTrigger.checkPosition": "not loop-free", "safeTrigger.safeTrigger": EQUAL},
+    "safe_zone": {"safeZone.odometry": PYTHON, "safeZone.gps": PYTHON, "safeZone.drive": EQUAL},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_specifications(name: str) -> None:
+    """All events that have a module without loops are proved; of the others it is said why not."""
+    trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
+    own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
+    assert (
+        answers((MONITORS / f"{name}.rv").read_text(), standard_definitions().extended(own)) == SHIPPED[name]
+    )
+
+
+def test_no_shipped_specification_is_left_out() -> None:
+    """A new one is proved, too."""
+    assert {path.stem for path in MONITORS.glob("*.rv")} == set(SHIPPED)
+
+
+PROVED = {
+    "guards, fields that are written, a drop": event(
+        "if (x < 3) { return; } if (y > 2.5) { y = -y; } x = n + 7; n++;",
+        "int x, double y", "count:x, x:y", "uint8_t n = 0;",
+    ),
+    "conversions at the limits": event(
+        "a = y; b = y; c = x; d = c; e = a; x = y;", "long x, double y", "three[0]:x, x:y",
+        "int8_t a = 0; unsigned long b = 0; float c = 0; double d = 0; uint16_t e = 0;",
+    ),
+    "rounding": event("y = floor(y) + trunc(fabs(y)) - rint(y) + ceil(y);", "double y", "x:y"),
+    "times": event(
+        "last = t; t.sec = 7; if (t.nsec > 5 && t > last) { n++; }",
+        "ros::Time t", "when:t", "ros::Time last; int n = 0;",
+    ),
+    "helper functions, and what they cannot go on with": event(
+        "n = f(x, 7); x = n;", "int x", "count:x",
+        'int n = 0; int f(int a, int b) { if (a > 3) { ROS_INFO("x"); } n += a; return a > 2 ? b : a << 1; }',
+    ),
+    "output that is not due": event('n++; ROS_INFO_THROTTLE(10.0, "%d", n);', "int x", "count:x", "int n = 0;"),
+    "an element of an array": event(
+        "n = three[x] + three.size();", "std::vector<long> three, int x", "three:three, count:x", "long n = 0;"
+    ),
+    "a string": """s() { int n = 0;
+        event e(std::string f) /stamped own/Stamped '{frame:f}' when (f == "base_link") { n += f.size(); } }""",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PROVED)
+def test_what_the_language_has_without_loops(name: str) -> None:
+    """For every message and every state, of which there are more than any test can try."""
+    assert answers(PROVED[name]) == {"s.e": EQUAL}
+
+
+UNPROVED = {
+    "not loop-free": event("for (int i = 0; i < x; i++) { x += i; }", "int x", "count:x"),
+    "uses seconds": event("d = t.toSec();", "ros::Time t", "when:t", "double d = 0;"),
+    "uses the instruction f64.copysign": event("y = copysign(y, 1.0);", "double y", "x:y"),
+    PYTHON: event("y = sin(y);", "double y", "x:y"),
+}
+
+
+@pytest.mark.parametrize("answer", UNPROVED)
+def test_what_is_not_proved_says_why(answer: str) -> None:
+    """Nothing is called equal that was not shown to be."""
+    assert answers(UNPROVED[answer]) == {"s.e": answer}
+
+
+def test_without_time_nothing_is_proved() -> None:
+    """What is not decided is said to be so."""
+    clock = itertools.count(0.0, 1000.0)
+    (found,) = findings_of(compiled(PROVED["conversions at the limits"]), lambda: next(clock), patience=0)
+    assert (found.answer, found.differs) == ("not decided in time", False)
+
+
+def test_wrong_modules_are_found() -> None:
+    """Some of those that `tests/proofs/test_events.py` makes: each is decided, and most differ."""
+    told = Counter(answer for _, answer in faulty(next(iter(FAULTY.values())), every=9))
+    assert set(told) == {EQUAL, "not equal"}
+    assert told["not equal"] > 4 * told[EQUAL]
