@@ -381,6 +381,12 @@ class Settings(_Section):
     on_fault: Literal["drop", "pass"] = Field(
         default="drop", description="what becomes of a message at which an action of a monitor faults"
     )
+    slices: int = Field(
+        default=100_000,
+        ge=1,
+        le=1_000_000,
+        description="slices of a parametric specification: bindings that are monitored at a time, about 500 bytes each",
+    )
     publish_as: Annotated[str, AfterValidator(_checked_name)] = Field(
         default="/rosrv", description="the node name under which monitors publish"
     )

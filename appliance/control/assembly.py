@@ -265,6 +265,7 @@ class Parts:
             base.store,
             self.trail,
             on_fault=settings.on_fault,
+            slices=settings.slices,
             allocation=self._allocation,
             relays=Moving(self.relay, self.graph, self.enactor, self.reminders),
             published=self.publisher.wake,

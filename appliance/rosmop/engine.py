@@ -16,7 +16,9 @@ Theory of operation:
    far as these need nothing that is recorded or explained. Whoever uses it must not see a difference but in time.
 5. `replaced` makes the set that follows: one swap between two messages. Specifications whose text is the same
    keep their variables and runs.
-6. Specifications on trial are sets of their own (`trials`), one for those that share variables: nothing that one does
+6. Of a parametric specification each slice that an event belongs to takes its turn, with its own state
+   (`slices.py`), as if there were a specification for each.
+7. Specifications on trial are sets of their own (`trials`), one for those that share variables: nothing that one does
    or uses up is seen by others. Where the first of such a set would stand among the others, a copy of the message as
    it is there is left in `tapped`; who has passed the message on has it given (`Tapped.give`), and what comes of it is
    what would have been done. The copies for one set are given in their order.
@@ -38,8 +40,9 @@ from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step, Ti
 from appliance.rosmop.outcomes import Fault, Outcome, Verdict
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.reach import reached, redefined
-from appliance.rosmop.runtime.context import FOLDED_NS, Context, LogLine
+from appliance.rosmop.runtime.context import FOLDED_NS, Context, FaultError, LogLine
 from appliance.rosmop.runtime.wire import Buffer, Message
+from appliance.rosmop.slices import LIMIT, Key, Slice
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.parser import parse
@@ -123,6 +126,8 @@ class MonitorSet:
         on_fault: OnFault,
         patience: Patience,
         trials: Sequence["MonitorSet"] = (),
+        *,
+        slices: int = LIMIT,
     ) -> None:
         """`files` are all in their order; what is on trial in them is compiled in `trials`."""
         self.files = tuple(files)
@@ -136,7 +141,9 @@ class MonitorSet:
         self._patience = patience
         nodes = {node.name: node for file in files for node in file.specifications}
         self._order = tuple(nodes)
-        self._monitors = monitors_of(compiled, [nodes[one.name] for one in compiled.specifications], 0)
+        self._monitors = monitors_of(
+            compiled, [nodes[one.name] for one in compiled.specifications], 0, slices
+        )
         self._steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
         self._requests: dict[tuple[str, str], tuple[Step, ...]] = {}
@@ -161,12 +168,14 @@ class MonitorSet:
         trials: Collection[str] = (),
         trial_patience: Patience = lambda: _never,
         margins: bool = False,
+        slices: int = LIMIT,
     ) -> "MonitorSet":
         """Compile files (name to text) in this order; raises `SpecificationError` with all that is wrong.
 
         `patience()` is asked when something is due: what says whether that has taken too long (`trial_patience` for
         those on trial). With one that is named in `trials`, all that share variables with it are on trial. With
-        `margins` they note how close comparisons of numbers come (`take_margins`).
+        `margins` they note how close comparisons of numbers come (`take_margins`). A parametric specification has at
+        most so many `slices`.
         """
         files: list[tree.File] = []
         findings: list[Finding] = []
@@ -181,16 +190,20 @@ class MonitorSet:
         uses = {one.name: one.uses for one in compiled.specifications}
         groups = [group for group in sharing(uses) if not group.isdisjoint(trials)]
         if not groups:
-            return cls(compiled, files, on_fault, patience)
+            return cls(compiled, files, on_fault, patience, slices=slices)
         tried = []
         for group in groups:
             own = _part(files, group)
-            trial = cls(compile_files(own, definitions, margins=margins), own, on_fault, trial_patience)
+            trial = cls(
+                compile_files(own, definitions, margins=margins), own, on_fault, trial_patience, slices=slices
+            )
             for monitor in trial._monitors:
                 monitor.context.most = TRIAL_BUDGET
             tried.append(trial)
         others = compile_files(_part(files, set(uses).difference(*groups)), definitions, margins=margins)
-        return cls(replace(others, warnings=compiled.warnings), files, on_fault, patience, tried)
+        return cls(
+            replace(others, warnings=compiled.warnings), files, on_fault, patience, tried, slices=slices
+        )
 
     # What there is
 
@@ -517,7 +530,7 @@ class MonitorSet:
                 if (not monitor.seen or monitor.held) and self._first(monitor, message, outcome):
                     outcome.dropped_by = monitor.name
                     break
-            if self._happen(step, message, outcome):
+            if (self._happen if step.key is None else self._happen_in_slices)(step, message, outcome):
                 outcome.dropped_by = step.monitor.name
                 break
             if message.touched:
@@ -547,6 +560,114 @@ class MonitorSet:
             self._step_properties(step, message, message.time, outcome)
             return message.dropped
         return False
+
+    def _happen_in_slices(self, step: Step, message: Message, outcome: Outcome) -> bool:
+        """Give the message to an event of a parametric specification; whether it was dropped."""
+        assert step.key is not None  # noqa: S101  who asks has looked
+        try:
+            found = step.key(message)
+        except Exception as error:  # noqa: BLE001  the bytes are not of its type
+            self._fault(error, step.monitor, step.event.position, outcome)
+            self._block(message, outcome)
+            return message.dropped
+        if not found:
+            if message.past:
+                self._past(step, message)
+            return False
+
+        key = (True,) if found is True else tuple(found)
+        slices = step.monitor.slices
+        if slices is not None and slices.step(step.index, key):
+            outcome.events = (*outcome.events, step.name)
+            return False
+
+        def act(outcome: Outcome, message: Message | None) -> bool:
+            assert message is not None  # noqa: S101  each has one
+            if not step.event.plain:
+                return self._happen(step, message, outcome)
+            outcome.events = (*outcome.events, step.name)
+            self._step_properties(step, message, message.time, outcome)
+            return message.dropped
+
+        self._each(step, key, message, outcome, act)
+        return message.dropped
+
+    def _each(
+        self,
+        step: Step,
+        key: Key,
+        message: Message | None,
+        outcome: Outcome,
+        act: Callable[[Outcome, Message | None], bool],
+    ) -> None:
+        """Let an event happen in each slice that it belongs to, until one has dropped the message.
+
+        In a slice that lacks a parameter it happens to a copy of the message, and what it puts out is not put out.
+        """
+        slices = step.monitor.slices
+        assert slices is not None  # noqa: S101  who asks has looked
+        whole, seeds = slices.targets(step.event, key)
+        refused, why = slices.refused, slices.why
+        before = outcome.events
+        names: Sequence[str] = ()
+        try:
+            if len(whole) + len(seeds) > 1:
+                step.monitor.context.spend(len(whole) + len(seeds), -1)
+            for one in whole:
+                outcome.events = before
+                dropped = self._in_slice(step.monitor, one, outcome, message, act)
+                names = outcome.events if outcome.events is not before else names
+                if dropped:
+                    return
+            turn = self._turn
+            for one in seeds:
+                unseen = Outcome(time=outcome.time)
+                lines, published = len(turn.log), len(turn.published)
+                copied = None if message is None else Message(bytes(message.buffer), message.time)
+                self._in_slice(step.monitor, one, unseen, copied, act)
+                del turn.log[lines:], turn.published[published:]
+                outcome.faults = (*outcome.faults, *unseen.faults)
+        except FaultError as error:
+            self._fault(error, step.monitor, step.event.position, outcome)
+            self._block(message, outcome)
+        finally:
+            outcome.events = names or before
+        if refused is not None:
+            self._refuse_slice(step, refused, why, message, outcome)
+
+    def _in_slice(
+        self,
+        monitor: Monitor,
+        one: Slice,
+        outcome: Outcome,
+        message: Message | None,
+        act: Callable[[Outcome, Message | None], bool],
+    ) -> bool:
+        """Make the slice the state of the monitor and let the event happen; whether the message was dropped."""
+        slices = monitor.slices
+        assert slices is not None  # noqa: S101  it has a slice
+        for running, run in zip(monitor.properties, slices.select(one), strict=True):
+            running.run = run
+        before, monitor.slice = outcome.events, one
+        dropped = act(outcome, message)
+        runs = tuple(running.run for running in monitor.properties)
+        slices.settle(one, runs, happened=outcome.events is not before)
+        return dropped
+
+    def _refuse_slice(
+        self,
+        step: Step,
+        binding: Mapping[str, object],
+        why: str,
+        message: Message | None,
+        outcome: Outcome,
+    ) -> None:
+        """There can be no slice of what an event binds: that is a fault."""
+        monitor = step.monitor
+        monitor.faults += 1
+        text = f"{why}: {step.name} is not monitored for this binding"
+        outcome.faults = (*outcome.faults, Fault(monitor.name, step.event.position, text, binding))
+        self._block(message, outcome)
 
     def _finish(self, message: Message, writers: tuple[str, ...], outcome: Outcome) -> None:
         turn = self._turn
@@ -606,7 +727,9 @@ class MonitorSet:
         self._turn.reset = False
         for category, handler in handlers:
             logic = running.code.property.logic
-            outcome.verdicts = (*outcome.verdicts, Verdict(monitor.name, running.index, logic, category))
+            binding = monitor.slices.binding(monitor.slice) if monitor.slices and monitor.slice else {}
+            verdict = Verdict(monitor.name, running.index, logic, category, binding)
+            outcome.verdicts = (*outcome.verdicts, verdict)
             self._handle(monitor, handler, message, running, outcome)
         if self._turn.reset:
             running.run = running.code.property.start(self._turn.now)
@@ -665,13 +788,22 @@ class MonitorSet:
         step.monitor.context.begin()
         timer.ticked = True
         timer.due = due + timer.period
-        outcome.events = (step.name,)
-        try:
-            step.function(None)
-        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
-            self._fault(error, step.monitor, step.event.position, outcome)
+
+        def act(outcome: Outcome, message: Message | None) -> bool:
+            outcome.events = (step.name,)
+            try:
+                step.function(message)
+            except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
+                self._fault(error, step.monitor, step.event.position, outcome)
+            else:
+                self._step_properties(step, message, due, outcome)
+            return False
+
+        if step.monitor.slices is None:
+            act(outcome, None)
         else:
-            self._step_properties(step, None, due, outcome)
+            self._each(step, (True,), None, outcome, act)
+            outcome.events = (step.name,)
         ticks[id(timer)] = ticks.get(id(timer), 0) + 1
         if ticks[id(timer)] >= MAX_TICKS and timer.due <= time_ns:
             self._skip_ticks(timer, time_ns, "the time has made a leap")
@@ -746,6 +878,12 @@ class MonitorSet:
             monitor.context.begin()
             for running in monitor.properties:
                 running.run = running.code.property.start(time_ns)
+        self._begin_variables(monitors, outcome)
+        for monitor in monitors:
+            if monitor.slices is not None:
+                monitor.slices.begin(tuple(running.run for running in monitor.properties))
+
+    def _begin_variables(self, monitors: Sequence[Monitor], outcome: Outcome) -> None:
         beginning = list(monitors)
         for stage in range(3):
             for monitor in tuple(beginning):
@@ -761,6 +899,8 @@ class MonitorSet:
             self._compiled.namespace[code] = compiled.namespace[before.code.variables[name]]
         for running, old in zip(monitor.properties, before.properties, strict=True):
             running.run = old.run
+        if monitor.slices is not None and before.slices is not None:
+            monitor.slices.take_over(before.slices)
         for step, old_step in zip(monitor.steps, before.steps, strict=True):
             step.past, step.told = old_step.past, old_step.told
         for timer, ticking in zip(monitor.timers, before.timers, strict=True):

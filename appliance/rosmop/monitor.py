@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from appliance.rosmop.compile.events import EventCode
 from appliance.rosmop.compile.specification import Compiled, PropertyCode, SpecificationCode
 from appliance.rosmop.logics.interface import Run
 from appliance.rosmop.runtime.context import Context
 from appliance.rosmop.runtime.wire import Message
+from appliance.rosmop.slices import Slice, Slices
 from appliance.rosmop.syntax import tree
 
 FAILING_AFTER = 10
@@ -51,6 +52,8 @@ class Step:
     """The first of its monitor on its topic."""
     past: int = 0
     told: int | None = None
+    key: Callable[[Message], Any] | None = None
+    """Of a parametric specification: what a message binds of its parameters (see `compile/events.py`)."""
 
 
 @dataclass(eq=False, slots=True)
@@ -82,6 +85,10 @@ class Monitor:
     """A message of one of its events has come."""
     home: Home | None = None
     """Where its state is, if that may be in a module."""
+    slices: Slices | None = None
+    """Of a parametric specification: its states. `properties` have the runs of the one that was looked at last."""
+    slice: Slice | None = None
+    """That one."""
 
     @property
     def name(self) -> str:
@@ -94,15 +101,19 @@ class Monitor:
         return self.broken or self.faults >= FAILING_AFTER
 
 
-def monitors_of(compiled: Compiled, nodes: list[tree.Specification], time_ns: int) -> tuple[Monitor, ...]:
-    """The running forms of compiled specifications, in their initial state."""
+def monitors_of(
+    compiled: Compiled, nodes: list[tree.Specification], time_ns: int, slices: int
+) -> tuple[Monitor, ...]:
+    """The running forms of compiled specifications, in their initial state; each with at most so many slices."""
     return tuple(
-        _monitor(compiled, code, node, time_ns)
+        _monitor(compiled, code, node, time_ns, slices)
         for code, node in zip(compiled.specifications, nodes, strict=True)
     )
 
 
-def _monitor(compiled: Compiled, code: SpecificationCode, node: tree.Specification, time_ns: int) -> Monitor:
+def _monitor(
+    compiled: Compiled, code: SpecificationCode, node: tree.Specification, time_ns: int, slices: int
+) -> Monitor:
     names = compiled.namespace
     properties = tuple(
         RunningProperty(
@@ -114,8 +125,17 @@ def _monitor(compiled: Compiled, code: SpecificationCode, node: tree.Specificati
         for index, each in enumerate(code.properties)
     )
     monitor = Monitor(code, node, names[code.context], properties)
+    if code.slicing is not None:
+        monitor.slices = Slices(code, names, slices)
     steps = [
-        Step(monitor, event, index, f"{code.name}.{event.name}", names[event.function])
+        Step(
+            monitor,
+            event,
+            index,
+            f"{code.name}.{event.name}",
+            names[event.function],
+            key=names[event.key] if event.key else None,
+        )
         for index, event in enumerate(code.events)
     ]
     monitor.steps = tuple(step for step in steps if step.event.period_ns is None)

@@ -1,7 +1,7 @@
 """What comes of a message, of a tick and of a deadline, as values for the relay and for `rosrv monitor run`."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from appliance.rosmop.positions import Position
@@ -13,12 +13,16 @@ Result = Literal["passed", "changed", "dropped"]
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A property is in a category that has a handler. `property` counts from 0 in its specification."""
+    """A property is in a category that has a handler. `property` counts from 0 in its specification.
+
+    `binding` has the values of the parameters of a parametric specification, by name.
+    """
 
     monitor: str
     property: int
     logic: str
     category: str
+    binding: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +33,13 @@ class Fault:
     position: Position
     text: str
     values: Mapping[str, object]
+
+
+def bound(verdict: Verdict) -> str:
+    """The binding as text that goes on from the name of the property; empty without parameters."""
+    if not verdict.binding:
+        return ""
+    return f" with {', '.join(f'{name} = {value}' for name, value in verdict.binding.items())}"
 
 
 class Outcome:

@@ -119,6 +119,7 @@ class Monitors:
         trail: AuditTrail,
         *,
         on_fault: Literal["drop", "pass"],
+        slices: int,
         allocation: Allocation,
         relays: Relays,
         published: Callable[[], None],
@@ -131,7 +132,7 @@ class Monitors:
         self.site_keys = site_keys
         self._store = store
         self._trail = trail
-        self._stating = Stating(allocation, trail, on_fault, self._states_of, relays)
+        self._stating = Stating(allocation, trail, on_fault, self._states_of, relays, slices=slices)
         self._switches: dict[str, Switch] = {}
         self._states: dict[str, Switch] = {}  # of those in force
         self._acts = 0  # switches and resumptions, ever

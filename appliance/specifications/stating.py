@@ -53,11 +53,14 @@ class Stating:
         on_fault: Literal["drop", "pass"],
         states: Callable[[Checked], Mapping[str, Switch]],
         relays: Relays,
+        *,
+        slices: int,
     ) -> None:
         self.allocation = allocation
         self._relays = relays
         self._trail = trail
         self._on_fault: Literal["drop", "pass"] = on_fault
+        self._slices = slices
         self._states = states
         self._now = Revision()
         self._known: set[int] = set()  # relays that had specifications before
@@ -257,6 +260,7 @@ class Stating:
             next(self._numbers),
             ahead,
             tuple(name for name in revision.checked.monitors if name in mine and states[name] == TRIAL),
+            self._slices,
         )
 
     # --- what the relays say ---

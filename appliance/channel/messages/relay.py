@@ -280,7 +280,7 @@ class SpecificationsStated(Message):
     they come from another relay, and begin here. `statement` is a number of its own for every statement, which the
     answer has, too: the same revision may be stated again. `ahead`: what is stated after it is carried out when it is
     in force (or refused), so that nothing is placed where its monitors are not yet. `trials` are the monitors that are
-    on trial: they are given copies of messages.
+    on trial: they are given copies of messages. A parametric specification has at most so many `slices`.
     """
 
     revision: int
@@ -293,6 +293,7 @@ class SpecificationsStated(Message):
     statement: int = 0
     ahead: bool = False
     trials: tuple[str, ...] = ()
+    slices: int = 100_000
 
 
 class MonitorSwitched(Message):

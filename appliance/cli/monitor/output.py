@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 
 from appliance.cli.output import say, say_json
-from appliance.rosmop.outcomes import Fault, Outcome
+from appliance.rosmop.monitor import Monitor
+from appliance.rosmop.outcomes import Fault, Outcome, bound
 from appliance.rosmop.positions import Finding
 
 BILLION = 1_000_000_000
@@ -41,6 +42,7 @@ def record(outcome: Outcome, index: int | None = None, topic: str | None = None)
                 "property": verdict.property,
                 "logic": verdict.logic,
                 "category": verdict.category,
+                **({"binding": dict(verdict.binding)} if verdict.binding else {}),
             }
             for verdict in outcome.verdicts
         ],
@@ -48,6 +50,19 @@ def record(outcome: Outcome, index: int | None = None, topic: str | None = None)
         "log": [{"level": line.level, "text": line.text, "monitor": line.monitor} for line in outcome.log],
         "faults": [_fault(fault) for fault in outcome.faults],
     }
+
+
+def explained(monitor: Monitor) -> Iterator[str]:
+    """What the parameters of a specification mean: nothing without any."""
+    slices, slicing = monitor.slices, monitor.code.slicing
+    if slices is None or slicing is None:
+        return
+    for number, (name, _, kind) in enumerate(slicing.parameters):
+        events = [event.name for event in monitor.code.events if number in event.binds]
+        yield f"parameter {name} ({kind}), bound by {', '.join(events)}"
+    begins = ", ".join(event.name for event in monitor.code.events if event.creates)
+    names = ", ".join(name for name, _, _ in slicing.parameters)
+    yield f"a slice for each {names}, begun by {begins}; at most {slices.limit} at a time"
 
 
 def _fault(fault: Fault) -> dict[str, object]:
@@ -68,7 +83,7 @@ def lines(outcome: Outcome, index: int | None = None, topic: str | None = None) 
         yield f"{head}: {outcome.result}" + (f" ({outcome.reason})" if outcome.reason else "")
     for verdict in outcome.verdicts:
         name = f"{verdict.monitor} ({verdict.logic} property {verdict.property})"
-        yield f"{head}: {verdict.category} of {name}"
+        yield f"{head}: {verdict.category} of {name}{bound(verdict)}"
     for message in outcome.published:
         yield f"{head}: published {message.topic} {message.type}"
     for line in outcome.log:

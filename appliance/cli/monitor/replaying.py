@@ -23,7 +23,7 @@ from appliance.cli.running import Appliance, speaks
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.engine import Margin, MonitorSet, sharing
-from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.outcomes import Outcome, bound
 from appliance.rosmop.positions import Position, line_of
 from appliance.rosmop.syntax.errors import SpecificationError
 
@@ -220,7 +220,7 @@ def _found(outcome: Outcome) -> Iterator[_Found]:
         own = [event for event in outcome.changed_by if event.startswith(f"{monitor}.")]
         yield _Found(monitor, "change", ", ".join(own))
     for verdict in outcome.verdicts:
-        text = f"{verdict.category} of property {verdict.property + 1} ({verdict.logic})"
+        text = f"{verdict.category} of property {verdict.property + 1} ({verdict.logic}){bound(verdict)}"
         yield _Found(verdict.monitor, "verdict", text)
     for line in outcome.log:
         if line.level not in ("DEBUG", "INFO"):

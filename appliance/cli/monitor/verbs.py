@@ -13,7 +13,7 @@ from rosbags.rosbag1 import Reader
 
 from appliance.cli.monitor.bag import Recording, definitions_of, open_bag, refusals, replay
 from appliance.cli.monitor.input import read_definitions, read_specifications, usage_error
-from appliance.cli.monitor.output import lines, record, say_finding
+from appliance.cli.monitor.output import explained, lines, record, say_finding
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.progress import progress
 from appliance.ros.definitions import Definitions
@@ -76,6 +76,8 @@ def check(
     if not as_json:
         _summarise(findings, errors, monitors)
         for monitor in monitors.monitors if monitors is not None else ():
+            for line in explained(monitor):
+                say(f"{monitor.name}: {line}")
             for line, each in zip(certificates[monitor.name], monitor.properties, strict=True):
                 say(f"{monitor.name}: {line}")
                 say(f"{monitor.name}: {each.code.property.logic}: {each.code.enforcement}")

@@ -101,6 +101,7 @@ class Compiler:
                 trials=message.trials,
                 trial_patience=lambda: _patience(_TRIAL_TICKS_SECONDS),
                 margins=True,
+                slices=message.slices,
             )
             monitors.write_module()
             return monitors

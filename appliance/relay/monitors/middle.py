@@ -338,11 +338,12 @@ def _replaced(before: MonitorSet, after: MonitorSet) -> list[Monitor]:
 
 
 def _same(one: SpecificationsStated, other: SpecificationsStated) -> bool:
-    return (one.files, one.definitions, one.on_fault, one.trials) == (
+    return (one.files, one.definitions, one.on_fault, one.trials, one.slices) == (
         other.files,
         other.definitions,
         other.on_fault,
         other.trials,
+        other.slices,
     )
 
 

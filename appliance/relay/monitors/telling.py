@@ -14,7 +14,7 @@ from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.places import NOWHERE, Place, Sighting
 from appliance.rosmop.monitor import Monitor
-from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.outcomes import Outcome, bound
 from appliance.rosmop.runtime.context import Published
 
 
@@ -243,18 +243,19 @@ class Telling:
     def _verdicts(self, outcome: Outcome, place: Place, sighting: Sighting | None) -> None:
         for verdict in outcome.verdicts:
             self._counter(verdict.monitor).verdicts += 1
-            name = f"property {verdict.property + 1} of {verdict.monitor} ({verdict.logic})"
+            name = f"property {verdict.property + 1} of {verdict.monitor} ({verdict.logic}){bound(verdict)}"
             self._observations.note(
                 f"{self._prefix}verdict",
                 verdict.monitor,
                 place,
                 outcome.time,
                 f"{name}: {verdict.category}",
-                distinction=f"{verdict.property} {verdict.category}",
+                distinction=f"{verdict.property} {verdict.category}{bound(verdict)}",
                 detail={
                     "property": verdict.property,
                     "logic": verdict.logic,
                     "category": verdict.category,
+                    **({"binding": verdict.binding} if verdict.binding else {}),
                     "events": list(outcome.events),
                 },
                 after=bytes(outcome.buffer[:SHOWN]),

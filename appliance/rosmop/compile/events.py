@@ -5,7 +5,7 @@ the `when` or a constant of the pattern look at are decoded; only fields that we
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from appliance.ros.errors import DefinitionError
 from appliance.rosmop.compile.conversion import condition, refusal
@@ -14,6 +14,7 @@ from appliance.rosmop.compile.fields import Bound, check_overlaps, read_fields, 
 from appliance.rosmop.compile.locate import type_of_path
 from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.compile.scope import Scope, Shared, SpecificationNames
+from appliance.rosmop.compile.slicing import acts, binds, creates
 from appliance.rosmop.compile.statements import check_topic, write
 from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
@@ -43,13 +44,25 @@ class EventCode:
     period_ns: int | None = None
     action_line: int = 0
     """The line of the code at which the action begins: what faults there has happened."""
+    binds: tuple[int, ...] = ()
+    """The parameters of the specification that it binds, by their numbers."""
+    key: str = ""
+    """Of an event on messages of a parametric specification: its function for the values of these."""
+    creates: bool = False
+    """A slice may begin with it."""
+    plain: bool = False
+    """Where its key is known it has happened, and there is nothing to do."""
+    acts: bool = False
+    """Its action does more than to change the slice's own variables."""
 
 
-def compile_event(shared: Shared, names: SpecificationNames, event: tree.Event) -> EventCode:
+def compile_event(
+    shared: Shared, names: SpecificationNames, specification: tree.Specification, event: tree.Event
+) -> EventCode:
     """Write the function of an event."""
     function = shared.module.fresh("e")
     if isinstance(event.trigger, tree.TimerTrigger):
-        return _timer(shared, names, event, function)
+        return replace(_timer(shared, names, event, function), creates=creates(specification, event))
     trigger = event.trigger
     check_topic(trigger.topic, trigger.position)
     kind = _message_type(shared, trigger)
@@ -58,7 +71,8 @@ def compile_event(shared: Shared, names: SpecificationNames, event: tree.Event) 
     scope.lines.site = scope.site(event)
     bound = _bind(scope, event, trigger, kind)
     happens = _assemble(scope, event, bound, *_body(scope, event, trigger))
-    action_line = shared.define(scope.function(function, ("m",), happens=happens))
+    whole = scope.function(function, ("m",), happens=happens)
+    action_line = shared.define(whole)
     service = trigger.type if trigger.part is not None else None
     return EventCode(
         event.name,
@@ -69,7 +83,33 @@ def compile_event(shared: Shared, names: SpecificationNames, event: tree.Event) 
         trigger.part,
         service,
         action_line=action_line,
+        binds=binds(names, event),
+        key=_key(shared, names, event, trigger, kind) if names.parameters else "",
+        creates=creates(specification, event),
+        plain=not event.action.statements and trigger.when is None,
+        acts=acts(whole, names),
     )
+
+
+def _key(
+    shared: Shared, names: SpecificationNames, event: tree.Event, trigger: tree.MessageTrigger, kind: str
+) -> str:
+    """Write the function for what an event binds: False where the message is none of its; else a list of True and
+    the values, or True alone.
+    """
+    scope = Scope(shared, names, "action")
+    scope.message_type = kind
+    site = scope.lines.site = scope.site(event)
+    bound = _bind(scope, event, trigger, kind)
+    found = {each.variable.name: each.variable for each in bound if each.variable is not None}
+    values = [found[name] for name in names.parameters if name in found]
+    for variable in values:
+        variable.used = True
+    read_fields(scope, bound)
+    scope.add(form.Return(site, form.Literal(kinds.BOOL, True), tuple(variable.code for variable in values)))
+    function = shared.module.fresh("k")
+    shared.define(scope.function(function, ("m",), happens=len(scope.lines.found)))
+    return function
 
 
 def _timer(shared: Shared, names: SpecificationNames, event: tree.Event, function: str) -> EventCode:
@@ -83,8 +123,11 @@ def _timer(shared: Shared, names: SpecificationNames, event: tree.Event, functio
     scope.lines.site = scope.site(event)
     write(scope, event.action)
     scope.add(form.Leave(scope.lines.site, True))
-    shared.define(scope.function(function, ("m",)))
-    return EventCode(event.name, function, event.position, period_ns=event.trigger.period_ns)
+    whole = scope.function(function, ("m",))
+    shared.define(whole)
+    return EventCode(
+        event.name, function, event.position, period_ns=event.trigger.period_ns, acts=acts(whole, names)
+    )
 
 
 def _message_type(shared: Shared, trigger: tree.MessageTrigger) -> str:
@@ -154,6 +197,12 @@ def _bind_one(scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Pa
         )
     if isinstance(target, kinds.Vector) and isinstance(field, kinds.Vector):
         target = kinds.Vector(target.element, field.length)
+    sliced = scope.names.parameters.get(parameter.name)
+    if sliced is not None and sliced.type != target:
+        text = (
+            f"the parameter {shown(parameter.name)} of the specification is {sliced.type}, and {target} here"
+        )
+        raise SpecificationError.at(parameter.position, text)
     variable = Variable(parameter.name, target, scope.module.fresh("v"), parameter.position)
     variable.constant = parameter.type.constant
     variable.flag = scope.module.fresh("f")

@@ -7,6 +7,7 @@ from appliance.rosmop.compile.expressions import value_of
 from appliance.rosmop.compile.loops import charge
 from appliance.rosmop.compile.places import Value, Variable
 from appliance.rosmop.compile.scope import HelperFunction, Scope, Shared, SpecificationNames
+from appliance.rosmop.compile.slicing import check_own
 from appliance.rosmop.compile.statements import initial, known, write
 from appliance.rosmop.ir import form
 from appliance.rosmop.syntax import tree
@@ -24,6 +25,7 @@ def declare_variables(shared: Shared, names: SpecificationNames, specification: 
         for declarator in declaration.declarators:
             try:
                 variable = _shared_variable(shared, names, declaration, declarator)
+                check_own(names, variable)
             except SpecificationError as error:
                 shared.findings += error.findings
                 names.misdeclared.add(declarator.name)
@@ -57,6 +59,7 @@ def _shared_variable(
         shared=True,
         constant=declaration.type.constant,
         known=_known(scope, declaration, declarator, kind),
+        sliced=bool(names.parameters) and not (declaration.type.static or declaration.type.constant),
     )
 
 
@@ -101,6 +104,9 @@ def _start_scope(shared: Shared, names: SpecificationNames) -> Scope:
 def _constants(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> Scope:
     """What C++ calls static initialisation: the constants that are written down, zero for the rest."""
     scope = _start_scope(shared, names)
+    for parameter in names.parameters.values():
+        scope.written.add(parameter.code)
+        scope.evaluate(form.Assign(parameter.type, parameter.code, form.Zero(parameter.type)))
     for declaration in specification.declarations:
         for declarator in declaration.declarators:
             variable = names.variables.get(declarator.name)

@@ -29,6 +29,8 @@ class Variable:
     """A `char *` or `T name[]` that holds a copy of another's elements, where C++'s would point to them."""
     used: bool = False
     assigned: bool = False
+    sliced: bool = False
+    """Each slice of a parametric specification has its own."""
 
 
 @dataclass(frozen=True)

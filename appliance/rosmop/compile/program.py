@@ -61,12 +61,18 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
         properties += [
             (number, index)
             for index, each in enumerate(specification.properties)
-            if isinstance(each.property, FiniteProperty)
+            if isinstance(each.property, FiniteProperty) and specification.slicing is None
         ]
         for index, event in enumerate(specification.events):
             if event.topic is not None and event.part is None:
                 topics.setdefault(event.topic, []).append((number, index))
     rows = []
+    # A message of a parametric specification is always for Python, which has the slices.
+    topics = {
+        topic: events
+        for topic, events in topics.items()
+        if all(specifications[number].slicing is None for number, _ in events)
+    }
     for topic, events in topics.items():
         met = list(dict.fromkeys(number for number, _ in events))
         rows.append(

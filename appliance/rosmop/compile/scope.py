@@ -66,6 +66,8 @@ class SpecificationNames:
     context: str
     variables: dict[str, Variable] = field(default_factory=dict)
     functions: dict[str, HelperFunction] = field(default_factory=dict)
+    parameters: dict[str, Variable] = field(default_factory=dict)
+    """Those of the specification, in order; they are variables, too."""
     misdeclared: set[str] = field(default_factory=set)
     """Names of variables and functions whose declarations are refused: to use them is no further mistake."""
     uses: set[str] = field(default_factory=set)
@@ -136,7 +138,12 @@ class Shared:
         if not owners:
             return None
         own.uses.add(owners[0].name)
-        return owners[0].variables[name]
+        variable = owners[0].variables[name]
+        if variable.sliced:
+            raise SpecificationError.at(
+                position, f"each slice of {owners[0].name} has its own {shown(name)}: others cannot see it"
+            )
+        return variable
 
 
 class Scope:

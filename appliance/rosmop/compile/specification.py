@@ -27,6 +27,13 @@ from appliance.rosmop.compile.lint import lint_property, unused_events
 from appliance.rosmop.compile.module import Module, TooComplexError
 from appliance.rosmop.compile.python import NAMESPACE
 from appliance.rosmop.compile.scope import Comparison, Publication, Shared, SpecificationNames
+from appliance.rosmop.compile.slicing import (
+    Slicing,
+    check_parameters,
+    declare_parameters,
+    slicing_of,
+    unsliceable,
+)
 from appliance.rosmop.ir import form
 from appliance.rosmop.logics.catalogue import compile_property
 from appliance.rosmop.logics.interface import CompiledProperty, FormulaError
@@ -41,7 +48,7 @@ _T = TypeVar("_T")
 _TAKEN = "revisions"
 MODIFIERS = frozenset({"hold"})
 IGNORED_MODIFIERS = frozenset({"unsynchronized", "decentralized", "perthread", "suffix", "creation"})
-"""Modifiers of MOP that say how a monitor is generated, and mean nothing here."""
+"""Modifiers of MOP that say how a monitor is generated, and mean nothing here (`creation` does before an event)."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +83,8 @@ class SpecificationCode:
     """The other specifications whose variables it uses."""
     comparisons: tuple[Comparison, ...] = ()
     """Those that are noted, in the order of the text."""
+    slicing: Slicing | None = None
+    """Of a parametric specification: what its slices differ in."""
 
 
 @dataclass(eq=False)
@@ -161,6 +170,7 @@ def _declare(
     module.namespace[context] = Context(specification.name, turn, shared.measures)
     names = SpecificationNames(specification.name, context)
     shared.specifications.append(names)
+    declare_parameters(shared, names, specification)
     declare_variables(shared, names, specification)
     declare_functions(shared, names, specification)
     size = sum(shared.values.width(variable.type) for variable in names.variables.values())
@@ -187,6 +197,8 @@ def _check_names(shared: Shared, specifications: Sequence[tree.Specification]) -
             shared.findings.append(Finding(specification.position, "error", text))
         seen[specification.name] = specification
         for variable in names.variables.values():
+            if variable.sliced:
+                continue
             other = owners.setdefault(variable.name, names.name)
             if other != names.name:
                 text = f"{shown(variable.name)} is also a variable of {other}; each has its own"
@@ -200,7 +212,11 @@ def _compile(
     start = _noted(shared, partial(compile_start, shared, names, specification))
     for function in names.functions.values():
         _noted(shared, partial(compile_function, shared, names, function))
-    events = [_noted(shared, partial(compile_event, shared, names, event)) for event in specification.events]
+    events = [
+        _noted(shared, partial(compile_event, shared, names, specification, event))
+        for event in specification.events
+    ]
+    check_parameters(shared, names, specification)
     good = tuple(event for event in events if event is not None)
     properties = [_property(shared, names, specification, node) for node in specification.properties]
     if start is None or len(good) < len(events) or None in properties:
@@ -220,6 +236,7 @@ def _compile(
         variables,
         uses,
         tuple(sorted(names.comparisons.values(), key=lambda comparison: comparison.position)),
+        slicing_of(names),
     )
 
 
@@ -243,9 +260,6 @@ def _check_head(shared: Shared, specification: tree.Specification) -> None:
     if specification.name == _TAKEN:
         text = f"no specification can be called {shown(_TAKEN)}: over REST /v1/monitors/{_TAKEN} is their history"
         shared.findings.append(Finding(specification.position, "error", text))
-    if specification.parameters:
-        text = "specifications take no parameters; write them as variables"
-        shared.findings.append(Finding(specification.parameters[0].position, "error", text))
     if not specification.events:
         text = f"the specification {shown(specification.name)} has no event; write `event name() /topic …`"
         shared.findings.append(Finding(specification.position, "error", text))
@@ -257,6 +271,8 @@ def _check_head(shared: Shared, specification: tree.Specification) -> None:
             )
         seen.add(event.name)
         for modifier in event.modifiers:
+            if specification.parameters and modifier.parts == ("creation",):
+                continue
             text = f"the modifier {shown(modifier.parts[0])} of an event means nothing here"
             shared.findings.append(Finding(modifier.position, "warning", text))
 
@@ -273,6 +289,9 @@ def _property(
     except FormulaError as error:
         shared.findings += error.findings
         return None
+    why = unsliceable(compiled) if specification.parameters else None
+    if why is not None:
+        shared.findings.append(Finding(node.position, "error", why))
     handlers: dict[str, str] = {}
     published = _noted(shared, partial(topics_of_remedy, names, compiled))
     if published is None:

@@ -124,6 +124,10 @@ class Interpreter:
         """Give a message (a timer: None) to an event; whether it happened."""
         return bool(self._run(self._functions[name], message))
 
+    def key(self, name: str, message: wire.Message | None) -> Any:
+        """What the message binds of the parameters of a specification: False, True, or a list of True and values."""
+        return self._run(self._functions[name], message)
+
     def action(self, name: str, message: wire.Message | None = None) -> None:
         """Run a handler, or a stage of the beginning."""
         self._run(self._functions[name], message)

@@ -84,6 +84,13 @@ class CaretRun:
         self._bits = 0
         self._stack: list[int] = []
 
+    def __copy__(self) -> "CaretRun":
+        twin = CaretRun.__new__(CaretRun)
+        for name in CaretRun.__slots__:
+            setattr(twin, name, getattr(self, name))
+        twin._stack = self._stack.copy()
+        return twin
+
     @property
     def deadline(self) -> int | None:
         """None: the verdict comes with each event."""

@@ -18,8 +18,10 @@ def interpreted(compiled: Compiled) -> Compiled:
     namespace: dict[str, Any] = {**contexts}
     interpreter = Interpreter(compiled.functions, namespace, contexts, compiled.messages)
     events = {event.function for one in compiled.specifications for event in one.events}
+    keys = {event.key for one in compiled.specifications for event in one.events}
     for name in compiled.functions:
-        namespace[name] = partial(interpreter.event if name in events else interpreter.action, name)
+        run = interpreter.key if name in keys else interpreter.event if name in events else interpreter.action
+        namespace[name] = partial(run, name)
     return replace(compiled, namespace=namespace, turn=turn)
 
 

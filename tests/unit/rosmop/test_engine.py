@@ -681,7 +681,6 @@ BAD_NAMES = [
         "no specification can be called `revisions`: over REST /v1/monitors/revisions is their history",
     ),
     ("hodl a() {" + on("/t") + "}", "`hodl` is no modifier of a specification; did you mean `hold`?"),
-    ("a(int x) {" + on("/t") + "}", "specifications take no parameters; write them as variables"),
     ("a() { int n; }", "the specification `a` has no event"),
     ("a() {" + on("t") + "}", "`t` is no global name; write `/t`"),
     ("a() {" + on("~t") + "}", "`~t` is no global name"),

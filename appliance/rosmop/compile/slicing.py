@@ -1,0 +1,140 @@
+"""Parametric specifications: their parameters as variables, and what each event binds of them.
+
+An event binds a parameter of the specification by one of its own with that name and type. Beside its function it has
+one that gives the values that it binds, for which nothing else of the message is read.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass
+
+from appliance.rosmop.compile.places import Variable
+from appliance.rosmop.compile.scope import Shared, SpecificationNames
+from appliance.rosmop.ir import form
+from appliance.rosmop.logics.interface import CompiledProperty
+from appliance.rosmop.logics.past import PastProperty
+from appliance.rosmop.positions import Finding
+from appliance.rosmop.syntax import tree
+from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.messages import shown
+from appliance.rosmop.types.resolve import resolve
+
+MOST_PARAMETERS = 6
+
+_ACTS = (form.Log, form.Throttle, form.Drop, form.Publish, form.Invoke)
+
+
+@dataclass(frozen=True)
+class Slicing:
+    """What slices differ in: the parameters (name in the text, name in the code, type), and their own variables."""
+
+    parameters: tuple[tuple[str, str, kinds.Type], ...]
+    own: tuple[str, ...]
+
+
+def declare_parameters(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
+    """Make the parameters variables that each slice has a value of, and that nothing assigns."""
+    for parameter in specification.parameters:
+        try:
+            kind = resolve(parameter.type, shared.messages)
+            if not (kinds.is_number(kind) or isinstance(kind, kinds.String | kinds.Time | kinds.Duration)):
+                text = f"a parameter of a specification is a string, a number or a time, and {kind} is none"
+                raise SpecificationError.at(parameter.position, text)
+            if parameter.name in names.variables:
+                raise SpecificationError.at(
+                    parameter.position, f"the parameter {shown(parameter.name)} occurs twice"
+                )
+        except SpecificationError as error:
+            shared.findings += error.findings
+            names.misdeclared.add(parameter.name)
+            continue
+        code = shared.module.fresh("g")
+        variable = Variable(
+            parameter.name, kind, code, parameter.position, shared=True, constant=True, sliced=True
+        )
+        names.variables[parameter.name] = names.parameters[parameter.name] = variable
+        shared.measures[code] = shared.values.measure(kind)
+    if len(specification.parameters) > MOST_PARAMETERS:
+        text = f"a specification has at most {MOST_PARAMETERS} parameters"
+        shared.findings.append(Finding(specification.parameters[-1].position, "error", text))
+
+
+def check_own(names: SpecificationNames, variable: Variable) -> None:
+    """Refuse a variable of which not each slice can have its own: what slices hold is bounded by their number."""
+    if variable.sliced and not (
+        kinds.is_number(variable.type) or isinstance(variable.type, kinds.Time | kinds.Duration)
+    ):
+        text = (
+            f"each slice of {names.name} has its own {shown(variable.name)}, so it is a number or a time; "
+            "write `static` for one that all slices share"
+        )
+        raise SpecificationError.at(variable.position, text)
+
+
+def slicing_of(names: SpecificationNames) -> Slicing | None:
+    """What the slices of a specification differ in; None without parameters."""
+    if not names.parameters:
+        return None
+    own = (one for one in names.variables.values() if one.sliced and one.name not in names.parameters)
+    return Slicing(
+        tuple((one.name, one.code, one.type) for one in names.parameters.values()),
+        tuple(one.code for one in own),
+    )
+
+
+def binds(names: SpecificationNames, event: tree.Event) -> tuple[int, ...]:
+    """Which parameters of the specification an event binds, by their numbers."""
+    own = {parameter.name for parameter in event.parameters}
+    return tuple(number for number, name in enumerate(names.parameters) if name in own)
+
+
+def creates(specification: tree.Specification, event: tree.Event) -> bool:
+    """Whether a slice may begin with an event: with all where none is a `creation event`."""
+
+    def marked(one: tree.Event) -> bool:
+        return any(modifier.parts == ("creation",) for modifier in one.modifiers)
+
+    return marked(event) or not any(map(marked, specification.events))
+
+
+def acts(function: form.Function, names: SpecificationNames) -> bool:
+    """Whether the action of an event does more than to change the slice's own variables."""
+    own = {one.code for one in names.variables.values() if one.sliced}
+    if not own.issuperset(function.shared):
+        return True
+    return any(
+        isinstance(node, _ACTS) or (isinstance(node, form.WriteBack) and bool(node.writes))
+        for node in _nodes(function.body)
+    )
+
+
+def _nodes(root: object) -> Iterator[object]:
+    waiting = [root]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, tuple):
+            waiting += node
+        elif is_dataclass(node):
+            yield node
+            waiting += [getattr(node, each.name) for each in fields(node)]
+
+
+def unsliceable(compiled: CompiledProperty) -> str | None:
+    """Why slices cannot have a run each of a property."""
+    if compiled.timed:
+        return (
+            f"a `{compiled.logic}` with times cannot be sliced: keep the time of an event in a variable of the slice "
+            "and compare it, or look at it in an `event … every`"
+        )
+    if isinstance(compiled, PastProperty):
+        return "the formula has too many states to be sliced; split it into several properties"
+    return None
+
+
+def check_parameters(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
+    """Every parameter is bound by an event."""
+    bound = {number for event in specification.events for number in binds(names, event)}
+    for number, (name, variable) in enumerate(names.parameters.items()):
+        if number not in bound:
+            text = f"no event binds the parameter {shown(name)}: give an event a parameter of that name"
+            shared.findings.append(Finding(variable.position, "error", text))
