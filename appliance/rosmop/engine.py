@@ -608,31 +608,33 @@ class MonitorSet:
         assert slices is not None  # noqa: S101  who asks has looked
         whole, seeds = slices.targets(step.event, key)
         refused, why = slices.refused, slices.why
-        before = outcome.events
-        names: Sequence[str] = ()
-        try:
-            if len(whole) + len(seeds) > 1:
+        before, verdicts, faults = outcome.events, [*outcome.verdicts], [*outcome.faults]
+        names: Sequence[str] = before
+        turn, dropped = self._turn, False
+        if len(whole) + len(seeds) > 1:
+            try:
                 step.monitor.context.spend(len(whole) + len(seeds), -1)
-            for one in whole:
-                outcome.events = before
-                dropped = self._in_slice(step.monitor, one, outcome, message, act)
-                names = outcome.events if outcome.events is not before else names
-                if dropped:
-                    return
-            turn = self._turn
-            for one in seeds:
-                unseen = Outcome(time=outcome.time)
-                lines, published = len(turn.log), len(turn.published)
-                copied = None if message is None else Message(bytes(message.buffer), message.time)
-                self._in_slice(step.monitor, one, unseen, copied, act)
-                del turn.log[lines:], turn.published[published:]
-                outcome.faults = (*outcome.faults, *unseen.faults)
-        except FaultError as error:
-            self._fault(error, step.monitor, step.event.position, outcome)
-            self._block(message, outcome)
-        finally:
-            outcome.events = names or before
-        if refused is not None:
+            except FaultError as error:
+                self._fault(error, step.monitor, step.event.position, outcome)
+                self._block(message, outcome)
+                return
+        for one in whole:
+            outcome.events, outcome.verdicts, outcome.faults = before, (), ()
+            dropped = self._in_slice(step.monitor, one, outcome, message, act)
+            names = outcome.events if outcome.events is not before else names
+            verdicts += outcome.verdicts  # many slices: a tuple would be copied with each
+            faults += outcome.faults
+            if dropped:
+                break
+        for one in () if dropped else seeds:
+            unseen = Outcome(time=outcome.time)
+            lines, published = len(turn.log), len(turn.published)
+            copied = None if message is None else Message(bytes(message.buffer), message.time)
+            self._in_slice(step.monitor, one, unseen, copied, act)
+            del turn.log[lines:], turn.published[published:]
+            faults += unseen.faults
+        outcome.events, outcome.verdicts, outcome.faults = names, tuple(verdicts), tuple(faults)
+        if refused is not None and not dropped:
             self._refuse_slice(step, refused, why, message, outcome)
 
     def _in_slice(

@@ -13,7 +13,8 @@ Theory of operation:
 2. The engine makes each of them in turn the state of the monitor (`select`), steps it as any other, and takes the state
    back (`settle`): the tables, functions and handlers are the ones of specifications without parameters. Where
    nothing comes of an event but other states of automata, `step` does that.
-3. A slice ends when no event can bring it to a handler any more, and no action does more than to change its variables.
+3. A slice ends, and its ticks with it, when no event can bring it to a handler any more, and no action for a message
+   does more than to change its variables.
    Its binding is remembered, so that none begins anew with it: of so many bindings as there may be slices, then the
    one that ended first is forgotten. One that is as at its beginning, and would begin with any event that matters to
    it, is forgotten at once: nobody can tell.
@@ -95,7 +96,9 @@ class Slices:
         self._first: Slice
         self._known = {domain: _Known() for domain in _joined(_domain(event) for event in code.events)}
         self._ended: deque[tuple[int, Key]] = deque()
-        ends = every and bool(finite) and not any(event.acts for event in code.events)
+        ends = (
+            every and bool(finite) and not any(event.acts for event in code.events if event.period_ns is None)
+        )
         self._lost = [_lost(one) for one in finite] if ends else []
         self._idles = _idles(code, self._all)
         self._whole = self._known[self._all].slices

@@ -45,7 +45,7 @@ def test_they_load_together_without_a_word() -> None:
     monitors = shipped(*sorted(path.stem for path in MONITORS.glob("*.rv")))
     assert monitors.warnings == ()
     assert [monitor.name for monitor in monitors.monitors] == [
-        "logging", "obstacleAvoidance", "safeTrigger", "safeZone",
+        "goals", "logging", "obstacleAvoidance", "safeTrigger", "safeZone",
     ]  # fmt: skip
 
 
@@ -178,3 +178,39 @@ def test_logging_changes_nothing() -> None:
     assert [line.text for line in turret.log] == ["turret_pan to 0.10 rad", "turret_tilt to 0.25 rad"]
     shot = monitors.process("/landshark_control/trigger", TRIGGER, 10)
     assert (shot.result, shot.log[0].text) == ("passed", "trigger 1")
+
+
+def goal(monitors: MonitorSet, part: str, name: str, time: float) -> Outcome:
+    """A message of the action `/count` about the goal of this id."""
+    types = {
+        "goal": "actionlib/TestActionGoal",
+        "result": "actionlib/TestActionResult",
+        "cancel": "actionlib_msgs/GoalID",
+    }
+    path = {"goal": "goal_id__id", "result": "status__goal_id__id", "cancel": "id"}[part]
+    data = message(types[part], **{path: name})
+    return monitors.process(f"/count/{part}", data, int(time * SECOND))
+
+
+def test_each_goal_is_answered_within_its_cancel() -> None:
+    """Of two goals that are cancelled, the one without an answer within three seconds is named."""
+    monitors = shipped("goals")
+    for number, name in enumerate(("a", "b", "c")):
+        goal(monitors, "goal", name, number)
+    goal(monitors, "cancel", "a", 3)
+    goal(monitors, "cancel", "b", 3.2)
+    goal(monitors, "result", "a", 5)
+    said = [(each.time / SECOND, line.text) for each in monitors.advance(20 * SECOND) for line in each.log]
+    assert said == [(6.5, "goal b is not answered 3.0 s after it was cancelled")]
+
+
+def test_an_id_is_that_of_one_goal() -> None:
+    """The second goal of an id is told with it; after the answer nothing is kept but the id."""
+    monitors = shipped("goals")
+    goal(monitors, "goal", "a", 1)
+    (verdict,) = goal(monitors, "goal", "a", 2).verdicts
+    assert (verdict.category, verdict.binding) == ("twice", {"id": "a"})
+    goal(monitors, "result", "a", 3)
+    slices = monitors.monitors[0].slices
+    assert slices is not None
+    assert slices.live == 0

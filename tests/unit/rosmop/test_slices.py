@@ -377,3 +377,14 @@ def test_topics_of_slices_have_no_walk_and_others_have() -> None:
     assert monitors.walker("/goal") is None
     assert monitors.walker("/o") is not None
     assert compile_files([parse(GOALS, "x.rv")], definitions()).specifications[0].slicing is not None
+
+
+def test_one_message_may_concern_all_slices() -> None:
+    """Verdicts of thousands at once, in the order in which the slices began."""
+    monitors = load(ANSWERED)
+    for number in range(3000):
+        monitors.process("/goal", text(str(number)), 1)
+    outcome = monitors.process("/stop", b"", 2)
+    assert [each.binding["id"] for each in outcome.verdicts] == [str(number) for number in range(3000)]
+    assert outcome.events == ("goals.stop",)
+    assert live(monitors) == 0

@@ -63,6 +63,7 @@ class Desk:
             self.store,
             self.trail,
             on_fault="drop",
+            slices=1000,
             allocation=Allocation(1),
             relays=relay,
             published=lambda: None,

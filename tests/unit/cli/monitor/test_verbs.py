@@ -385,3 +385,14 @@ def test_run_says_why_a_monitor_that_could_not_begin_drops(tmp_path: Path) -> No
     bag = make_bag(tmp_path / "in.bag", [("/t", "std_msgs/Int32", time, one) for time in (1.0, 2.0)])
     said = invoke("run", write(tmp_path, "m.rv", text), "--bag", bag).stdout
     assert said.count("dropped (m could not begin: its first values or `init` faulted)") == 2
+
+
+def test_parameters_are_explained() -> None:
+    """What binds each, and what a slice begins with."""
+    shipped = Path(__file__).parents[4] / "monitors" / "goals.rv"
+    result = CliRunner().invoke(app, ["monitor", "check", str(shipped)])
+    assert result.exit_code == 0
+    assert result.output.splitlines()[1:3] == [
+        "goals: parameter id (std::string), bound by goal, cancel, result",
+        "goals: a slice for each id, begun by goal; at most 100000 at a time",
+    ]

@@ -201,3 +201,20 @@ def test_clients_of_one_host_are_counted_together_and_those_of_two_are_not() -> 
         ("10.0.0.2", "", 49),
     ]
     told.monitored.close()
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_a_verdict_names_its_binding(together: bool) -> None:
+    """Each binding's is told in full, not counted with that of another one."""
+    turns = (
+        "turns(double x) { event on(double x) /cmd geometry_msgs/Twist '{linear.x:x}' { } "
+        'ere: on on @match { ROS_INFO("twice"); } }'
+    )
+    told = Told(together=together, texts=(turns,))
+    told.send((5, 0, 0), (6, 0, 0), (5, 0, 0), (6, 0, 0))
+    verdicts = told.events("verdict")
+    assert [(one.text, one.detail["binding"]) for one in verdicts] == [
+        ("property 1 of turns (ere) with x = 5.0: match", {"x": 5.0}),
+        ("property 1 of turns (ere) with x = 6.0: match", {"x": 6.0}),
+    ]
+    told.monitored.close()
