@@ -87,7 +87,7 @@ def compile_event(
         key=_key(shared, names, event, trigger, kind) if names.parameters else "",
         creates=creates(specification, event),
         plain=not event.action.statements and trigger.when is None,
-        acts=acts(whole, names),
+        acts=acts(whole, shared),
     )
 
 
@@ -126,7 +126,7 @@ def _timer(shared: Shared, names: SpecificationNames, event: tree.Event, functio
     whole = scope.function(function, ("m",))
     shared.define(whole)
     return EventCode(
-        event.name, function, event.position, period_ns=event.trigger.period_ns, acts=acts(whole, names)
+        event.name, function, event.position, period_ns=event.trigger.period_ns, acts=acts(whole, shared)
     )
 
 

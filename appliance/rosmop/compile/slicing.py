@@ -97,10 +97,10 @@ def creates(specification: tree.Specification, event: tree.Event) -> bool:
     return marked(event) or not any(map(marked, specification.events))
 
 
-def acts(function: form.Function, names: SpecificationNames) -> bool:
+def acts(function: form.Function, shared: Shared) -> bool:
     """Whether the action of an event does more than to change the slice's own variables."""
-    own = {one.code for one in names.variables.values() if one.sliced}
-    if not own.issuperset(function.shared):
+    others = {one.code for each in shared.specifications for one in each.variables.values() if not one.sliced}
+    if not others.isdisjoint(function.shared):
         return True
     return any(
         isinstance(node, _ACTS) or (isinstance(node, form.WriteBack) and bool(node.writes))

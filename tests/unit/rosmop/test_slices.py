@@ -233,7 +233,8 @@ def test_a_binding_is_short() -> None:
 
 def test_slices_that_are_over_are_collected_and_do_not_begin_anew() -> None:
     """No memory for a goal that is answered, but its id is not taken for another one's; as many as the bound are known."""
-    monitors = MonitorSet.load({"x.rv": ANSWERED}, definitions(), slices=3)
+    counted = ANSWERED.replace("again = again + 1;", "if (again < 1) again = again + 1;")
+    monitors = MonitorSet.load({"x.rv": counted}, definitions(), slices=3, margins=True)  # as in the relay
     monitors.start(0)
     for one in "abcd":
         monitors.process("/goal", text(one), 1)
