@@ -41,7 +41,11 @@ class Fleet:
 
     def __init__(self, trail: AuditTrail) -> None:
         self.stating = Stating(
-            Allocation(2), trail, "drop", lambda checked: dict.fromkeys(checked.monitors, True), self,
+            Allocation(2),
+            trail,
+            "drop",
+            lambda checked: dict.fromkeys(checked.monitors, True),
+            self,
             slices=1000,
         )
         self.story: list[tuple[Any, ...]] = []
