@@ -15,6 +15,7 @@ from typing import TypeVar
 
 from appliance.rosmop.certify import patterns, text
 from appliance.rosmop.certify.future import Future, State, positive
+from appliance.rosmop.certify.guesses import Guesses
 from appliance.rosmop.certify.machines import Machine
 from appliance.rosmop.certify.past import Past
 from appliance.rosmop.certify.text import TooMuchError, UnreadError
@@ -212,11 +213,13 @@ _SILENCE = "(silence)"
 
 def _check_endless(formula: text.Node, events: Sequence[str], letters: Sequence[str], tables: Tables) -> int:
     """`violation` once no endless continuation makes it true, `validation` once all do. Follows it and its opposite."""
-    future = Future(letters, MOST_WORK)
-    start = tuple(future.start(positive(formula, letters, wanted=wanted)) for wanted in (True, False))
+    guesses = Guesses(formula, letters)
+    future = Future(guesses.count, MOST_WORK)
+    sides = (guesses.formula, ("not", guesses.formula))
+    start = tuple(future.start(positive(guesses.kept(side), guesses.count)) for side in sides)
 
     def step(state: tuple[State, ...], event: str) -> tuple[State, ...]:
-        return tuple(future.step(side, event) for side in state)
+        return tuple(future.steps(side, guesses.letters[event]) for side in state)
 
     def told(_before: object, after: tuple[State, ...], _event: str) -> Verdicts:
         if not future.possible(after[0]):

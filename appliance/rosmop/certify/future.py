@@ -23,44 +23,57 @@ FALSE: State = frozenset()
 
 
 class Future:
-    """Follows a formula whose events are these `letters`: at each position exactly one of them happens.
+    """Follows a formula over so many letters, which are numbers: at each position exactly one of them happens.
 
     `work` is how many clauses may be made in all; beyond that `TooMuchError` is raised.
     """
 
-    def __init__(self, letters: Sequence[str], work: int) -> None:
-        self._letters = letters
+    def __init__(self, letters: int, work: int) -> None:
+        self._letters = range(letters)
         self._work = work
-        self._left: dict[tuple[Node, str], State] = {}
+        self._left: dict[tuple[Node, int], State] = {}
         self._known: dict[Clause, bool] = {}
 
     def start(self, formula: Node) -> State:
         """Before the first event."""
         return self._now(formula)
 
-    def step(self, state: State, letter: str) -> State:
-        """What remains after an event."""
+    def step(self, state: State, letter: int) -> State:
+        """What remains after a letter."""
         return self._any([self._after(clause, letter) for clause in state])
+
+    def steps(self, state: State, letters: Sequence[int]) -> State:
+        """What remains after one of them, whichever."""
+        self._work -= len(letters)
+        return self._any(
+            [self._after(clause, letter) for clause in state for letter in self._among(clause, letters)]
+        )
 
     def possible(self, state: State) -> bool:
         """Whether some endless trace makes it true."""
         return any(self._possible(clause) for clause in state)
 
+    def _among(self, clause: Clause, letters: Sequence[int]) -> list[int]:
+        """Those letters that no part of the clause rules out by itself."""
+        masks = [part[1] for part in clause if part[0] == "one of"]
+        return [letter for letter in letters if all(mask >> letter & 1 for mask in masks)]  # type: ignore[operator]  # sets of letters
+
     # --- what remains ---
 
-    def _after(self, clause: Clause, letter: str) -> State:
-        return self._all([self._part_after(part, letter) for part in clause])
+    def _after(self, clause: Clause, letter: int) -> State:
+        left = [self._part_after(part, letter) for part in clause]
+        return FALSE if FALSE in left else self._all(left)
 
-    def _part_after(self, part: Node, letter: str) -> State:
+    def _part_after(self, part: Node, letter: int) -> State:
         key = part, letter
         if key not in self._left:
             self._left[key] = self._define(part, letter)
         return self._left[key]
 
-    def _define(self, part: Node, letter: str) -> State:
+    def _define(self, part: Node, letter: int) -> State:
         operator, operands = part[0], part[1:]
         if operator == "one of":
-            return TRUE if letter in operands else FALSE
+            return TRUE if operands[0] >> letter & 1 else FALSE  # type: ignore[operator]  # a set of letters
         first: Node = operands[0]  # type: ignore[assignment]  # a formula
         if operator == "next":
             return self._now(first)
@@ -70,7 +83,7 @@ class Future:
             return self._any([self._at(second, letter), self._all([self._at(first, letter), again])])
         return self._all([self._at(second, letter), self._any([self._at(first, letter), again])])
 
-    def _at(self, formula: Node, letter: str) -> State:
+    def _at(self, formula: Node, letter: int) -> State:
         """What remains of a formula that is to hold at a position where the letter happens."""
         return self.step(self._now(formula), letter)
 
@@ -81,8 +94,8 @@ class Future:
             return self._all([self._now(operand) for operand in operands])  # type: ignore[arg-type]  # formulas
         if operator == "or":
             return self._any([self._now(operand) for operand in operands])  # type: ignore[arg-type]  # formulas
-        if operator == "one of" and len(operands) in (0, len(self._letters)):
-            return TRUE if operands else FALSE
+        if operator == "one of" and operands[0] in (0, (1 << len(self._letters)) - 1):
+            return TRUE if operands[0] else FALSE
         return frozenset([frozenset([formula])])
 
     def _any(self, states: list[State]) -> State:
@@ -121,7 +134,9 @@ class Future:
         while waiting:
             clause = waiting.pop()
             if clause not in ways:
-                ways[clause] = {way for letter in self._letters for way in self._ways(clause, letter)}
+                ways[clause] = {
+                    way for letter in self._among(clause, self._letters) for way in self._ways(clause, letter)
+                }
                 waiting += [after for after, _ in ways[clause]]
         good = {clause for clause in ways if self._known.get(clause, False)}
         for group in _circles(ways):
@@ -139,14 +154,18 @@ class Future:
                     waiting.append(before)
         self._known.update({clause: clause in good for clause in ways})
 
-    def _ways(self, clause: Clause, letter: str) -> set[Way]:
+    def _ways(self, clause: Clause, letter: int) -> set[Way]:
         """What may remain, with what was put off; without what asks for more and puts off as much as another way."""
+        left = [(part, self._part_after(part, letter)) for part in clause]
+        self._work -= 1
+        if any(state == FALSE for _, state in left):
+            return set()
         ways: set[Way] = {(frozenset(), frozenset())}
-        for part in clause:
+        for part, state in left:
             found = {
                 (after | more, off | {part} if part[0] == "until" and part in more else off)
                 for after, off in ways
-                for more in self._part_after(part, letter)
+                for more in state
             }
             self._work -= len(found)
             if self._work < 0:
@@ -199,18 +218,22 @@ def _circles(ways: dict[Clause, set[Way]]) -> list[set[Clause]]:
     return groups
 
 
-def positive(formula: Node, letters: Sequence[str], *, wanted: bool = True) -> Node:
-    """The formula (or its opposite) with `one of` some events, `and`, `or`, `next`, `until`, `release` only."""
-    operator = formula[0]
-    if operator in ("event", "true", "false"):
-        holds = {str(formula[1])} if operator == "event" else set(letters) if operator == "true" else set()
-        return ("one of", *(letter for letter in letters if (letter in holds) is wanted))
+def positive(formula: Node, letters: int, *, wanted: bool = True) -> Node:
+    """The formula (or its opposite) with `one of` some letters, `and`, `or`, `next`, `until`, `release` only.
+
+    `letters` is how many there are; which ones is said by a set of bits.
+    """
+    operator, everything = formula[0], (1 << letters) - 1
+    if operator in ("one of", "true", "false"):
+        holds = formula[1] if operator == "one of" else everything if operator == "true" else 0
+        assert isinstance(holds, int)  # noqa: S101  a set of letters
+        return ("one of", holds if wanted else everything & ~holds)
     first: Node = formula[1]  # type: ignore[assignment]  # a formula
     if operator == "not":
         return positive(first, letters, wanted=not wanted)
     if operator == "next":
         return ("next", positive(first, letters, wanted=wanted))
-    always, never = ("one of", *letters), ("one of",)
+    always, never = ("one of", everything), ("one of", 0)
     if operator in ("always", "eventually"):
         strong = (operator == "eventually") is wanted
         inner = positive(first, letters, wanted=wanted)

@@ -100,14 +100,13 @@ _NOT = {"!": "not", "not": "not"}
 _FUTURE = {
     "U": "until", "~U": "release", "R": "release",
 }  # fmt: skip
+_BACK = {"(*)": "previously", "~(*)": "dual previously", "<*>": "once", "[*]": "historically"}
+_SINCE = {"S": "since", "~S": "dual since"}
 LTL = (
-    {**_NOT, "o": "next", "~o": "next", "[]": "always", "<>": "eventually"},
-    (*_BOOLEAN[:3], {**_BOOLEAN[3], **_FUTURE}),
+    {**_NOT, **_BACK, "o": "next", "~o": "next", "[]": "always", "<>": "eventually"},
+    (*_BOOLEAN[:3], {**_BOOLEAN[3], **_FUTURE, **_SINCE}),
 )
-PTLTL = (
-    {**_NOT, "(*)": "previously", "~(*)": "dual previously", "<*>": "once", "[*]": "historically"},
-    ({"S": "since", "~S": "dual since"}, *_BOOLEAN),
-)
+PTLTL = ({**_NOT, **_BACK}, (_SINCE, *_BOOLEAN))
 """Of a logic: what stands before its one operand, and what stands between two, from the tightest to the loosest."""
 
 Grammar = tuple[Mapping[str, str], Sequence[Mapping[str, str]]]

@@ -38,7 +38,6 @@ class Automata:
     """Nodes, their transitions and the automata made of them, over letters ``0 … letters-1``."""
 
     def __init__(self, letters: int) -> None:
-        self._letters = letters
         self._nodes = Nodes(letters)
         self._chosen: dict[int, Sets] = {}
         self._moves: dict[tuple[int, int], Sets] = {}
@@ -47,9 +46,9 @@ class Automata:
         self._after: dict[tuple[Obligations, int], Sets] = {}
         self._work = 0
 
-    def translate(self, formula: Formula, atoms: Mapping[str, int], *, positive: bool) -> Sets:
-        """The initial states for a formula, or for its negation. ``atoms``: the letters of each event."""
-        return self._choices(Translation(self._nodes, atoms).node(formula, positive))
+    def translate(self, formula: Formula, atoms: Mapping[str, int]) -> Sets:
+        """The initial states for a formula. ``atoms``: the letters of each event."""
+        return self._choices(Translation(self._nodes, atoms).node(formula, True))
 
     def _choices(self, node: int) -> Sets:
         """The ways to satisfy a node, as obligation sets over nodes that are neither conjunction nor
@@ -150,7 +149,7 @@ class Automata:
                 continue
             edges[state] = [
                 (letter, target)
-                for letter in range(self._letters)
+                for letter in _members(self._possible(state))
                 for target in self._transitions(state, letter)
             ]
             if len(edges) > MAX_OBLIGATION_SETS:
@@ -176,9 +175,23 @@ class Automata:
             for state in component:
                 self._live[state] = verdict
 
-    def after(self, states: Sets, letter: int) -> Sets:
-        """Where the automaton may be after a letter; only states that accept some word."""
-        return self._smallest(target for state in states for target in self._live_after(state, letter))
+    def after(self, states: Sets, letters: int) -> Sets:
+        """Where the automaton may be after one of the letters (a bit set); only states that accept some word."""
+        return self._smallest(
+            target
+            for state in states
+            for letter in _members(self._possible(state) & letters)
+            for target in self._live_after(state, letter)
+        )
+
+    def _possible(self, state: Obligations) -> int:
+        """The letters that no node rules out by itself; a bit set."""
+        letters = self._nodes.everything
+        for node in _members(state):
+            kind, parts = self._nodes[node]
+            if kind == "letters":
+                letters &= parts[0]
+        return letters
 
     def _live_after(self, state: Obligations, letter: int) -> Sets:
         known = self._after.get((state, letter))

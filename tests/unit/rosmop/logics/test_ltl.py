@@ -17,6 +17,17 @@ PRINTER = Printer(
     ["until", "release", "implies", "iff"],
 )
 
+PAST = ("previously", "once", "historically", "since", "dual since", "dual previously")
+MIXED = Printer(
+    {
+        "next": ("o",), "always": ("[]",), "eventually": ("<>",), "until": ("U",), "release": ("R",),
+        "previously": ("(*)",), "once": ("<*>",), "historically": ("[*]",), "since": ("S",), "dual since": ("~S",),
+        "dual previously": ("~(*)",),
+    },
+    [["and"], ["xor"], ["or"], ["until", "release", "since", "dual since", "implies", "iff"]],
+    ["until", "release", "since", "dual since", "implies", "iff"],
+)  # fmt: skip
+
 Lasso = tuple[tuple[str, ...], int]
 """A trace that goes on for ever: its positions, and where the last one leads back to."""
 
@@ -31,7 +42,7 @@ def lassos(events: tuple[str, ...], stem: int, loop: int) -> list[Lasso]:
     ]
 
 
-def holds(tree: Tree, lasso: Lasso) -> list[bool]:
+def holds(tree: Tree, lasso: Lasso) -> list[bool]:  # noqa: PLR0911  # one per kind of operator
     """The truth of a formula at each position, by the definition of each operator; fixed points by iteration."""
     word, back = lasso
     size = len(word)
@@ -48,6 +59,11 @@ def holds(tree: Tree, lasso: Lasso) -> list[bool]:
         tail = [{*range(i, size), *range(back, size)} for i in range(size)]
         test = all if operator == "always" else any
         return [test(values[0][j] for j in tail[i]) for i in range(size)]
+    if operator in PAST:
+        truth = looking_back(operator, values)
+        turn = size - back
+        assert truth[-turn:] == truth[-2 * turn : -turn], "the trace is not unrolled far enough"
+        return truth
     if operator in ("until", "release"):
         truth = [operator == "release"] * size
         for _ in range(size + 1):
@@ -66,6 +82,24 @@ def holds(tree: Tree, lasso: Lasso) -> list[bool]:
         "iff": lambda x, y: x == y,
     }
     return [table[operator](*(value[i] for value in values)) for i in range(size)]
+
+
+def looking_back(operator: str, values: list[list[bool]]) -> list[bool]:
+    """The truth of an operator about the past at each position, by its definition."""
+    truth: list[bool] = []
+    for i, value in enumerate(values[-1]):
+        if operator in ("previously", "dual previously"):
+            truth.append(values[0][i - 1] if i else operator == "dual previously")
+        elif operator in ("once", "since"):
+            reach = values[0] if operator == "since" else [True] * (i + 1)
+            truth.append(any(values[-1][j] and all(reach[j + 1 : i + 1]) for j in range(i + 1)))
+        elif operator == "historically":
+            truth.append(all(values[0][: i + 1]))
+        else:
+            truth.append(value and (all(values[1][: i + 1]) or any(
+                values[0][j] and all(values[1][j : i + 1]) for j in range(i + 1)
+            )))  # fmt: skip
+    return truth
 
 
 def by_enumeration(tree: Tree, words: list[Lasso], longest: int) -> dict[tuple[str, ...], tuple[str, ...]]:
@@ -100,6 +134,44 @@ def test_verdicts_against_enumerated_continuations(
         expected = by_enumeration(tree, words, 3)
         for prefix in traces(events, 3):
             assert told(monitor, prefix)[-1] == expected[prefix], (text, prefix)
+
+
+def unrolled(lasso: Lasso, turns: int) -> Lasso:
+    """The same trace, its loop written down several times before it leads back."""
+    word, back = lasso
+    loop = word[back:]
+    return word + loop * turns, len(word) + len(loop) * (turns - 1)
+
+
+def has(tree: Tree, operators: tuple[str, ...]) -> bool:
+    """Whether the formula has one of these."""
+    return tree[0] in operators or any(has(part, operators) for part in tree[1:] if isinstance(part, tuple))
+
+
+def test_past_and_future_against_enumerated_continuations() -> None:
+    """Operators of both kinds in each other: the verdict is what all continuations have in common."""
+    random = seeded(7)
+    words = [unrolled(lasso, 6) for lasso in lassos(AB, 4, 2)]
+    arity = UNARY | dict.fromkeys(("previously", "once", "historically", "dual previously"), 1)
+    checked = 0
+    while checked < 100:
+        tree = draw(random, 3, (*TEMPORAL, *PAST), arity, AB)
+        if not (has(tree, PAST) and has(tree, TEMPORAL)):
+            continue
+        checked += 1
+        text = MIXED.show(tree, random)
+        monitor = compiled("ltl", text, AB)
+        expected = by_enumeration(tree, words, 3)
+        for prefix in traces(AB, 3):
+            assert told(monitor, prefix)[-1] == expected[prefix], (text, prefix)
+
+
+def test_many_operators_about_the_past() -> None:
+    """What looks back over past events only costs no more than what it remembers."""
+    monitor = compiled("ltl", "[](a => " + "(*) " * 7 + "b)", AB)
+    assert told(monitor, "bbbbbbbab")[-2:] == [(), ()]
+    assert told(monitor, "abbbbbbaa") == [("violation",)] * 9
+    assert told(monitor, "b" + "b" * 7 + "a" * 8 + "a")[-2:] == [("violation",)] * 2
 
 
 def test_long_traces_of_random_formulas() -> None:
@@ -141,10 +213,10 @@ def test_chains_need_parentheses() -> None:
 
 
 def test_formulas_about_the_past_are_refused() -> None:
-    """A past formula is pointed to ptltl; a mixture is refused too."""
+    """A formula about the past alone is pointed to ptltl; one with too many operators about it is refused."""
     assert refusal("ltl", "[*] a") == ["7:11: a formula about the past; write `ptltl:` for `ltl:`"]
     assert refusal("ltl", "a S b") == ["7:11: a formula about the past; write `ptltl:` for `ltl:`"]
-    assert "not supported yet" in refusal("ltl", "[](a => (*) b)")[0]
+    assert "10 different operators about the past" in refusal("ltl", "[](a => " + "(*) " * 10 + "b)")[0]
 
 
 def test_an_event_with_the_name_of_an_operator() -> None:
