@@ -74,6 +74,13 @@ class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     note: Annotated[str, msgspec.Meta(max_length=300)] = ""
 
 
+class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Of which time: from `since` (null: all that there is) to `until` (null: now)."""
+
+    since: Annotated[int | None, told("nanoseconds since the epoch")] = None
+    until: Annotated[int | None, told("nanoseconds since the epoch")] = None
+
+
 def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1/recordings", tags=["recordings"])
@@ -105,6 +112,12 @@ def routes(services: Services) -> Routes:
         """Record the last seconds, and the next ones, of what the robot says."""
         order = admin.RecordNow(new.before, new.after, new.note)
         return answer(answered(await control.ask(order, bearer, _SLOW_SECONDS)), 201)
+
+    @router.post("/memory", operation_id="recording_of_memory", responses=_UNKNOWN)
+    async def of_memory(span: Annotated[MemorySpan, body(MemorySpan)], bearer: Investigator) -> Recording:
+        """What is in memory now, to be fetched as a recording for ten minutes, or until somebody else asks."""
+        order = admin.RecordingOfMemory(span.since, span.until)
+        return answered(await control.ask(order, bearer, _SLOW_SECONDS))
 
     @router.get("/{recording_id}", operation_id="recording", responses=_UNKNOWN)
     async def recording(recording_id: OneId, bearer: Viewer) -> Recording:

@@ -248,6 +248,16 @@ class RecordingRead(AdminRequest[recordings.Recording], frozen=True, tag="record
     topics: list[str] = []
 
 
+class RecordingOfMemory(AdminRequest[recordings.Recording], frozen=True, tag="recording memory"):
+    """What is in memory, to be read: from `since` to `until`, nanoseconds since the epoch (None: all, now).
+
+    It is no recording that is kept: for ten minutes, or until somebody else asks, it can be fetched as one.
+    """
+
+    since: int | None = None
+    until: int | None = None
+
+
 class RecordingRemove(AdminRequest[recordings.Recording], frozen=True, tag="recording remove"):
     """Remove a recording."""
 
@@ -255,7 +265,8 @@ class RecordingRemove(AdminRequest[recordings.Recording], frozen=True, tag="reco
 
 
 RecorderRequest = (
-    RecordingsWanted | RecordingWanted | RecordNow | RecordingFetch | RecordingRead | RecordingRemove
+    RecordingsWanted | RecordingWanted | RecordNow | RecordingFetch | RecordingRead | RecordingOfMemory
+    | RecordingRemove
 )  # fmt: skip
 
 

@@ -83,6 +83,7 @@ OPERATIONS = (
     Operation(admin.RecordingWanted, "viewer", "GET", "/v1/recordings/{id}"),
     Operation(admin.RecordingFetch, "investigator", "GET", "/v1/recordings/{id}/bag"),
     Operation(admin.RecordingRead, "investigator", "GET", "/v1/recordings/{id}/messages", ("topics",)),
+    Operation(admin.RecordingOfMemory, "investigator", "POST", "/v1/recordings/memory"),
     Operation(admin.RecordingRemove, "admin", "DELETE", "/v1/recordings/{id}"),
     Operation(admin.TokenList, "admin", "GET", "/v1/tokens"),
     Operation(admin.TokenRevoke, "admin", "DELETE", "/v1/tokens/{name}"),

@@ -201,7 +201,10 @@ def fetch(
         raise usage_error(f"{target} is there already")
     part = target.with_name(f"{target.name}.part")
     try:
-        body = _fetched(appliance, recording, part, as_json=as_json)
+        body = appliance.ask_or_exit(admin.RecordingWanted(recording), as_json=as_json)
+        bag = bag_of(appliance, body.id, part, as_json=as_json)
+        if bag is not part:
+            shutil.copyfile(bag, part)
         with part.open("rb") as file:
             whole = hashlib.file_digest(file, "sha256").hexdigest() == body.sha256
         if whole and mcap:
@@ -233,23 +236,20 @@ def remove(appliance: Appliance, recording: _Id, as_json: Json = False) -> None:
     say(f"recording {body.id} is removed")
 
 
-def _fetched(appliance: Appliance, recording: str, part: Path, *, as_json: bool) -> Recording:
-    """The bag in a file, and what it must be. Raises `OSError`."""
+def bag_of(appliance: Appliance, recording: str, part: Path, *, as_json: bool) -> Path:
+    """The bag where it lies, or over REST in `part`, once it is on record who takes it. Raises `OSError`."""
     way = appliance.way
     if isinstance(way, AdminSocket):
-        body = appliance.ask_or_exit(admin.RecordingFetch(recording), as_json=as_json)
-        shutil.copyfile(_bag(way, body), part)
-        return body
+        return _bag(way, appliance.ask_or_exit(admin.RecordingFetch(recording), as_json=as_json))
     from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
-    body = appliance.ask_or_exit(admin.RecordingWanted(recording), as_json=as_json)
     try:
-        with way.client.streamed("GET", f"/v1/recordings/{body.id}/bag") as answer, part.open("wb") as file:
+        with way.client.streamed("GET", f"/v1/recordings/{recording}/bag") as answer, part.open("wb") as file:
             for piece in answer.iter_bytes():
                 file.write(piece)
     except (ProblemError, NotRunningError) as error:
         raise usage_error(str(error)) from None
-    return body
+    return part
 
 
 def _bag(way: AdminSocket, recording: Recording) -> Path:

@@ -18,7 +18,9 @@ from appliance.control.errors import SenselessError, UnknownThingError
 _PATIENCE_SECONDS = 10.0
 _LONGEST_NOTE = 300
 _MOST_TOPICS = 20
-_Answer = messages.RecordingBegun | messages.RecordingRemoved | messages.RecordingRefused
+_Answer = (
+    messages.RecordingBegun | messages.RecordingRemoved | messages.MemoryLent | messages.RecordingRefused
+)
 
 
 class RecorderAwayError(Exception):
@@ -39,6 +41,7 @@ class RecordingOrders:
         self._in_force = in_force
         self._channel: Channel | None = None
         self._kept: dict[str, Recording] = {}
+        self._lent: dict[str, Recording] = {}  # the last one of the memory
         self._numbers = itertools.count(1)
         self._asked: dict[int, asyncio.Future[_Answer]] = {}
 
@@ -75,7 +78,8 @@ class RecordingOrders:
     async def recordings(self, _request: admin.RecordingsWanted) -> Recordings:
         """Those that are kept, the oldest first."""
         self._require()
-        return Recordings([self._kept[name] for name in sorted(self._kept)])
+        rules, kept = self._rules, [self._kept[name] for name in sorted(self._kept)]
+        return Recordings(kept, list(rules.topics), list(rules.never), rules.before)
 
     async def recording(self, request: admin.RecordingWanted) -> Recording:
         """One of them."""
@@ -139,6 +143,24 @@ class RecordingOrders:
             raise RecorderAwayError(f"nobody can fetch anything while that is not on record: {failure}")
         return recording
 
+    async def of_memory(self, request: admin.RecordingOfMemory, who: str) -> Recording:
+        """What is in memory, to be fetched as a recording that is not kept."""
+        self._require()
+        now = time.time_ns()
+        since, until = request.since or 0, now if request.until is None else request.until
+        record = self._trail.happened(
+            "recording ordered",
+            f"of what is in memory, by {who}",
+            severity=Severity.NOTICE,
+            who=who,
+            kept=False,
+        )
+        trigger = Trigger(now, "order", record, f"{who}: of what is in memory")
+        answer = await self._ask(lambda number: messages.MemoryWanted(number, trigger, since, until))
+        assert isinstance(answer, messages.MemoryLent)  # noqa: S101  what this order is answered with
+        self._lent = {answer.recording.id: answer.recording}
+        return answer.recording
+
     async def remove(self, request: admin.RecordingRemove, who: str) -> Recording:
         """Take it away."""
         self._require()
@@ -155,9 +177,10 @@ class RecordingOrders:
             raise RecorderAwayError("the flight recorder does not run at the moment")
 
     def _find(self, recording_id: str) -> Recording:
-        if recording_id not in self._kept:
+        known = self._kept | self._lent
+        if recording_id not in known:
             raise UnknownThingError(f"there is no recording {recording_id[:40]}")
-        return self._kept[recording_id]
+        return known[recording_id]
 
     async def _ask(self, order: Callable[[int], messages.Message]) -> _Answer:
         """The recorder's answer to an order, which is given a number."""
@@ -206,7 +229,7 @@ class RecordingOrders:
                     who=who or "recorder",
                 )
                 self._answered(message)
-            case messages.RecordingBegun() | messages.RecordingRefused():
+            case messages.RecordingBegun() | messages.MemoryLent() | messages.RecordingRefused():
                 self._answered(message)
 
     def _answered(self, message: _Answer) -> None:

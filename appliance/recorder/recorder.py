@@ -122,6 +122,8 @@ class Recorder:
                 self._shelf.note(recording_id)
             case messages.RecordingWanted():
                 self._order(message)
+            case messages.MemoryWanted():
+                self._lend(message)
             case messages.RecordingRemovalWanted(number, recording_id, who):
                 self._remove(number, recording_id, who)
 
@@ -136,6 +138,30 @@ class Recorder:
         else:
             progress = self._making.progress
             self._answers.append(messages.RecordingBegun(wanted.number, progress.id, progress.ends))
+
+    def _lend(self, wanted: messages.MemoryWanted) -> None:
+        """Write what is in memory of that time where it can be read, beside the recordings and not among them."""
+        now = self._clock()
+        since = max(self._memory, wanted.since, now - int(self._rules.before * _SECOND))
+        until = min(wanted.until, now)
+        if since >= until:
+            reason = f"the memory has the last {self._rules.before:g} seconds, and nothing of that time"
+            self._answers.append(messages.RecordingRefused(wanted.number, reason, unknown=True))
+            return
+        if self._shelf.free < 2 * self._reserve + self._shelf.largest:
+            self._answers.append(messages.RecordingRefused(wanted.number, "the disk is nearly full"))
+            return
+        progress = Progress(self._ids.next(), self._memory, since, until, [wanted.trigger])
+        try:
+            lent = self._in_progress(progress)
+            lent.step()
+            recording = lent.finish((), self._revisions)
+            self._shelf.lend(recording)
+        except OSError as error:
+            shutil.rmtree(self._shelf.part(progress.id), ignore_errors=True)
+            self._answers.append(messages.RecordingRefused(wanted.number, str(error)))
+        else:
+            self._answers.append(messages.MemoryLent(wanted.number, recording))
 
     def _remove(self, number: int, recording_id: str, who: str) -> None:
         recording = self._shelf.find(recording_id)

@@ -7,6 +7,7 @@ Invariants:
    of trigger whose recordings have most of it, the oldest goes: who causes many loses none of others. So it does where
    their descriptions have more than `_MOST_DESCRIBED` bytes, for control is told of all of them in one message.
 3. `noted` in a folder says that the audit log has the recording; what was not noted is told again.
+4. `lent` in a folder says that it is no recording that is kept: there is one at most, which goes with the next.
 """
 
 import re
@@ -22,8 +23,9 @@ from appliance.channel.answers.recordings import Recording
 
 BAG, ABOUT, PROGRESS = "recording.bag", "recording.json", "progress"
 MOST_KEPT = 500
+LENT_SECONDS = 600
 _MOST_DESCRIBED = 32 << 20
-_NOTED = "noted"
+_NOTED, _LENT = "noted", "lent"
 _ID = re.compile(r"[0-9a-f]{20}")
 _PART = re.compile(r"\.([0-9a-f]{20})\.part")
 _LARGEST = 8  # the part of `disk` that one recording may have
@@ -37,6 +39,9 @@ class Shelf:
         self._folder = folder
         self._disk = disk
         self._seconds = seconds
+        for mark in folder.glob(f"*/{_LENT}"):
+            shutil.rmtree(mark.parent)
+        self._lent: Recording | None = None
         self.recordings = sorted(self._read(), key=lambda recording: recording.id)
         self._described = {found.id: self._length(found) for found in self.recordings}
 
@@ -77,6 +82,18 @@ class Shelf:
         self.recordings.append(recording)
         self._described[recording.id] = self._length(recording)
 
+    def lend(self, recording: Recording) -> None:
+        """One that is not kept can be read until there is another, or for `LENT_SECONDS`. Raises `OSError`."""
+        self._take_back()
+        (self.part(recording.id) / _LENT).touch()
+        self.part(recording.id).rename(self._folder / recording.id)
+        self._lent = recording
+
+    def _take_back(self) -> None:
+        if self._lent is not None:
+            shutil.rmtree(self._folder / self._lent.id)
+            self._lent = None
+
     def find(self, recording_id: str) -> Recording | None:
         """The recording of this id; None when there is none."""
         return next((found for found in self.recordings if found.id == recording_id), None)
@@ -99,8 +116,10 @@ class Shelf:
     def surplus(self, now: int, *, room: bool) -> Iterator[tuple[Recording, str]]:
         """What is to be removed now (nanoseconds since the epoch), and why; `room`: another recording begins.
 
-        Each is to be removed before the next is asked for.
+        Each is to be removed before the next is asked for. What was lent for long enough goes, too. Raises `OSError`.
         """
+        if self._lent is not None and self._lent.triggers[0].time + LENT_SECONDS * 1_000_000_000 < now:
+            self._take_back()
         while self._seconds is not None and self.recordings:
             oldest = self.recordings[0]
             if oldest.ended + int(self._seconds * 1e9) > now:

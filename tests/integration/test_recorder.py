@@ -136,6 +136,23 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
     if os.geteuid() == 0:
         assert (folder.stat().st_uid, folder.stat().st_gid) == (61019, 61014)
         assert stat.S_IMODE((folder / "recording.bag").stat().st_mode) == 0o640
+    replayed = appliance.rosrv("monitor", "replay", "censor", "--since", "1h", "--json").stdout
+    found = [json.loads(line) for line in replayed.splitlines()]
+    drops = [one for one in found if one["kind"] == "drop"]
+    assert len([one for one in drops if one["bag"] == row["id"]]) == len(said(ros, bag, "/rude"))
+    assert len(drops) == json.loads(appliance.rosrv("monitor", "list", "--json").stdout)["drops"]
+    assert found[0]["kind"] == "gap"
+    assert found[0]["until"] == row["began"] / 1e9
+    table = appliance.rosrv("monitor", "replay", "censor", "--since", "1h").stdout.splitlines()
+    assert table[0].startswith("not recorded: ")
+    assert table[-1].endswith(" of 2 recordings")
+    secret = tmp_path / "secret.rv"
+    secret.write_text(MONITOR.replace("/rude", "/secret/key"))
+    refused = appliance.rosrv("monitor", "replay", str(secret), "--since", "1h", check=False)
+    assert (refused.returncode, "recorder.never has /secret/*" in refused.stderr) == (2, True)
+    long_ago = ("--since", "2020-01-01", "--until", "2020-01-02")
+    nothing = appliance.rosrv("monitor", "replay", "censor", *long_ago, check=False)
+    assert (nothing.returncode, "nothing is recorded of 2020-01-01" in nothing.stderr) == (1, True)
     mcap = tmp_path / "a.mcap"
     appliance.rosrv("record", "fetch", row["id"], "--mcap", "--out", str(mcap))
     assert mcap.read_bytes() == b"".join(as_mcap(bag))
@@ -230,10 +247,13 @@ def test_over_rest_messages_are_for_investigators(
     assert appliance.recorded(event="recording read")[0]["detail"]["who"] == "the-investigator"
     taken = tmp_path / "taken.bag"
     done = {}
-    for verb in (("fetch", row["id"], "--out", str(taken)), ("timeline", row["id"]), ("messages", row["id"])):
+    for group, *verb in (
+        ("record", "fetch", row["id"], "--out", str(taken)), ("record", "timeline", row["id"]),
+        ("record", "messages", row["id"]), ("monitor", "replay", "censor", "--since", "1h"),
+    ):  # fmt: skip
         done[verb[0]] = subprocess.run(
             [
-                *(ROSRV, "record", *verb, "--api", str(appliance.ready["api"])),
+                *(ROSRV, group, *verb, "--api", str(appliance.ready["api"])),
                 *("--api-ca", str(appliance.state / "api" / "certificate.pem")),
             ],
             env=os.environ | {"ROSRV_TOKEN": secret},
@@ -244,8 +264,16 @@ def test_over_rest_messages_are_for_investigators(
     assert "/chatter" in done["timeline"]
     assert "data: " in done["messages"]
     assert taken.read_bytes() == bag.body
+    for other in (viewer, operator, admin):
+        assert other.post("/v1/recordings/memory", {}).status == 403
+    memory = investigator.post("/v1/recordings/memory", {"since": row["ended"] + 1}).json
+    assert (memory["began"], memory["complete"]) == (row["ended"] + 1, True)
+    lent = investigator.get(f"/v1/recordings/{memory['id']}/bag").body
+    assert hashlib.sha256(lent).hexdigest() == memory["sha256"]
+    assert memory["id"] not in {one["id"] for one in viewer.get("/v1/recordings").json["recordings"]}
+    assert "of 2 recordings" in done["replay"]
     assert set(heard) <= set(said(ros, taken, "/chatter"))
-    fetches = appliance.recorded(event="recording fetched", count=2)
+    fetches = appliance.recorded(event="recording fetched", count=5)
     assert {record["detail"]["who"] for record in fetches} == {"the-investigator"}
     assert operator.request("DELETE", path).status == 403
     assert admin.request("DELETE", path).status == 200

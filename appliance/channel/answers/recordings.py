@@ -54,9 +54,12 @@ class RecordingBegun(msgspec.Struct, frozen=True):
 
 
 class Recordings(msgspec.Struct, frozen=True):
-    """All recordings that are kept, the oldest first."""
+    """All recordings that are kept, the oldest first, and what is recorded."""
 
     recordings: list[Recording]
+    topics: Annotated[list[str], told("names of topics that are recorded; `*` is anything")] = []
+    never: Annotated[list[str], told("names and types that are never recorded")] = []
+    before: Annotated[float, told("seconds that the memory keeps")] = 0.0
 
 
 class Sender(msgspec.Struct, frozen=True):

@@ -88,6 +88,22 @@ class RecordingRemoved(Message):
     reason: str
 
 
+class MemoryWanted(Message):
+    """Control asks for what is in memory of the time from `since` to `until` (ns), to be read and not to be kept."""
+
+    number: int
+    trigger: Trigger
+    since: int
+    until: int
+
+
+class MemoryLent(Message):
+    """What was asked for as `number` can be read as `recording`, which goes by itself or with the next one."""
+
+    number: int
+    recording: Recording
+
+
 class RecordingRefused(Message):
     """What was asked for as `number` is not done; `unknown`: there is no such recording."""
 
@@ -106,4 +122,5 @@ class RecordingMissed(Message):
 RecorderLink = (
     RecordingsAsked | RecordingsStated | RevisionsWanted | RevisionsStated | RecordingClosed | RecordingNoted
     | RecordingWanted | RecordingBegun | RecordingRemovalWanted | RecordingRemoved | RecordingRefused | RecordingMissed
+    | MemoryWanted | MemoryLent
 )  # fmt: skip

@@ -21,6 +21,9 @@ from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
 
 
+_OWN = "/rosrv"  # the appliance: what monitors publish is not given to monitors
+
+
 @dataclass(frozen=True)
 class Replayed:
     """What came of one message (or, without a topic, of a tick or deadline)."""
@@ -154,7 +157,7 @@ class Recording:
         for message in outcome.published:
             package, _, kind = message.type.partition("/")
             text, digest = self._definitions.full_text(message.type), self._definitions.md5sum(message.type)
-            header = (message.topic, f"{package}/msg/{kind}", text, digest, "/rosrv", None)
+            header = (message.topic, f"{package}/msg/{kind}", text, digest, _OWN, None)
             self._write(header, outcome.time, message.data)
 
     def _write(self, header: _Header, time_ns: int, data: bytes) -> None:
@@ -167,14 +170,20 @@ class Recording:
 
 
 def replay(
-    monitors: MonitorSet, reader: Reader, output: Recording | None, topics: Sequence[str] = ("*",)
+    monitors: MonitorSet,
+    reader: Reader,
+    output: Recording | None,
+    topics: Sequence[str] = ("*",),
+    span: tuple[int, int] = (0, 1 << 63),
 ) -> Iterator[Replayed]:
-    """Give the messages of a bag on these topics (patterns) to the monitors, in its order and with its clock."""
+    """Give the messages of a bag on these topics (patterns), from a moment to another (nanoseconds since the epoch), to
+    the monitors, in its order and with its clock.
+    """
     started: Outcome | None = None
     refusals = {
         connection.id: _refusal(monitors, connection)
         for connection in reader.connections
-        if _fits(connection, topics)
+        if _fits(connection, topics) and getattr(connection.ext, "callerid", None) != _OWN
     }
     expected = frozenset(
         connection.topic for connection in reader.connections if refusals.get(connection.id, "") is None
@@ -182,7 +191,7 @@ def replay(
     begun = False
     try:
         for index, (connection, time_ns, data) in enumerate(reader.messages()):
-            if connection.id not in refusals:
+            if connection.id not in refusals or not span[0] <= time_ns <= span[1]:
                 continue
             if not begun:
                 started, begun = monitors.start(time_ns, expected), True

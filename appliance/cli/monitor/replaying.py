@@ -3,7 +3,8 @@
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -16,6 +17,7 @@ from appliance.channel import admin
 from appliance.cli.monitor.bag import Replayed, definitions_of, open_bag, refusals, replay
 from appliance.cli.monitor.input import read_definitions, read_specifications, usage_error
 from appliance.cli.monitor.output import BILLION
+from appliance.cli.monitor.recorded import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
 from appliance.cli.monitor.running import WIDE
 from appliance.cli.output import Json, counted, printable, say, say_json
 from appliance.cli.progress import progress
@@ -25,7 +27,9 @@ from appliance.ros.standard import standard_definitions
 from appliance.rosmop.engine import Margin, MonitorSet, sharing
 from appliance.rosmop.outcomes import Outcome, bound
 from appliance.rosmop.positions import Position, line_of
+from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.syntax.parser import parse
 
 _KINDS = ("drop", "change", "verdict", "warning", "fault")
 _WOULD = {"drop": "would drop it", "change": "would change it"}
@@ -53,8 +57,20 @@ def replay_monitor(
     ],
     *,
     bags: Annotated[
-        list[Path], typer.Option("--bag", metavar="FILE", help="A recording (repeatable)", show_default=False)
-    ],
+        list[Path] | None,
+        typer.Option("--bag", metavar="FILE", help="A recording (repeatable)", show_default=False),
+    ] = None,
+    since: Annotated[
+        str | None,
+        typer.Option(
+            "--since",
+            help="Without --bag: what the flight recorder has from this moment on: 1h (ago), a date, or RFC 3339",
+            show_default=False,
+        ),
+    ] = None,
+    until: Annotated[
+        str | None, typer.Option("--until", help="The same up to this moment", show_default=False)
+    ] = None,
     topics: Annotated[
         list[str] | None,
         typer.Option("--topic", metavar="PATTERN", help="Only these topics; `*` fits anything (repeatable)"),
@@ -73,22 +89,36 @@ def replay_monitor(
 ) -> None:
     """Say what a monitor would have dropped and changed of recordings, where, and how often.
 
-    Each recording begins in the monitor's initial state. With --json all places, one object each.
+    Of bags, or (--since) of what the flight recorder of the running appliance has in its recordings and in memory; what
+    of that time it does not have is said. Each recording begins in the monitor's initial state. With --json all
+    places, one object each.
 
-    Example: rosrv monitor replay safeTrigger --bag monday.bag --bag tuesday.bag
+    Example: rosrv monitor replay safeTrigger --since 1h
     """
+    if bool(bags) is (since is not None or until is not None):
+        raise usage_error("give --bag FILE (repeatable), or --since and --until for the flight recorder")
     report = _Report(most, as_json)
+    patterns = topics or ["*"]
     messages = 0
     try:
         texts, definitions, chosen = _specifications(appliance, what, msg or [], as_json=as_json)
-        for bag in bags:
-            with closing(open_bag(bag)) as reader:
-                known = definitions_of(reader).extended(definitions)
-                monitors = _only(chosen, MonitorSet.load(texts, known, margins=margins))
-                for text in refusals(monitors, reader, topics or ["*"]):
-                    raise usage_error(f"{bag}: {text}")
-                monitors.write_module()
-                messages += report.of(monitors, reader, bag, topics or ["*"])
+        with ExitStack() as fetched:
+            if bags:
+                pieces = [Piece(str(bag), bag, EVER, "") for bag in bags]
+            else:
+                span = span_of(since, until)
+                recorded = appliance.ask_or_exit(admin.RecordingsWanted(), as_json=as_json)
+                require_recorded(recorded, _topics(texts, chosen, patterns))
+                pieces = fetched.enter_context(pieces_of(appliance, recorded, span, as_json=as_json))
+                report.cover(pieces, span)
+            for piece in pieces:
+                with closing(open_bag(piece.bag)) as reader:
+                    known = definitions_of(reader).extended(definitions)
+                    monitors = _only(chosen, MonitorSet.load(texts, known, margins=margins))
+                    for text in refusals(monitors, reader, patterns):
+                        raise usage_error(f"{piece.name}: {text}")
+                    monitors.write_module()
+                    messages += report.of(monitors, reader, piece, patterns)
     except SpecificationError as error:
         for finding in error.findings:
             typer.echo(printable(str(finding)), err=True)
@@ -97,7 +127,7 @@ def replay_monitor(
         report.show()
     report.show_margins(texts)
     if not as_json:
-        say(f"{counted(messages, 'message')} of {counted(len(bags), 'recording')}")
+        say(f"{counted(messages, 'message')} of {counted(len(pieces), 'recording')}")
 
 
 def _specifications(
@@ -117,6 +147,19 @@ def _specifications(
     return loaded.files or {}, definitions, what
 
 
+def _topics(texts: Mapping[str, str], chosen: str | None, patterns: Sequence[str]) -> dict[str, str]:
+    """The topics, with their types, that the monitor (None: any of these files) listens to and that are to be read."""
+    return {
+        event.trigger.topic: event.trigger.type
+        for name, text in texts.items()
+        for specification in parse(text, name).specifications
+        if chosen in (None, specification.name)
+        for event in specification.events
+        if isinstance(event.trigger, tree.MessageTrigger) and event.trigger.part is None
+        if any(fnmatchcase(event.trigger.topic, pattern) for pattern in patterns)
+    }
+
+
 def _only(chosen: str | None, monitors: MonitorSet) -> MonitorSet:
     """A set in which only this one, with those that it shares variables with, is enabled (None: all are)."""
     if chosen is not None:
@@ -130,7 +173,7 @@ class _Closest(NamedTuple):
     """How close a comparison came, and when."""
 
     margin: Margin
-    bag: Path
+    bag: str
     time: int
     number: int | None
 
@@ -144,18 +187,33 @@ class _Report:
         self._counts: Counter[tuple[str, str, str]] = Counter()
         self._closest: dict[tuple[Position, int, bool], _Closest] = {}
 
-    def of(self, monitors: MonitorSet, reader: Reader, bag: Path, topics: Sequence[str]) -> int:
+    def cover(self, pieces: Sequence[Piece], span: Span) -> None:
+        """Say what of this time the pieces do not have."""
+        for gap in gaps(pieces, span):
+            if self._as_json:
+                say_json({"kind": "gap", "since": gap.since / BILLION, "until": gap.until / BILLION})
+            else:
+                say(f"not recorded: {gap}", "yellow")
+        for piece in pieces:
+            if piece.why_not and self._as_json:
+                say_json({"kind": "incomplete", "bag": piece.name, "text": piece.why_not})
+            elif piece.why_not:
+                say(f"{piece.name} is not complete: {piece.why_not}", "yellow")
+
+    def of(self, monitors: MonitorSet, reader: Reader, piece: Piece, topics: Sequence[str]) -> int:
         """A recording; how many messages there were."""
         given = 0
         with progress("replaying", lambda: reader.message_count, shares_screen=True) as told:
-            for number, replayed in enumerate(replay(monitors, reader, None, topics)):
+            for number, replayed in enumerate(replay(monitors, reader, None, topics, piece.span)):
                 given += replayed.topic is not None
                 for found in _found(replayed.outcome):
-                    self._say(bag, replayed, found)
+                    self._say(piece.name, replayed, found)
                 for margin in monitors.take_margins():
                     known = self._closest.get(key := (margin.position, margin.number, not margin.holds))
                     if known is None or margin.distance < known.margin.distance:
-                        self._closest[key] = _Closest(margin, bag, replayed.outcome.time, replayed.index)
+                        self._closest[key] = _Closest(
+                            margin, piece.name, replayed.outcome.time, replayed.index
+                        )
                 if not number % _TOLD_EVERY:
                     told(given)
         return given
@@ -169,7 +227,7 @@ class _Report:
                     "kind": "margin", "monitor": margin.monitor, "file": position.file,
                     "line": position.line, "column": position.column, "holds": margin.holds,
                     "distance": margin.distance, "left": margin.left, "right": margin.right,
-                    "threshold_at": margin.threshold_at, "bag": str(bag), "time": time / BILLION, "index": number,
+                    "threshold_at": margin.threshold_at, "bag": bag, "time": time / BILLION, "index": number,
                 })  # fmt: skip
             else:
                 place = "" if number is None else f" #{number}"
@@ -179,12 +237,12 @@ class _Report:
                 sides = f"{margin.left:.6g} against {margin.right:.6g}"
                 say(f"{position}: {line}: {word} by {margin.distance:.6g} at the closest, {sides} ({where})")
 
-    def _say(self, bag: Path, replayed: Replayed, found: _Found) -> None:
+    def _say(self, bag: str, replayed: Replayed, found: _Found) -> None:
         where, outcome = replayed.topic or replayed.outcome.timer or "", replayed.outcome
         self._counts[found.monitor, where, found.kind] += 1
         if self._as_json:
             say_json({
-                "bag": str(bag), "monitor": found.monitor, "kind": found.kind, "topic": replayed.topic,
+                "bag": bag, "monitor": found.monitor, "kind": found.kind, "topic": replayed.topic,
                 "index": replayed.index, "timer": outcome.timer, "time": outcome.time / BILLION,
                 "text": found.text,
             })  # fmt: skip
