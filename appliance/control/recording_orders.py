@@ -150,10 +150,11 @@ class RecordingOrders:
         since, until = request.since or 0, now if request.until is None else request.until
         record = self._trail.happened(
             "recording ordered",
-            f"of what is in memory, by {who}",
+            f"of what is in memory, not to be kept, by {who}",
             severity=Severity.NOTICE,
             who=who,
-            kept=False,
+            before=min(self._rules.before, max(0, now - since) / 1e9),
+            after=0.0,
         )
         trigger = Trigger(now, "order", record, f"{who}: of what is in memory")
         answer = await self._ask(lambda number: messages.MemoryWanted(number, trigger, since, until))

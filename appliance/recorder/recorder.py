@@ -144,7 +144,7 @@ class Recorder:
         now = self._clock()
         since = max(self._memory, wanted.since, now - int(self._rules.before * _SECOND))
         until = min(wanted.until, now)
-        if since >= until:
+        if since > until:
             reason = f"the memory has the last {self._rules.before:g} seconds, and nothing of that time"
             self._answers.append(messages.RecordingRefused(wanted.number, reason, unknown=True))
             return

@@ -20,7 +20,6 @@ from appliance.ros.errors import DefinitionError
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
 
-
 _OWN = "/rosrv"  # the appliance: what monitors publish is not given to monitors
 
 

@@ -5,6 +5,7 @@ import socket
 from collections.abc import Awaitable, Callable
 from typing import Any, cast
 
+import msgspec
 import pytest
 
 from appliance.audit_trail import AuditTrail
@@ -179,5 +180,34 @@ def test_who_waits_for_a_recorder_that_dies_is_told() -> None:
         recorder.close()
         with pytest.raises(RecorderAwayError, match="before it answered"):
             await asyncio.wait_for(asked, 5)
+
+    played(story)
+
+
+def test_what_is_in_memory_can_be_fetched_and_is_not_listed() -> None:
+    """Who asked and who fetched is on record; the next one takes its place."""
+    lent = iter([msgspec.structs.replace(KEPT, id=letter * 20) for letter in "cd"])
+
+    def answer(message: Any) -> list[messages.Message]:
+        if not isinstance(message, messages.MemoryWanted):
+            return []
+        assert (message.since, message.until > 0, message.trigger.record) == (7, True, "record")
+        return [messages.MemoryLent(message.number, next(lent))]
+
+    async def story() -> None:
+        scene = Scene()
+        recorder = scene.attach(answer)
+        first = await scene.orders.of_memory(admin.RecordingOfMemory(since=7), "eve")
+        assert await scene.orders.fetch(admin.RecordingFetch(first.id), "eve") == first
+        assert [(event, detail["who"]) for event, detail in scene.trail.events] == [
+            ("recording ordered", "eve"),
+            ("recording fetched", "eve"),
+        ]
+        known = await scene.orders.recordings(admin.RecordingsWanted())
+        assert (known.recordings, known.topics, known.before) == ([], ["/*"], 60)
+        await scene.orders.of_memory(admin.RecordingOfMemory(since=7), "eve")
+        with pytest.raises(UnknownThingError):
+            await scene.orders.fetch(admin.RecordingFetch(first.id), "eve")
+        recorder.close()
 
     played(story)

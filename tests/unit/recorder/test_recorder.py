@@ -133,6 +133,42 @@ def test_before_and_after(scene: Scene) -> None:
     assert {path.name for path in kept.iterdir()} == {"recording.bag", "recording.json"}
 
 
+def test_what_is_in_memory_is_lent_and_not_kept(scene: Scene) -> None:
+    """Of the time that was asked for, as far as it goes back; until the next, for ten minutes, or another recorder."""
+    trigger = Trigger(BEGAN, "order", "r", "eve: of what is in memory")
+
+    def lent(since: int, until: int) -> Recording:
+        asked = messages.MemoryWanted(1, msgspec.structs.replace(trigger, time=scene.clock.now), since, until)
+        [answer] = scene.later(0, asked)
+        assert isinstance(answer, messages.MemoryLent), answer
+        return answer.recording
+
+    def there() -> set[str]:
+        return {path.name for path in scene.folder.iterdir()}
+
+    scene.later(20)
+    scene.say(TEXT.replace(b"hello", b"alarm"))
+    scene.later(1)
+    scene.say()
+    first = lent(0, scene.clock.now)
+    assert (first.began, first.ended) == (BEGAN + 11 * SECOND, BEGAN + 21 * SECOND)  # `before` seconds
+    assert [data for _topic, _time, data in scene.bag(first)] == [TEXT.replace(b"hello", b"alarm"), TEXT]
+    second = lent(BEGAN + 21 * SECOND, scene.clock.now + SECOND)
+    assert (second.ended, len(scene.bag(second))) == (scene.clock.now, 1)
+    assert there() == {second.id}
+    [refused] = scene.later(0, messages.MemoryWanted(2, trigger, 0, BEGAN + 5 * SECOND))
+    assert isinstance(refused, messages.RecordingRefused)
+    assert (refused.unknown, "the last 10 seconds" in refused.reason) == (True, True)
+    [stated, *_rest] = scene.later(0, messages.RecordingsAsked())
+    assert stated == messages.RecordingsStated([])
+    scene.later(601)
+    assert there() == set()
+    scene.say()
+    lent(0, scene.clock.now)
+    scene.begin_anew()
+    assert there() == set()
+
+
 def test_triggers_that_overlap_make_one_recording(scene: Scene) -> None:
     """Up to its longest; what happens later begins another."""
     scene.happen()

@@ -1,0 +1,115 @@
+"""What the flight recorder of the running appliance has of a span of time: its recordings, and its memory."""
+
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import NamedTuple
+
+import typer
+
+from appliance.audit.moment import parse_moment
+from appliance.audit.output import rfc3339
+from appliance.channel import admin
+from appliance.channel.answers.recordings import Recording, Recordings
+from appliance.cli.monitor.input import usage_error
+from appliance.cli.record import bag_of
+from appliance.cli.running import Appliance
+
+_SECOND = 1_000_000_000
+
+
+class Span(NamedTuple):
+    """From a moment to another, both belong to it: nanoseconds since the epoch."""
+
+    since: int
+    until: int
+
+    def __str__(self) -> str:
+        seconds = (self.until - self.since) / _SECOND
+        return f"{rfc3339(self.since)} to {rfc3339(self.until)} ({seconds:.1f} s)"
+
+
+EVER = Span(0, 1 << 63)
+
+
+class Piece(NamedTuple):
+    """A bag of the recorder: how it is called, and of which time it is read (no piece before has that)."""
+
+    name: str
+    bag: Path
+    span: Span
+    why_not: str
+    """What is missing in it; empty when nothing is."""
+
+
+def span_of(since: str | None, until: str | None) -> Span:
+    """The time that was asked for. Ends the program with 2 when it is none."""
+    now = time.time_ns()
+    try:
+        span = Span(
+            0 if since is None else parse_moment(since, now),
+            now if until is None else min(now, parse_moment(until, now)),
+        )
+    except ValueError as error:
+        raise usage_error(str(error)) from None
+    if span.since >= span.until:
+        raise usage_error("--since is not before --until")
+    return span
+
+
+def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
+    """End the program with 2 when one of these topics (name to type) is never recorded."""
+    for topic, kind in topics.items():
+        if not any(fnmatchcase(topic, glob) for glob in known.topics):
+            raise usage_error(f"{topic} is not recorded: recorder.topics has {', '.join(known.topics)}")
+        out = next((glob for glob in known.never for name in (topic, kind) if fnmatchcase(name, glob)), None)
+        if out is not None:
+            raise usage_error(f"{topic} ({kind}) is not recorded: recorder.never has {out}")
+
+
+@contextmanager
+def pieces_of(appliance: Appliance, known: Recordings, span: Span, *, as_json: bool) -> Iterator[list[Piece]]:
+    """The recordings of this time and what is in memory, the oldest first; each is fetched, which is on record.
+
+    Ends the program with 1 when there is nothing, or when the appliance refuses.
+    """
+    found = [row for row in known.recordings if row.began <= span.until and row.ended >= span.since]
+    last = max((row.ended for row in found), default=0)
+    if span.until > max(last, time.time_ns() - int(known.before * _SECOND)):
+        order = admin.RecordingOfMemory(max(span.since, last + 1), span.until)
+        found.append(appliance.ask_or_exit(order, as_json=as_json))
+    pieces: list[Piece] = []
+    with tempfile.TemporaryDirectory(prefix="rosrv-replay-") as folder:
+        for recording in sorted(found, key=lambda row: row.began):
+            since = max(recording.began, span.since, pieces[-1].span.until + 1 if pieces else 0)
+            until = min(recording.ended, span.until)
+            if since <= until:
+                name = recording.id if recording in known.recordings else "memory"
+                bag = bag_of(appliance, recording.id, Path(folder) / recording.id, as_json=as_json)
+                pieces.append(Piece(name, bag, Span(since, until), recording.why_not))
+        if not pieces:
+            text = f"nothing is recorded of {span}: {_there(known.recordings)}"
+            typer.echo(f"rosrv monitor: {text}; the memory has the last {known.before:g} s", err=True)
+            raise typer.Exit(1)
+        yield pieces
+
+
+def gaps(pieces: Sequence[Piece], span: Span) -> Iterator[Span]:
+    """The times of the span that no piece has. Of all that there is (`span.since` is 0) none is before the first."""
+    at = span.since or pieces[0].span.since
+    for piece in pieces:
+        if piece.span.since > at + 1:
+            yield Span(at, piece.span.since)
+        at = piece.span.until
+    if span.until > at + 1:
+        yield Span(at, span.until)
+
+
+def _there(recordings: Sequence[Recording]) -> str:
+    if not recordings:
+        return "no recording is kept"
+    first, last = min(row.began for row in recordings), max(row.ended for row in recordings)
+    return f"the recordings that are kept are of {rfc3339(first)} to {rfc3339(last)}"
