@@ -1,5 +1,7 @@
 """The tree of parameters as ROSMaster has it: what stands at a key, and in the way of one."""
 
+from collections.abc import Iterator
+
 from appliance.ros.xmlrpc import Value
 
 Tree = dict[str, Value]
@@ -30,3 +32,16 @@ def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
             return None, None
         passed += f"/{part}"
     return node, None
+
+
+def names_in(tree: Tree, above: str = "/") -> Iterator[str]:
+    """The names of all values in a tree that stands at `above`, as ROSMaster tells them; a namespace is none.
+
+    A key of a dictionary may begin with `/` or `~`: ROSMaster tells it as it is.
+    """
+    for key, value in tree.items():
+        name = key if key.startswith(("/", "~")) else above + key
+        if isinstance(value, dict):
+            yield from names_in(value, name if name == "~" or name.endswith("/") else f"{name}/")
+        else:
+            yield name

@@ -25,7 +25,7 @@ from appliance.master.upkeep.enactor import Enactor
 from appliance.policy.model import Address, Decision
 from appliance.ros.errors import EncodingError, ProtocolError
 from appliance.ros.names import resolve_parameter
-from appliance.ros.parameter_tree import standing_at
+from appliance.ros.parameter_tree import names_in, standing_at
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import weigh
 from appliance.rpc.client import CallFailedError
@@ -82,7 +82,10 @@ class ParameterCalls:
 
     async def get_param_names(self, caller: Caller) -> Answer:
         """`getParamNames(caller_id)`: those that the host may read."""
-        answer = await self.rosmaster.call("getParamNames", caller.caller_id)
+        if self.rosmaster.reachable and self.mirror.weight < self.large:
+            answer: Answer = [1, "Parameter names", list(names_in(self.mirror.tree))]
+        else:
+            answer = await self.rosmaster.call("getParamNames", caller.caller_id)
         if answer[0] == 1 and isinstance(answer[2], list) and not caller.own:
             answer[2] = [name for name in answer[2] if self.rights.to_find(caller, str(name)).allowed]
         return answer
