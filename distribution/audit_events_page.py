@@ -47,12 +47,14 @@ ELSEWHERE: dict[str, tuple[str, ...]] = {
     "denials folded": _FOLDED,
     "repetitions folded": _FOLDED,
     **dict.fromkeys(
-        ("monitor verdict", "message dropped", "monitor fault", "monitor log"),
+        ("monitor fault", "monitor log"),
         _MONITOR,
     ),
+    "monitor verdict": (*_MONITOR, "at", "conditions", "why"),
+    "message dropped": (*_MONITOR, "at", "conditions"),
     "monitor published": (*_MONITOR, "because_of"),
-    "message changed": (*_MONITOR, "changed_by"),
-    "trial observed": (*_MONITOR, "changed_by", "trial", "would"),
+    "message changed": (*_MONITOR, "changed_by", "at", "conditions"),
+    "trial observed": (*_MONITOR, "changed_by", "trial", "would", "at", "conditions", "why"),
 }  # fmt: skip
 
 _HEAD = """\

@@ -44,9 +44,11 @@ EVENTS: dict[str, str] = {
     " publish, or `missed`: what it was not given.",
     "monitor resumed": "The topics that a monitor held after a restart go on; `detail` has who.",
     "monitors restarted": "A new relay process: monitors began in their initial state, some hold their topics.",
-    "monitor verdict": "A property of a monitor is in a category that is handled; `detail` has logic and category, and"
-    " of a parametric specification the `binding`.",
-    "message dropped": "A monitor dropped a message; the first of a second in full, the rest as `detail.count`.",
+    "monitor verdict": "A property of a monitor is in a category that is handled; `detail` has logic and category, of a"
+    " parametric specification the `binding`, `at` its place, `why` which events alone give the verdict,"
+    " and `conditions` what they compared.",
+    "message dropped": "A monitor dropped a message; the first of a second in full, the rest as `detail.count`. `at` is"
+    " where the statement stands that did, `conditions` has what led there: each with the values that it compared.",
     "message changed": "Monitors changed a message; `detail` has the bytes before and after, `changed_by` the events"
     " that did, in order, `monitor` whose the last is. A `count` has `changed_by` if it was more than one monitor.",
     "monitor fault": "An action of a monitor could not go on; `detail` has file, line and values.",

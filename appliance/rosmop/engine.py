@@ -47,9 +47,11 @@ from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.parser import parse
 from appliance.rosmop.walking import Walker, Walks, walks_of
+from appliance.rosmop.why import NOBODY, Bound, Sender, of_slice
 
 OnFault = Literal["drop", "pass"]
 Patience = Callable[[], Callable[[], bool]]
+Asked = Callable[[str, int, str, int], bool]
 
 TRIAL_BUDGET = 100_000
 """Instructions that a specification on trial may spend on one message: what waits meanwhile waits some milliseconds."""
@@ -83,11 +85,11 @@ class Tapped(NamedTuple):
     data: bytes
     time: int
 
-    def give(self) -> Outcome:
+    def give(self, sender: Sender = NOBODY) -> Outcome:
         """What they would have done with it."""
         if self.part is None:
-            return self.trial.process(self.resource, self.data, self.time)
-        return self.trial.process_service(self.resource, self.part, self.data, self.time)
+            return self.trial.process(self.resource, self.data, self.time, sender)
+        return self.trial.process_service(self.resource, self.part, self.data, self.time, sender)
 
 
 class Margin(NamedTuple):
@@ -149,6 +151,9 @@ class MonitorSet:
         self._requests: dict[tuple[str, str], tuple[Step, ...]] = {}
         self._due: int | None = None
         self.began: tuple[str, ...] = ()
+        self._asked: Asked | None = None
+        self._sender = NOBODY
+        self._bound: Bound | None = None
         self._timed = False
         self._walks = Walks()
         self._broken = False
@@ -279,9 +284,7 @@ class MonitorSet:
 
     def stamped(self, topic: str) -> bool:
         """Whether the messages of a topic begin with a `std_msgs/Header`, as their type is known here."""
-        name = self.type_of(topic, tried=True)
-        fields = self.definitions.message(name).fields if name is not None else ()
-        return bool(fields) and fields[0].notation == "std_msgs/Header"
+        return self._compiled.is_stamped(self.type_of(topic, tried=True))
 
     def service_type_of(self, service: str, *, tried: bool = False) -> str | None:
         """The type of a service with an enabled event; None of another, or (unless `tried`) where it is on trial."""
@@ -294,6 +297,12 @@ class MonitorSet:
     def write_module(self) -> None:
         """Write the module that `walker` offers the walks of."""
         self._walks = walks_of(self._compiled, self._monitors)
+
+    def explain_when(self, asked: Asked, tried: Asked) -> None:
+        """Explain only verdicts that are asked for, by monitor, property, category and source; and those on trial."""
+        self._asked = asked
+        for trial in self.trials:
+            trial.explain_when(tried, tried)
 
     @property
     def area(self) -> memoryview | None:
@@ -453,7 +462,7 @@ class MonitorSet:
                     timer.due = time_ns + timer.period
                 for running in monitor.properties:
                     if running.code.property.timed:
-                        running.run = running.code.property.start(time_ns)
+                        running.begin(time_ns)
         if changed:
             self._index()
             self._schedule()
@@ -465,23 +474,26 @@ class MonitorSet:
 
     # What happens
 
-    def process(self, topic: str, buffer: Buffer, time_ns: int) -> Outcome:
+    def process(self, topic: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY) -> Outcome:
         """What is to be done with a message: the bytes of its fields, received at this time on this topic."""
-        return self._process(self._steps.get(topic, ()), buffer, time_ns)
+        return self._process(self._steps.get(topic, ()), buffer, time_ns, sender)
 
-    def judge(self, topic: str, buffer: Buffer, time_ns: int) -> Outcome:
+    def judge(self, topic: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY) -> Outcome:
         """What `process` says, by the walk where that takes the message: as in the relay."""
         walker = self.walker(topic)
-        events = walker.take(buffer, time_ns) if walker is not None and self.walks(walker, time_ns) else None
+        walks = walker is not None and self.walks(walker, time_ns)
+        events = walker.take(buffer, time_ns, sender.source) if walker is not None and walks else None
         if events is None:
-            return self.process(topic, buffer, time_ns)
+            return self.process(topic, buffer, time_ns, sender)
         outcome = Outcome(buffer, time_ns)
         outcome.events = events
         return outcome
 
-    def process_service(self, service: str, part: str, buffer: Buffer, time_ns: int) -> Outcome:
+    def process_service(
+        self, service: str, part: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY
+    ) -> Outcome:
         """The same for the `request` or `response` (the `part`) of a service."""
-        return self._process(self._requests.get((service, part), ()), buffer, time_ns)
+        return self._process(self._requests.get((service, part), ()), buffer, time_ns, sender)
 
     @property
     def next_due(self) -> int | None:
@@ -490,6 +502,7 @@ class MonitorSet:
 
     def advance(self, time_ns: int) -> list[Outcome]:
         """Let the ticks up to this time and the deadlines before it happen, in the order of their times."""
+        self._sender = NOBODY
         outcomes: list[Outcome] = []
         ticks: dict[int, int] = {}
         over = self._patience()
@@ -513,7 +526,7 @@ class MonitorSet:
 
     # One message
 
-    def _process(self, steps: tuple[Step, ...], buffer: Buffer, time_ns: int) -> Outcome:
+    def _process(self, steps: tuple[Step, ...], buffer: Buffer, time_ns: int, sender: Sender) -> Outcome:
         outcome = Outcome(buffer, time_ns)
         if self._due is not None and self._due <= time_ns:
             outcome.before = self.advance(time_ns)
@@ -521,8 +534,9 @@ class MonitorSet:
             return outcome
         _come_home(steps[0].monitor)
         self._turn.now = time_ns
+        self._sender = sender
         message = Message(buffer, time_ns)
-        writers: tuple[str, ...] = ()
+        writers: tuple[Step, ...] = ()
         for step in steps:
             if step.first:
                 monitor = step.monitor
@@ -535,7 +549,7 @@ class MonitorSet:
                 break
             if message.touched:
                 message.touched = False
-                writers = (*writers, step.name)
+                writers = (*writers, step)
         self._finish(message, writers, outcome)
         return outcome
 
@@ -577,7 +591,9 @@ class MonitorSet:
 
         key = (True,) if found is True else tuple(found)
         slices = step.monitor.slices
+        self._bound = Bound(step.index, step.event.binds, key, message.time, self._sender)
         if slices is not None and slices.step(step.index, key):
+            step.monitor.trail.append(self._bound)
             outcome.events = (*outcome.events, step.name)
             return False
 
@@ -671,17 +687,22 @@ class MonitorSet:
         outcome.faults = (*outcome.faults, Fault(monitor.name, step.event.position, text, binding))
         self._block(message, outcome)
 
-    def _finish(self, message: Message, writers: tuple[str, ...], outcome: Outcome) -> None:
+    def _finish(self, message: Message, writers: tuple[Step, ...], outcome: Outcome) -> None:
         turn = self._turn
         if turn.log or turn.published:
             self._collect(outcome)
+        if message.looked:
+            outcome.looked, outcome.sites = message.looked, self._compiled.module.sites
         if message.dropped:
             outcome.result = "dropped"
             outcome.overwritten = message.overwritten
+            if message.cause is not None and outcome.fatal is None:
+                outcome.cause, outcome.sites = message.cause, self._compiled.module.sites
         elif message.changed:
             outcome.result = "changed"
             outcome.buffer = message.buffer
-            outcome.changed_by = writers
+            outcome.changed_by = tuple([step.name for step in writers])
+            outcome.changed_at = tuple([step.event.position for step in writers])
         if self._timed:
             self._schedule()
 
@@ -702,9 +723,19 @@ class MonitorSet:
         return False
 
     def _step_properties(self, step: Step, message: Message | None, time_ns: int, outcome: Outcome) -> None:
+        trail = step.monitor.trail
+        if (
+            self._bound is not None
+            and step.monitor.slices is not None
+            and (not trail or trail[-1] is not self._bound)
+        ):
+            trail.append(self._bound)
         for running in step.monitor.properties:
             try:
-                categories = running.run.step(step.index, time_ns)
+                if step.monitor.slices is None:
+                    categories = running.history.step(running.run, step.index, time_ns, self._sender)
+                else:
+                    categories = running.run.step(step.index, time_ns)
             except RunFaultError as error:
                 self._fault(error, step.monitor, running.code.property.source.origin, outcome)
                 self._block(message, outcome)
@@ -728,13 +759,21 @@ class MonitorSet:
             handlers.sort(key=lambda pair: categories.index(pair[0]))
         self._turn.reset = False
         for category, handler in handlers:
-            logic = running.code.property.logic
-            binding = monitor.slices.binding(monitor.slice) if monitor.slices and monitor.slice else {}
-            verdict = Verdict(monitor.name, running.index, logic, category, binding)
-            outcome.verdicts = (*outcome.verdicts, verdict)
+            outcome.verdicts = (*outcome.verdicts, self._verdict(monitor, running, category))
             self._handle(monitor, handler, message, running, outcome)
         if self._turn.reset:
-            running.run = running.code.property.start(self._turn.now)
+            running.begin(self._turn.now)
+
+    def _verdict(self, monitor: Monitor, running: RunningProperty, category: str) -> Verdict:
+        source, index = running.code.property.source, running.index
+        asked = self._asked is None or self._asked(monitor.name, index, category, self._sender.source)
+        slices, one, why = monitor.slices, monitor.slice, None
+        if slices is None or one is None:
+            why = running.history.explain(category) if asked else None
+            return Verdict(monitor.name, index, source.logic, category, source, why)
+        if asked:
+            why = of_slice(running.code.property, monitor.trail, slices.values(one), category)
+        return Verdict(monitor.name, index, source.logic, category, source, why, slices.binding(one))
 
     def _handle(
         self,
@@ -804,6 +843,7 @@ class MonitorSet:
         if step.monitor.slices is None:
             act(outcome, None)
         else:
+            self._bound = Bound(step.index, (), (True,), due, NOBODY)
             self._each(step, (True,), None, outcome, act)
             outcome.events = (step.name,)
         ticks[id(timer)] = ticks.get(id(timer), 0) + 1
@@ -837,7 +877,7 @@ class MonitorSet:
         outcome.timer = f"{monitor.name}.{word}"
         self._turn.now = deadline
         monitor.context.begin()
-        categories = running.run.expire()
+        categories = running.history.expire(running.run)
         self._tell(monitor, running, categories, None, outcome, in_order_told=True)
         self._collect(outcome)
         return outcome
@@ -879,7 +919,7 @@ class MonitorSet:
         for monitor in monitors:
             monitor.context.begin()
             for running in monitor.properties:
-                running.run = running.code.property.start(time_ns)
+                running.begin(time_ns)
         self._begin_variables(monitors, outcome)
         for monitor in monitors:
             if monitor.slices is not None:
@@ -901,8 +941,10 @@ class MonitorSet:
             self._compiled.namespace[code] = compiled.namespace[before.code.variables[name]]
         for running, old in zip(monitor.properties, before.properties, strict=True):
             running.run = old.run
+            running.history = running.history.follow(old.history)
         if monitor.slices is not None and before.slices is not None:
             monitor.slices.take_over(before.slices)
+            monitor.trail = before.trail
         for step, old_step in zip(monitor.steps, before.steps, strict=True):
             step.past, step.told = old_step.past, old_step.told
         for timer, ticking in zip(monitor.timers, before.timers, strict=True):

@@ -23,7 +23,7 @@ def explain(error: Exception, module: Module, monitor: str, otherwise: Position)
             number = module.site_of_line(line)
     site = module.sites[number] if number >= 0 else Site(otherwise)
     values = {}
-    for name, code, show in site.variables:
+    for name, code, show, _ in site.variables:
         value = variables.get(code, module.namespace.get(code, _MISSING))
         if value is not _MISSING:
             values[name] = show(value)

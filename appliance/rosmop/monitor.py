@@ -1,16 +1,19 @@
 """A running specification: its events as functions, the runs of its properties, its timers."""
 
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 from appliance.rosmop.compile.events import EventCode
 from appliance.rosmop.compile.specification import Compiled, PropertyCode, SpecificationCode
-from appliance.rosmop.logics.interface import Run
+from appliance.rosmop.logics.interface import FiniteProperty, Run
 from appliance.rosmop.runtime.context import Context
 from appliance.rosmop.runtime.wire import Message
 from appliance.rosmop.slices import Slice, Slices
 from appliance.rosmop.syntax import tree
+from appliance.rosmop.why import TRAIL, Bound, Exits, Steps, history_of
 
 FAILING_AFTER = 10
 """Faults after which a monitor is shown as failing."""
@@ -28,12 +31,21 @@ Handler = Callable[[Message | None], None]
 
 @dataclass(eq=False, slots=True)
 class RunningProperty:
-    """A property of a running specification: the monitor of its formula, and its handlers in source order."""
+    """A property of a running specification: the monitor of its formula, what is kept of it to explain a verdict, and
+    its handlers in source order.
+    """
 
     index: int
     code: PropertyCode
     handlers: tuple[tuple[str, Handler], ...]
     run: Run
+    history: Exits | Steps
+
+    def begin(self, time_ns: int) -> None:
+        """Begin anew."""
+        self.run = self.code.property.start(time_ns)
+        if not (isinstance(self.history, Exits) and isinstance(self.code.property, FiniteProperty)):
+            self.history = history_of(self.code.property, time_ns)
 
 
 @dataclass(eq=False, slots=True)
@@ -89,6 +101,8 @@ class Monitor:
     """Of a parametric specification: its states. `properties` have the runs of the one that was looked at last."""
     slice: Slice | None = None
     """That one."""
+    trail: deque[Bound] = field(default_factory=partial(deque, maxlen=TRAIL))
+    """Of a parametric specification: what happened last in all slices."""
 
     @property
     def name(self) -> str:
@@ -121,6 +135,7 @@ def _monitor(
             each,
             tuple((category, names[each.handlers[category]]) for category in each.order),
             each.property.start(time_ns),
+            history_of(each.property, time_ns),
         )
         for index, each in enumerate(code.properties)
     )

@@ -2,18 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from types import MappingProxyType
+from typing import Any, Literal
 
+from appliance.rosmop.compile.module import Site
+from appliance.rosmop.logics.interface import Source
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.context import LogLine, Published
 from appliance.rosmop.runtime.wire import Buffer
+from appliance.rosmop.why import Explanation
 
 Result = Literal["passed", "changed", "dropped"]
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A property is in a category that has a handler. `property` counts from 0 in its specification.
+    """A property is in a category that has a handler. `property` counts from 0 in its specification; `source` is its
+    formula. `why` is None where nobody has asked (`MonitorSet.explain_when`), or it cannot be said.
 
     `binding` has the values of the parameters of a parametric specification, by name.
     """
@@ -22,6 +27,8 @@ class Verdict:
     property: int
     logic: str
     category: str
+    source: Source
+    why: Explanation | None = None
     binding: Mapping[str, object] = field(default_factory=dict)
 
 
@@ -52,9 +59,14 @@ class Outcome:
     its sets on trial.
 
     `changed_by` are the events whose actions made its bytes others than they found them, in order; empty unless the
-    result is `changed`. An event that happened without a change, or assigned what was there, is not among them.
+    result is `changed`, and stand at `changed_at`. An event that happened without a change, or assigned what was there,
+    is not among them.
     `dropped_by` is the specification that dropped it: by its last event, by `fatal` (a fault that dropped it), or for
     `reason` (it is held, or could not begin).
+
+    `looked` are the conditions that were met on the way, by their sites, with the values that they compared: each
+    `when` of an event that happened, each `if` around a statement that dropped the message. `cause` is the site of that
+    statement, or None.
 
     `overwritten` is, of a dropped message, what stood in the buffer that came in where actions have written into it
     (place and bytes, in order): `restore` puts it back.
@@ -73,8 +85,12 @@ class Outcome:
     tried: Sequence["Outcome"] = ()
     reason: str | None = None
     changed_by: Sequence[str] = ()
+    changed_at: Sequence[Position] = ()
     dropped_by: str = ""
     fatal: Fault | None = None
+    looked: Mapping[int, tuple[Any, ...]] = MappingProxyType({})
+    cause: int | None = None
+    sites: Sequence[Site] = ()
     overwritten: Sequence[tuple[int, bytes]] = ()
 
     def __init__(self, buffer: Buffer = b"", time: int = 0) -> None:
@@ -86,6 +102,21 @@ class Outcome:
         if not buffer.readonly:
             for start, old in reversed(self.overwritten):
                 buffer[start : start + len(old)] = old
+
+    @property
+    def conditions(self) -> dict[str, dict[str, object]]:
+        """Where the conditions stand that were met, and the values that they compared."""
+        return {
+            str(site.position): {
+                name: show(value) for (name, _, show, _), value in zip(site.compared, values, strict=True)
+            }
+            for site, values in ((self.sites[number], values) for number, values in self.looked.items())
+        }
+
+    @property
+    def statement(self) -> Position | None:
+        """Where the statement stands that dropped the message."""
+        return None if self.cause is None else self.sites[self.cause].position
 
     def __repr__(self) -> str:
         told = {name: value for name, value in vars(self).items() if name != "buffer"}

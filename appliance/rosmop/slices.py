@@ -265,6 +265,10 @@ class Slices:
             self._forget(one.domain, one.key)
             self.live -= 1
 
+    def values(self, one: Slice) -> Mapping[int, Any]:
+        """The values of the parameters, by their numbers."""
+        return dict(zip(_members(one.domain), one.key[1:], strict=True))
+
     def binding(self, one: Slice) -> Mapping[str, object]:
         """The values of the parameters, as they are told."""
         return self._shown(one.domain, one.key)

@@ -27,6 +27,7 @@ from appliance.rosmop.runtime.context import Context
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
+from appliance.rosmop.why import Exits
 
 FUEL = 50_000_000
 """Instructions of one call: some hundredths of a second."""
@@ -59,11 +60,11 @@ class Walked(NamedTuple):
 
 class Prepared(NamedTuple):
     """What holds for all walks of a topic until the engine, or somebody else, has done something: bits of `told` (and
-    whether no message may be changed) and of `enabled`, as the module takes them.
+    whether no message may be changed) and of `enabled`, as the module takes them; and who sends the messages.
     """
 
-    told: int
-    enabled: int
+    bits: tuple[int, int]
+    source: int
 
 
 class Home:
@@ -88,8 +89,11 @@ class Home:
         self._cells = struct.Struct(
             "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in cells.variables.values())
         )
+        self._source = cells.source
         self.inside = False
         """It is in the module's memory."""
+        self.prepared: Prepared | None = None
+        """For whom the module was prepared last."""
 
     def enter(self) -> None:
         """Take the state into the module."""
@@ -99,6 +103,11 @@ class Home:
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
         self.inside = True
+
+    def prepare(self, prepared: Prepared) -> None:
+        """Say who sends what comes now."""
+        self.prepared = prepared
+        _TIME.pack_into(self._memory, self._source, prepared.source << 32)
 
     def leave(self) -> None:
         """Give it back to Python."""
@@ -169,13 +178,13 @@ class Walker:
                 return False
         return True
 
-    def prepare(self, *, loud: bool, told: Sequence[bool]) -> Prepared:
+    def prepare(self, *, loud: bool, told: Sequence[bool], source: int = 0) -> Prepared:
         """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none.
         Good until the engine is asked for anything.
         """
         bits = sum(1 << number for number, one in enumerate(told) if one) - (LOUD if loud else 0)
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
-        return Prepared(bits, enabled)
+        return Prepared((bits, enabled), source)
 
     def walk(  # noqa: PLR0917  called for every batch: keywords would cost a tenth of it
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
@@ -189,12 +198,16 @@ class Walker:
             return self._walk_elsewhere(view, position, run, pieces, time_ns, prepared)
         if not self._home.inside:
             self._home.enter()
+        if self._home.prepared is not prepared:
+            self._home.prepare(prepared)
         frames, end, begun = self._frames, len(view), run
         changed: list[tuple[int, int]] = []
         while position < end:
             try:
                 answer = (
-                    self._call(self._name, frames + position, frames + end, time_ns, *prepared, fuel=FUEL)
+                    self._call(
+                        self._name, frames + position, frames + end, time_ns, *prepared.bits, fuel=FUEL
+                    )
                     or 0
                 )
             except MachineTrap:
@@ -211,7 +224,7 @@ class Walker:
                     break
         return Walked(position, run, self._dropped() if run != begun else (), changed)
 
-    def take(self, message: Buffer, time_ns: int) -> Sequence[str] | None:
+    def take(self, message: Buffer, time_ns: int, source: int = 0) -> Sequence[str] | None:
         """Take a message of which nothing is to be told but which events happened: they. None if it is left.
 
         Only as `walk`, and where nobody asks what has `happened`.
@@ -222,7 +235,7 @@ class Walker:
         frame = self._memory[self._frames : end]
         _LENGTH.pack_into(frame, 0, len(message))
         frame[4:] = message
-        prepared = self.prepare(loud=True, told=[True] * len(self.events))
+        prepared = self.prepare(loud=True, told=[True] * len(self.events), source=source)
         if not self.walk(frame, 0, 0, [], time_ns, prepared).position:
             return None
         return tuple(name for (name,), count in zip(self.events, self.happened(), strict=True) if count)
@@ -295,13 +308,17 @@ def walks_of(compiled: Compiled, monitors: Sequence[Monitor]) -> Walks:
     """The walkers of all topics that can have one; their monitors are told where their state is."""
     found = list(groups(compiled.specifications))
     components = [group.component for group in found]
-    module = module_of(compiled.functions, components, Values(compiled.messages))
+    module = module_of(compiled.functions, components, Values(compiled.messages), compiled.stamped)
     if not module.feeds:
         return Walks()
     machine = Machine(module.code, module.memory)
     walks = {}
     for group, cells in zip(found, module.cells, strict=True):
         running = [monitors[number].properties[index] for number, index in group.properties]
+        for number, address in cells.exits.items():
+            kept = running[number].history
+            assert isinstance(kept, Exits)  # noqa: S101  it has tables
+            kept.move(machine, machine.memory[address:])
         contexts = {compiled.specifications[number].context for number in group.specifications}
         throttles = [
             (compiled.namespace[context], site, address)

@@ -17,7 +17,7 @@ from appliance.relay.connections.frames import Batch
 from appliance.relay.counts import Counts
 from appliance.relay.monitors.observations import SHOWN
 from appliance.relay.monitors.passage import Passage
-from appliance.relay.monitors.places import HEAD, Place, Sighting
+from appliance.relay.monitors.places import HEAD, Place, Senders, Sighting
 from appliance.relay.monitors.telling import Telling
 from appliance.relay.monitors.trials import Trials
 from appliance.rosmop.engine import MonitorSet
@@ -58,6 +58,9 @@ class Monitors(Protocol):
     trials: Trials
     """Those that are given copies."""
 
+    senders: Senders
+    """Who sends."""
+
     def now(self) -> int:
         """Nanoseconds."""
 
@@ -80,6 +83,7 @@ class Lane:
         self._prepared: Prepared | None = None
         self._counts: Counts | None = None
         self._defect: Walker | None = None
+        self._source = middle.senders.number(place)
 
     def through(self, batch: Batch) -> Batch | None:
         """The frames that go on, as the monitors leave them; None when none does."""
@@ -160,6 +164,7 @@ class Lane:
             prepared = self._prepared = walker.prepare(
                 loud=walker.changes and telling.shows(place),
                 told=[not telling.hides_drop(one, place) for one in walker.monitors] if walker.drops else (),
+                source=self._source,
             )
         if counts is None or counts.walker is not walker:
             counts = self._counts = Counts(walker, place)
@@ -187,7 +192,9 @@ class Lane:
             sighting = Sighting(passage, position, bytes(body[:head]))
             try:
                 outcome = (
-                    process(topic, body, now) if middle.spent <= LONGEST else dropped(body, now, TOO_LONG)
+                    process(topic, body, now, sighting.sender(self._source))
+                    if middle.spent <= LONGEST
+                    else dropped(body, now, TOO_LONG)
                 )
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
                 outcome = dropped(body, now, telling.defect(error, place, now, sighting))

@@ -30,13 +30,14 @@ from appliance.relay.monitors.compiling import Compiler, Result
 from appliance.relay.monitors.lane import LONGEST, TOO_LONG, Lane, dropped
 from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
-from appliance.relay.monitors.places import NOWHERE, Place
+from appliance.relay.monitors.places import NOWHERE, Place, Senders
 from appliance.relay.monitors.telling import Telling, refusal
 from appliance.relay.monitors.trials import Trials
 from appliance.relay.report import Reporter
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.runtime.context import Published
+from appliance.rosmop.why import Sender
 
 _AFTER_DEFECT = 1.0
 
@@ -79,9 +80,12 @@ class Middle:
         self._compiler = Compiler(loop, self.compiled)
         self.observations = Observations(loop, reporter, self._rows)
         self._changed = changed
+        self.senders = Senders()
         self._margins = Margins()
-        self.telling = Telling(self.observations, publish, self._margins)
-        self._on_trial = Telling(self.observations, lambda _published: None, self._margins, "trial ")
+        self.telling = Telling(self.observations, publish, self._margins, self.senders)
+        self._on_trial = Telling(
+            self.observations, lambda _published: None, self._margins, self.senders, "trial "
+        )
         self.trials = Trials(loop, self.now, self._on_trial)
 
     # --- what control states ---
@@ -108,6 +112,7 @@ class Middle:
         if isinstance(result, list):
             self._refuse(message, result)
             return
+        result.explain_when(self.telling.asks, self._on_trial.asks)
         before, now, blocked = self.monitors, self.now(), self.blocked
         if before is None:
             outcome = result.start(now, restarted=message.restarted)
@@ -276,7 +281,9 @@ class Middle:
         now, began = self.now(), time.thread_time()
         view = memoryview(body)
         try:
-            outcome = self.monitors.process_service(service, part, bytearray(body), now)
+            outcome = self.monitors.process_service(
+                service, part, bytearray(body), now, Sender(self.senders.number(place))
+            )
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
             outcome = dropped(view, now, self.telling.defect(error, place, now))
         if self.monitors.tapped:

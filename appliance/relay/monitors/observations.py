@@ -117,9 +117,9 @@ class Observations:
         self._told[key] = self._told.get(key, 0) + count
         self._last[key] = max(time, self._last.get(key, 0))
 
-    def told(self, kind: str, monitor: str, place: Place) -> bool:
+    def told(self, kind: str, monitor: str, place: Place, distinction: str = "") -> bool:
         """Whether this has been told in this second, so that the next is only counted."""
-        return (kind, monitor, *place[:3], "") in self._told
+        return (kind, monitor, *place[:3], distinction) in self._told
 
     def tick(self) -> None:
         """A second is over: tell the counts, and the state of the monitors if it changed."""

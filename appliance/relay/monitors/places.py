@@ -1,15 +1,18 @@
 """Where monitors see something: which publication or service, whose message, and which of its messages."""
 
 import struct
+from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from appliance.relay.monitors.passage import Passage
+from appliance.rosmop.why import SEQ, Sender
 
 HEAD = 12
 """Bytes of `std_msgs/Header` that are told: seq and stamp."""
 
 _HEADER = struct.Struct("<III")
+_SENDERS = 4096
 
 
 class Place(NamedTuple):
@@ -23,6 +26,31 @@ class Place(NamedTuple):
 
 NOWHERE = Place("", "")
 """What happens by time is about no message."""
+
+
+class Senders:
+    """Numbers for places, that monitors keep to say later who sent what; the latest `_SENDERS` are known."""
+
+    def __init__(self) -> None:
+        self._places: OrderedDict[int, Place] = OrderedDict()
+        self._numbers: dict[Place, int] = {}
+        self._last = 0
+
+    def number(self, place: Place) -> int:
+        """The number of a place."""
+        found = self._numbers.get(place)
+        if found is None:
+            self._last = found = self._last + 1
+            self._numbers[place] = found
+            self._places[found] = place
+            if len(self._places) > _SENDERS:
+                del self._numbers[self._places.popitem(last=False)[1]]
+        self._places.move_to_end(found)
+        return found
+
+    def place(self, number: int) -> Place | None:
+        """The place that has this number."""
+        return self._places.get(number)
 
 
 class Sighting:
@@ -41,6 +69,12 @@ class Sighting:
     def at(self, number: int) -> "Sighting":
         """The same for when the passage is over; the number of the message is known."""
         return Sighting(None, number, self._head)
+
+    def sender(self, source: int) -> Sender:
+        """Who sent it, and its seq if it has a header."""
+        if len(self._head) == HEAD:
+            return Sender(source, _HEADER.unpack(self._head)[0], SEQ)
+        return Sender(source)
 
     def detail(self) -> Mapping[str, Any]:
         """Its number among those of its publication that this relay received; seq and stamp if it has a header."""

@@ -12,10 +12,13 @@ from appliance.channel.messages import MonitorRow
 from appliance.relay.counts import Counts
 from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
-from appliance.relay.monitors.places import NOWHERE, Place, Sighting
+from appliance.relay.monitors.places import NOWHERE, Place, Senders, Sighting
+from appliance.rosmop.explained import conditions, explained
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.outcomes import Outcome, bound
 from appliance.rosmop.runtime.context import Published
+
+_EXPLAINED = 10
 
 
 @dataclass(slots=True)
@@ -38,9 +41,12 @@ class Telling:
         observations: Observations,
         publish: Callable[[Published], None],
         margins: Margins,
+        senders: Senders,
         prefix: str = "",
     ) -> None:
         self._margins = margins
+        self.senders = senders
+        self._explained = 0
         self._observations = observations
         self._publish = publish
         self._prefix = prefix
@@ -64,6 +70,15 @@ class Telling:
     def hides_drop(self, monitor: str, place: Place) -> bool:
         """Whether the next drop of a monitor at a place is only counted."""
         return self._observations.told("drop", monitor, place)
+
+    def asks(self, monitor: str, index: int, category: str, source: int) -> bool:
+        """Whether a verdict is told in full, and so explained: as many as `_EXPLAINED` in a second are."""
+        place = self.senders.place(source) or NOWHERE
+        told = self._observations.told(f"{self._prefix}verdict", monitor, place, f"{index} {category}")
+        if told or self._explained >= _EXPLAINED:
+            return False
+        self._explained += 1
+        return True
 
     def owe(self, counts: Counts) -> None:
         """There are counts to be taken when the second is over."""
@@ -122,7 +137,12 @@ class Telling:
             f"{' and '.join(monitors)} changed a message",
             distinction=", ".join(together),
             shared={"changed_by": together} if together else {},
-            detail={"events": list(outcome.events), "changed_by": list(outcome.changed_by)},
+            detail={
+                "events": list(outcome.events),
+                "changed_by": list(outcome.changed_by),
+                "at": [str(one) for one in outcome.changed_at],
+                **conditions(outcome),
+            },
             before=before,
             after=bytes(outcome.buffer[:SHOWN]),
             size=size,
@@ -140,7 +160,11 @@ class Telling:
             place,
             outcome.time,
             outcome.reason or _why(outcome),
-            detail={"events": list(outcome.events)},
+            detail={
+                "events": list(outcome.events),
+                **({"at": [str(outcome.statement)]} if outcome.statement is not None else {}),
+                **conditions(outcome),
+            },
             before=bytes(body[:SHOWN]),
             size=len(body),
             sighting=sighting,
@@ -172,6 +196,7 @@ class Telling:
         """A second is over: sum up."""
         self._sum_up(time)
         self._shown.clear()
+        self._explained = 0
 
     def _sum_up(self, time: int) -> None:
         self._settle()
@@ -257,6 +282,9 @@ class Telling:
                     "category": verdict.category,
                     **({"binding": verdict.binding} if verdict.binding else {}),
                     "events": list(outcome.events),
+                    "at": [str(verdict.source.origin)],
+                    **conditions(outcome),
+                    **explained(verdict, self._who),
                 },
                 after=bytes(outcome.buffer[:SHOWN]),
                 size=len(outcome.buffer),
@@ -285,6 +313,10 @@ class Telling:
                 size=len(outcome.buffer),
                 sighting=sighting,
             )
+
+    def _who(self, source: int) -> dict[str, str]:
+        place = self.senders.place(source)
+        return {} if place is None else {"node": place.caller_id, "host": place.host, "on": place.resource}
 
     def _counter(self, monitor: str) -> _Counters:
         return self._counters.setdefault(monitor, _Counters())

@@ -19,6 +19,7 @@ from appliance.relay.monitors.places import NOWHERE, Place, Sighting
 from appliance.relay.monitors.telling import Telling
 from appliance.rosmop.engine import TRIAL_BUDGET, MonitorSet, Tapped
 from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.why import Sender
 
 SHARE = 0.2
 """Seconds of processor time in a second."""
@@ -155,7 +156,8 @@ class Trials:
         (trial, _, _, data, _), place, sighting = waiting
         telling, view = self._telling, memoryview(data)
         try:
-            outcome = waiting.tapped.give()
+            source = telling.senders.number(place)
+            outcome = waiting.tapped.give(sighting.sender(source) if sighting is not None else Sender(source))
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
             self._resting.add(trial)
             self._miss(trial, place, telling.defect(error, place, self._now(), sighting), sighting)

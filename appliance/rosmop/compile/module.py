@@ -15,11 +15,16 @@ MAX_LINES = 200_000
 class Site:
     """A place in the text that generated code belongs to, and the variables whose values explain a fault there.
 
-    `variables` are (name in the text, name in the code, how to show a value).
+    `variables` are (name in the text, name in the code, how to show a value, whether a value never changes in place).
     """
 
     position: Position
-    variables: tuple[tuple[str, str, Callable[[Any], object]], ...] = ()
+    variables: tuple[tuple[str, str, Callable[[Any], object], bool], ...] = ()
+
+    @property
+    def compared(self) -> list[tuple[str, str, Callable[[Any], object], bool]]:
+        """The variables of a condition that are told when it was met: they are still what they were then."""
+        return [variable for variable in self.variables if variable[3]]
 
 
 class TooComplexError(Exception):

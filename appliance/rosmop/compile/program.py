@@ -101,7 +101,7 @@ def _event(
             automaton = code.property.automaton
             handled = [bool(set(code.order) & set(verdict)) for verdict in automaton.verdicts]
             table = tuple(-1 if handled[row[index]] else row[index] for row in automaton.table)
-            advances.append(form.Advance(properties.index((number, each)), table))
+            advances.append(form.Advance(properties.index((number, each)), table, index))
         else:
             advances.append(form.Advance(None, (-1,)))
     return form.Event(specifications[number].events[index].function, place, tuple(advances))

@@ -86,11 +86,14 @@ class Printer:
         self._module = module
         self._values = values
         self._context = context
+        self._drops = 0
+        self._is_event = False
 
     def function(self, function: form.Function) -> int:
         """Add a function to the module; returns the line at which its event happens, 0 if it is none's."""
         lines = Lines()
         happens = 0
+        self._is_event = function.happens is not None
         for index, statement in enumerate(function.body):
             if index == function.happens:
                 happens = len(lines.lines)
@@ -134,11 +137,24 @@ class Printer:
 
     def _if(self, lines: Lines, node: form.If) -> None:
         lines.add(f"if {self.text(node.test)}:")
-        self._block(lines, node.yes)
+        self._branch(lines, node, node.yes)
         if node.no:
             lines.site = node.site
             lines.add("else:")
-            self._block(lines, node.no)
+            self._branch(lines, node, node.no)
+
+    def _branch(self, lines: Lines, node: form.If, statements: Sequence[form.Statement]) -> None:
+        """What drops the message can say which conditions led there."""
+        begins, drops = len(lines.lines), self._drops
+        self._block(lines, statements)
+        if self._drops > drops:
+            there = "" if self._is_event else "if m is not None: "
+            line = f"{'    ' * (lines.depth + 1)}{there}{self._looked(node.site)}"
+            lines.lines.insert(begins, (line, node.site))
+
+    def _looked(self, site: int) -> str:
+        values = "".join(f"{code}, " for _, code, _, _ in self._module.sites[site].compared)
+        return f"m.looked[{site}] = ({values})"
 
     def _loop(self, lines: Lines, node: form.Loop) -> None:
         lines.add("while True:")
@@ -182,7 +198,8 @@ class Printer:
         lines.add(f"if n > {MAX_CALLS}: e_too_deep({node.site}, {node.name!r})")
 
     def _drop(self, lines: Lines, node: form.Drop) -> None:
-        lines.add("m.dropped = True" if node.anyway else "if m is not None: m.dropped = True")
+        self._drops += 1
+        lines.add(f"{'' if node.anyway else 'if m is not None: '}m.dropped, m.cause = True, {node.site}")
 
     def _reset(self, lines: Lines, node: form.Reset) -> None:
         del node
@@ -247,6 +264,7 @@ class Printer:
 
     def _require(self, lines: Lines, node: form.Require) -> None:
         lines.add(f"if not {self.text(node.test)}: return False")
+        lines.add(self._looked(node.site))
 
     def _pending(self, lines: Lines, node: form.Pending) -> None:
         entries = [f"({write.flag}, {write.path!r}, {self.text(write.value)})" for write in node.writes]

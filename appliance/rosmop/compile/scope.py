@@ -304,7 +304,7 @@ class Scope:
         shared = tuple(sorted(self.written))
         return form.Function(name, self.context, parameters, tuple(self.lines.found), shared, happens)
 
-    def _variables(self, node: tree.Node) -> Iterator[tuple[str, str, Callable[[Any], object]]]:
+    def _variables(self, node: tree.Node) -> Iterator[tuple[str, str, Callable[[Any], object], bool]]:
         seen: set[str] = set()
         for name in names_in(node):
             if name in seen or len(seen) >= 16:
@@ -315,7 +315,8 @@ class Scope:
             except SpecificationError:
                 continue
             if variable is not None and variable.alias is None:
-                yield name, variable.code, showing(variable.type)
+                steady = kinds.is_scalar(variable.type) or isinstance(variable.type, kinds.String)
+                yield name, variable.code, showing(variable.type), steady
 
 
 def names_in(node: object) -> Iterator[str]:

@@ -101,6 +101,17 @@ class Compiled:
     functions: Mapping[str, form.Function] = field(default_factory=dict)
     """The same in the intermediate form, by name."""
 
+    def is_stamped(self, message_type: str | None) -> bool:
+        """Whether messages of a type begin with a `std_msgs/Header`."""
+        fields = self.messages.definitions.message(message_type).fields if message_type is not None else ()
+        return bool(fields) and fields[0].notation == "std_msgs/Header"
+
+    @property
+    def stamped(self) -> frozenset[str]:
+        """The topics whose messages do."""
+        events = [event for one in self.specifications for event in one.events if event.part is None]
+        return frozenset(event.topic for event in events if event.topic and self.is_stamped(event.type))
+
 
 def compile_files(files: Sequence[tree.File], definitions: Definitions, *, margins: bool = False) -> Compiled:
     """Compile a set of files; raises `SpecificationError` with everything that is wrong.

@@ -15,7 +15,7 @@ one is for Python.
 """
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.rosmop.ir import form
@@ -47,6 +47,7 @@ from appliance.rosmop.ir.wasm import (
     unsigned,
 )
 from appliance.rosmop.runtime.context import BUDGET
+from appliance.rosmop.why import ENTRY, NO_NUMBER, SEQ
 
 POSITION, EFFECT = 0, 4
 """Where it stands which frame is looked at, and the address of the last effect."""
@@ -105,16 +106,20 @@ class FeedModule:
 
 
 def module_of(
-    functions: Mapping[str, form.Function], components: Sequence[form.Component], values: Values
+    functions: Mapping[str, form.Function],
+    components: Sequence[form.Component],
+    values: Values,
+    stamped: Container[str] = (),
 ) -> FeedModule:
-    """The module of all topics that can have a walk."""
+    """The module of all topics that can have a walk. The messages of the `stamped` begin with a `std_msgs/Header`."""
     shared: dict[str, Cells] = {}
     writer = Writer(functions, shared, values)
     cells = []
     for component in components:
         variables = (*component.variables, *component.noted)
         room = component.properties + len(variables)
-        cells.append(Cells(writer.take(8 * room), component.properties, frozenset(component.noted)))
+        base, source = writer.take(8 * room), writer.take(8)
+        cells.append(Cells(base, component.properties, source, frozenset(component.noted)))
         shared |= dict.fromkeys(variables, cells[-1])
     effects = writer.take(16 * (MAX_EFFECTS + 2))
     feeds: dict[str, Feed] = {}
@@ -122,7 +127,7 @@ def module_of(
     for component, own in zip(components, cells, strict=True):
         for topic, events in component.topics:
             try:
-                walk = _Walk(writer, own, tables, effects, events)
+                walk = _Walk(writer, own, tables, effects, events, stamped=topic in stamped)
             except (NotScalarError, RecursionError):
                 continue
             walks.append(walk.code())
@@ -167,7 +172,14 @@ class _Walk:
     """Writes the walk for one topic. Raises `NotScalarError` if no message would come through."""
 
     def __init__(
-        self, writer: Writer, cells: Cells, tables: _Tables, effects: int, events: Sequence[form.Event]
+        self,
+        writer: Writer,
+        cells: Cells,
+        tables: _Tables,
+        effects: int,
+        events: Sequence[form.Event],
+        *,
+        stamped: bool,
     ) -> None:
         if len(events) > MAX_EVENTS:
             raise NotScalarError("many events")
@@ -192,6 +204,11 @@ class _Walk:
         self._states = {
             number: _FIRST + len(events) + place for place, number in enumerate(sorted(properties))
         }
+        for each in (each for event in events for each in event.advances):
+            if each.property is not None and each.property not in cells.exits:
+                cells.exits[each.property] = writer.take(ENTRY.size * len(each.table))
+        self._stamped = stamped
+        self._following = _FIRST + len(events) + len(self._states)
 
     def feed(self, name: str) -> Feed:
         """What is said about it."""
@@ -225,7 +242,7 @@ class _Walk:
             here, RETURN, END,
             here, constant(I64, LEFT), _OR64, END,
         ]  # fmt: skip
-        made = [I32, I32, I64, I32, *[I32] * len(self._events), *[I32] * len(self._states)]
+        made = [I32, I32, I64, I32, *[I32] * len(self._events), *[I32] * len(self._states), I32, I32]
         whole = row([b"\x01" + bytes((machine,)) for machine in made]) + b"".join(body)
         return unsigned(len(whole)) + whole
 
@@ -299,8 +316,20 @@ class _Walk:
         if advance.property is None:
             return _BR + left
         state = self._states[advance.property]
-        following = _get(state) + constant(I32, 1) + b"\x74\x2e\x00" + unsigned(table)
-        return _set(state, following) + _get(state) + constant(I32, 0) + b"\x48" + _BR_IF + left
+        following, room = self._following, self._following + 1
+        code = _set(following, _get(state) + constant(I32, 1) + b"\x74\x2e\x00" + unsigned(table)) + _get(
+            following
+        )
+        code += constant(I32, 0) + b"\x48" + _BR_IF + left
+        code += _get(following) + _get(state) + b"\x47" + IF + NOTHING
+        code += _set(room, _get(state) + constant(I32, ENTRY.size) + b"\x6c")
+        kind = constant(I64, (SEQ if self._stamped else NO_NUMBER) << 24 | advance.event)
+        exits = self._cells.exits[advance.property]
+        for offset, value in ((0, _get(_NOW)), (8, load(I64, self._cells.source) + kind + _OR64)):
+            code += _get(room) + value + b"\x37\x00" + unsigned(exits + offset)
+        if self._stamped:
+            code += _get(room) + _get(_AT) + b"\x28\x00\x04\x36\x00" + unsigned(exits + 16)
+        return code + _set(state, _get(following)) + END
 
     def _count(self, place: int, more: bytes) -> bytes:
         address = self._counters + 8 * place

@@ -634,11 +634,13 @@ class Function:
 @dataclass(frozen=True, slots=True)
 class Advance:
     """What an event does to a property: the next state for each of its states; -1 where a handler runs then, or where
-    the property has no table of states. `property` is its number among those with tables; None without one.
+    the property has no table of states. `property` is its number among those with tables; None without one. `event` is
+    the event's number in its specification.
     """
 
     property: int | None
     table: tuple[int, ...]
+    event: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,7 +93,11 @@ class Cells:
 
     base: int
     properties: int
+    source: int = 0
+    """Where it stands (i64) who sends what is looked at: `Sender.source` from bit 32 on."""
     noted: frozenset[str] = frozenset()
+    exits: dict[int, int] = field(default_factory=dict)
+    """Where it is kept how the states of a property were left (`why.Exits`), by its number."""
     variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
     """Where each stands, and its type; in the order of the places."""
 

@@ -23,6 +23,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 from appliance.rosmop.logics.formula import Formula
 from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
@@ -348,7 +349,7 @@ class BoundedProperty(CompiledProperty):
         result = ["None"] * (program.result + 1)
         for number in at_once:
             result[number] = f"v{number}"
-        self.make: Callable[[int], Callable[[int, int], list[Value | None]]] = loaded(
+        self.make: Callable[[int], tuple[Callable[[int, int], list[Value | None]], Any]] = loaded(
             generate(program, at_once, f"[{', '.join(result)}]")
         )
         self.order = {
@@ -419,7 +420,7 @@ class BoundedRun:
 
     def __init__(self, compiled: BoundedProperty, time_ns: int) -> None:
         self._compiled = compiled
-        self._at_once = compiled.make(time_ns)
+        self._at_once, _ = compiled.make(time_ns)
         self._operators = compiled.operators(self)
         self._now = time_ns
         self._values: list[Value | None] = []

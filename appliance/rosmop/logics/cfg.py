@@ -11,7 +11,7 @@ table.
 from appliance.rosmop.logics.automaton import Automaton, TooManyStatesError, explore
 from appliance.rosmop.logics.ere import with_fail
 from appliance.rosmop.logics.grammar import prepare, read_grammar
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty, Run, Source
+from appliance.rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty, Run, Source, twin
 from appliance.rosmop.logics.parsing import Frame, Recogniser
 
 CATEGORIES: Categories = ("match", "fail")
@@ -40,6 +40,7 @@ class GrammarRun:
     """A run: the current frame, or None after a failure."""
 
     __slots__ = ("_step", "frame")
+    __copy__ = twin
 
     def __init__(self, recogniser: Recogniser) -> None:
         self._step = recogniser.step

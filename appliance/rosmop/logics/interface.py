@@ -22,7 +22,7 @@ A ``FiniteProperty`` offers its tables as well, so that generated code can step 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from appliance.rosmop.logics.automaton import Automaton
 from appliance.rosmop.positions import Finding, Position
@@ -43,7 +43,9 @@ class RunFaultError(Exception):
 
 
 class Run(Protocol):
-    """One run of a property over a trace; see the head of this module for the contract."""
+    """One run of a property over a trace; see the head of this module for the contract. A copy (`copy.copy`) goes on
+    by itself; a run that has no `__copy__` has none.
+    """
 
     @property
     def deadline(self) -> int | None:
@@ -55,6 +57,14 @@ class Run(Protocol):
 
     def expire(self) -> Categories:
         """Let the deadline pass; return the categories that follow. Only while ``deadline`` is not None."""
+
+
+def twin(run: Any) -> Any:
+    """A copy of a run whose attributes are replaced and never changed in place: its `__copy__`."""
+    made = object.__new__(type(run))
+    for name in run.__slots__:
+        setattr(made, name, getattr(run, name))
+    return made
 
 
 @dataclass(frozen=True)

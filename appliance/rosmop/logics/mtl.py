@@ -13,7 +13,7 @@ from appliance.rosmop.logics.interface import CompiledProperty, Source
 from appliance.rosmop.logics.past import compile_past
 
 _PAST = ("previously", "once", "historically", "since")
-_FUTURE = ("next", "eventually", "always", "until")
+FUTURE = ("next", "eventually", "always", "until")
 _SYMBOLS = {
     "(*)": "previously",
     "<*>": "once",
@@ -26,9 +26,9 @@ _SYMBOLS = {
 }
 
 SYNTAX = Syntax(
-    unary={**NOT, **{word: word for word in (*_PAST[:3], *_FUTURE[:3])}},
+    unary={**NOT, **{word: word for word in (*_PAST[:3], *FUTURE[:3])}},
     levels=boolean_levels([Level({"since": "since", "until": "until"}, "left")]),
-    bounded=frozenset((*_PAST, *_FUTURE)),
+    bounded=frozenset((*_PAST, *FUTURE)),
     refused={symbol: f"is written `{word}` in mtl" for symbol, word in _SYMBOLS.items()},
 )
 
@@ -36,7 +36,7 @@ SYNTAX = Syntax(
 def compile_mtl(source: Source) -> CompiledProperty:
     """Compile an ``mtl`` formula. Raises FormulaError."""
     formula = read_formula(source, SYNTAX)
-    future = [node for node in nodes(formula) if node.operator in _FUTURE]
+    future = [node for node in nodes(formula) if node.operator in FUTURE]
     for node in future:
         if node.bounds is None or node.bounds[1] is None:
             raise source.error(

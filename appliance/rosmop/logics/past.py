@@ -16,6 +16,7 @@ Without time bounds the values are bits and the program a finite automaton, whic
 enough. Otherwise the program becomes a Python function of straight-line code.
 """
 
+import copy
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -227,20 +228,30 @@ class Window:
             intervals.popleft()
         return bool(intervals) and intervals[0][0] <= now
 
+    def __copy__(self) -> "Window":
+        twin = Window(self._low, self._high)
+        twin._intervals.extend(map(list, self._intervals))
+        return twin
+
     def __len__(self) -> int:
         return len(self._intervals)
 
 
 StepFunction = Callable[[int, int], Categories]
+Made = tuple[StepFunction, Callable[[], Any]]
 
 
 class PastRun:
-    """A run of a past formula; ``step`` is the compiled function itself."""
+    """A run of a past formula; ``step`` is the compiled function itself, ``twin`` makes one that goes on from here."""
 
-    __slots__ = ("step",)
+    __slots__ = ("step", "twin")
 
-    def __init__(self, step: StepFunction) -> None:
+    def __init__(self, step: StepFunction, twin: "Callable[[], Made]") -> None:
         self.step = step
+        self.twin = twin
+
+    def __copy__(self) -> "PastRun":
+        return PastRun(*self.twin())
 
     @property
     def deadline(self) -> int | None:
@@ -260,7 +271,7 @@ class PastProperty(CompiledProperty):
         self._timed = program.bounded
         everything = range(len(program.instructions))
         self.code = generate(program, everything, f"VALIDATION if v{program.result} else VIOLATION")
-        self._make: Callable[[int], StepFunction] = loaded(self.code)
+        self._make: Callable[[int], Made] = loaded(self.code)
 
     @property
     def timed(self) -> bool:
@@ -269,11 +280,12 @@ class PastProperty(CompiledProperty):
 
     def start(self, time_ns: int) -> Run:
         """A fresh run."""
-        return PastRun(self._make(time_ns))
+        return PastRun(*self._make(time_ns))
 
 
 def generate(program: Program, computed: Iterable[int], result: str) -> str:
-    """The text of ``make(now)``: it returns a step function with the state of one run in its closure.
+    """The text of ``make(now)``: it returns a step function with the state of one run in its closure,
+    and a function that makes the same once more, to go on from there.
 
     ``computed`` are the instructions that it computes, operands first (``v`` and the number is the value of one), and
     ``result`` is what a step gives.
@@ -283,7 +295,12 @@ def generate(program: Program, computed: Iterable[int], result: str) -> str:
 
 def loaded(code: str) -> Callable[[int], Any]:
     """The function that ``generate`` has written."""
-    namespace: dict[str, Any] = {"Window": Window, "VALIDATION": VERDICTS[1:], "VIOLATION": VERDICTS[:1]}
+    namespace: dict[str, Any] = {
+        "Window": Window,
+        "VALIDATION": VERDICTS[1:],
+        "VIOLATION": VERDICTS[:1],
+        "copy": copy.copy,
+    }
     exec(compile(code, "<past formula>", "exec"), namespace)  # noqa: S102  # made of numbers only
     make: Callable[[int], Any] = namespace["make"]
     return make
@@ -311,14 +328,18 @@ class _Generator:
         if assigned:
             lines.insert(0, f"nonlocal {', '.join(assigned)}")
         lines.append(f"return {result}")
-        setup = [f"{name} = {initial}" for name, initial in self._state.items()]
+        initial = {name: value for name, value in self._state.items() if name != "now"}
+        kept = "".join(f"copy({name}), " for name in initial)
+        names, values = ("".join(f"{one}, " for one in each) for each in (initial, initial.values()))
         return "\n".join(
             [
-                "def make(now):",
-                *(f"    {line}" for line in setup),
+                "def make(now, kept=None):",
+                f"    {names} = kept or ({values})" if names else "",
                 "    def step(e, t):",
                 *(f"        {line}" for line in lines),
-                "    return step",
+                "    def twin():",
+                f"        return make(now, ({kept}))",
+                "    return step, twin",
                 "",
             ]
         )

@@ -36,7 +36,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from appliance.rosmop.logics.automaton import explore
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty, Run, Source
+from appliance.rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty, Run, Source, twin
 from appliance.rosmop.logics.lexer import Token, TokenReader
 
 VIOLATION: Categories = ("violation",)
@@ -236,6 +236,7 @@ class TimedPatternRun:
     __slots__ = (
         "_at_expiry", "_expiries", "_in_time", "_late", "_verdicts", "_within", "deadline", "mode", "now", "since",
     )  # fmt: skip
+    __copy__ = twin
 
     def __init__(self, compiled: TimedPattern, time_ns: int) -> None:
         self._verdicts = compiled.verdicts

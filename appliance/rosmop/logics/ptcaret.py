@@ -13,7 +13,7 @@ bound beyond which a ``begin`` is a fault of the specification. (Rosu, Chen and 
 """
 
 from appliance.rosmop.logics.formula import NOT, Formula, Level, Syntax, boolean_levels, nodes, read_formula
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
+from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, twin
 from appliance.rosmop.logics.past import VERDICTS, Program, Stepper
 from appliance.rosmop.logics.ptltl import SYNTAX as PTLTL
 
@@ -44,17 +44,16 @@ SYNTAX = Syntax(
 
 def compile_ptcaret(source: Source) -> CompiledProperty:
     """Compile a ``ptcaret`` formula. Raises FormulaError."""
-    formula = read_formula(source, SYNTAX)
-    plain = _plain(formula)
+    formula = plain(read_formula(source, SYNTAX))
     missing = [name for name in (BEGIN, END) if name not in source.events]
-    if missing and any(node.operator.startswith("abstract ") for node in nodes(plain)):
+    if missing and any(node.operator.startswith("abstract ") for node in nodes(formula)):
         names = " and ".join(f"`{name}`" for name in missing)
         raise source.error(
             0, f"the abstract past needs the events `begin` and `end` of the specification; it has no {names}"
         )
-    if CALL not in source.events and any(node.name == CALL for node in nodes(plain)):
+    if CALL not in source.events and any(node.name == CALL for node in nodes(formula)):
         raise source.error(0, "`@bc` needs the event `call` of the specification")
-    return CaretProperty(source, Program(plain, source.events))
+    return CaretProperty(source, Program(formula, source.events))
 
 
 class CaretProperty(CompiledProperty):
@@ -85,11 +84,9 @@ class CaretRun:
         self._stack: list[int] = []
 
     def __copy__(self) -> "CaretRun":
-        twin = CaretRun.__new__(CaretRun)
-        for name in CaretRun.__slots__:
-            setattr(twin, name, getattr(self, name))
-        twin._stack = self._stack.copy()
-        return twin
+        made: CaretRun = twin(self)
+        made._stack = self._stack.copy()
+        return made
 
     @property
     def deadline(self) -> int | None:
@@ -114,9 +111,9 @@ class CaretRun:
         raise ValueError("this run has no deadline")
 
 
-def _plain(formula: Formula) -> Formula:
+def plain(formula: Formula) -> Formula:
     """The formula without the derived operators."""
-    operands = tuple(_plain(operand) for operand in formula.operands)
+    operands = tuple(plain(operand) for operand in formula.operands)
     operator, _, where = formula.operator.partition(" ")
     if operator not in ("at", "some", "every"):
         return Formula(formula.operator, operands, formula.name, formula.bounds, formula.offset)

@@ -11,7 +11,7 @@ A run has bounds on its string and on the work of one event; what exceeds them i
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
+from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, twin
 from appliance.rosmop.logics.lexer import Token, TokenReader
 
 CATEGORIES: Categories = ("fail", "succeed")
@@ -59,6 +59,7 @@ class RewritingRun:
     """A run: its string, to which no rule applies between two events, or the verdict that it came to."""
 
     __slots__ = ("_property", "string", "verdict")
+    __copy__ = twin
 
     def __init__(self, compiled: RewritingProperty) -> None:
         self._property = compiled

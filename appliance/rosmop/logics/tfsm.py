@@ -11,7 +11,7 @@ second passes after an event without another; the state stays.
 
 from appliance.rosmop.logics.automaton import Automaton
 from appliance.rosmop.logics.fsm import FAIL, TIMEOUT, machine_automaton, read_machine
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, Source
+from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, Source, twin
 
 SILENCE_NS = 10**9
 """How long a machine without timeout clauses waits for the next event."""
@@ -77,6 +77,7 @@ class _ClockRun:
     """A run of a machine with timeout clauses: the deadline is that of the state."""
 
     __slots__ = ("_table", "_timeouts", "_verdicts", "deadline", "now", "state")
+    __copy__ = twin
 
     def __init__(self, machine: TimedMachine, time_ns: int) -> None:
         self._table = machine.automaton.table
@@ -112,6 +113,7 @@ class _SilenceRun:
     """A run of a machine without timeout clauses: a second of silence after an event is told once."""
 
     __slots__ = ("_table", "_verdicts", "deadline", "now", "state")
+    __copy__ = twin
 
     def __init__(self, machine: TimedMachine, time_ns: int) -> None:
         self._table = machine.automaton.table

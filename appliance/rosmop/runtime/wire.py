@@ -116,10 +116,13 @@ class Message:
 
     Numbers are written where they stand, and only the bytes that were there are kept: a picture of a camera is not
     copied for a changed stamp. `touched` is set by whatever writes other bytes than were there; who wants to know
-    which event did clears it after each.
+    which event did clears it after each. `looked` are the values that conditions have compared, by their sites, and
+    `cause` is the site of the statement that dropped it.
     """
 
-    __slots__ = ("_replaced", "_written", "buffer", "dropped", "past", "time", "touched")
+    __slots__ = (
+        "_replaced", "_written", "buffer", "cause", "dropped", "looked", "past", "time", "touched",
+    )  # fmt: skip
 
     def __init__(self, buffer: Buffer, time: int) -> None:
         self.buffer = buffer
@@ -127,6 +130,8 @@ class Message:
         self._written: list[tuple[int, bytes]] | None = None  # where bytes were others, and which, in order
         self._replaced: bytes | None = None  # the bytes as received, once the buffer is another
         self.dropped = False
+        self.cause: int | None = None
+        self.looked: dict[int, tuple[Any, ...]] = {}
         self.touched = False
         self.past: tuple[int, int, int] | None = None  # an index was past the end: site, index, elements
 

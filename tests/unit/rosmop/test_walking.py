@@ -18,6 +18,7 @@ from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walking import BEGINNING, Walker
+from appliance.rosmop.why import Sender
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.interpreted import beside, check_same
 from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
@@ -180,11 +181,11 @@ def test_a_message_that_needs_no_record_is_not_for_the_engine() -> None:
     asked = []
     process = fed.monitors.process
 
-    def counted(topic: str, buffer: Buffer, time_ns: int) -> Outcome:
+    def counted(topic: str, buffer: Buffer, time_ns: int, sender: Sender) -> Outcome:
         asked.append(bytes(buffer))
-        return process(topic, buffer, time_ns)
+        return process(topic, buffer, time_ns, sender)
 
-    fed.monitors.process = counted  # type: ignore[method-assign]
+    fed.monitors.process = counted  # type: ignore[method-assign, assignment]
     told, engine = (
         [plain(1), plain(4), plain(6, kind=1)],
         [plain(3), plain(5, kind=1), plain(rest=bytes(AREA))],

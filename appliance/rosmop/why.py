@@ -1,0 +1,302 @@
+"""What made a verdict: of the events so far as few as give it alone, and who sent the messages that they were.
+
+Theory of operation:
+
+1. Of a property with tables (`Exits`) it is kept for each state by which event it was left last. From the initial state
+   these lead to the present one, and each is later than the one before: the events so far without all that came back
+   to where it had been. So nothing is cut, however long the trace; and since what happened before `__RESET;` is not on
+   the way, it need not be forgotten either. The module keeps the same, in the same place.
+2. Of the others (`Steps`) the last events are kept, and the run as it was before them. Where they give the verdict to
+   a run that begins anew they explain it alone; where not, only to the run as it was before them, and that is said
+   (`Explanation.since`), or, where a run cannot be copied, nothing.
+3. Of a parametric specification the last `TRAIL` events are kept with what they bound; those of the slice explain its
+   verdict alone, or nothing does.
+4. An explanation is found by trying: what is named has given the verdict.
+"""
+
+import copy
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from appliance.rosmop.logics.automaton import Automaton
+from appliance.rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty, Run, RunFaultError
+
+TRAIL = 4096
+"""Events that are kept of a parametric specification, of all its slices together."""
+
+KEPT = 64
+"""Of so many events, and as many more at most, what happened is kept where there are no tables."""
+
+ENTRY = struct.Struct("<qqI4x")
+"""How a state was left: time (ns); `Sender.source`, `Sender.kind` (from bit 24) and the event; `Sender.number`."""
+
+_LONGEST = 300  # ways through an automaton that are shortened
+_MOST_STEPS = 5_000  # that are tried for one explanation: some milliseconds
+_DEADLINE = -1
+
+
+class Sender(NamedTuple):
+    """Who sent a message (0: nobody; numbered by who has the monitors), and its number, if it has one by its `kind`."""
+
+    source: int = 0
+    number: int = 0
+    kind: int = 0
+
+
+NOBODY = Sender()
+NO_NUMBER, SEQ = range(2)
+"""Kinds of numbers: none; `seq` of the header."""
+
+
+class Happened(NamedTuple):
+    """An event (its number in the specification), when, whose message it was; the state after it, if it has a name."""
+
+    event: int
+    time: int
+    sender: Sender
+    state: str = ""
+
+
+class Bound(NamedTuple):
+    """An event of a parametric specification that happened: which parameters (by number) it bound, and to what (`key`
+    has True before the values).
+    """
+
+    event: int
+    binds: tuple[int, ...]
+    key: tuple[Any, ...]
+    time: int
+    sender: Sender
+
+
+class Explanation(NamedTuple):
+    """Events that alone give a verdict. None of them can be left out if they are the `fewest`.
+
+    `since`: they give it to the property as it was at this time (ns), after events that are not kept any more.
+    """
+
+    events: tuple[Happened, ...]
+    fewest: bool = True
+    since: int | None = None
+
+
+class Exits:
+    """How each state of an automaton was left last, in `room` (`ENTRY` for each state), whose `owner` lives as long."""
+
+    def __init__(self, automaton: Automaton) -> None:
+        self._automaton = automaton
+        self._last = 0, 0, NOBODY
+        self._at = automaton.initial
+        self.room = memoryview(bytearray(ENTRY.size * len(automaton)))
+        self.owner: object = None
+
+    def step(self, run: Any, event: int, time_ns: int, sender: Sender) -> Categories:
+        """Let the run take the event."""
+        self._at = state = run.state
+        self._last = event, time_ns, sender
+        categories: Categories = run.step(event, time_ns)
+        if run.state != state:
+            source, number, kind = sender
+            who = source << 32 | kind << 24 | event
+            ENTRY.pack_into(self.room, ENTRY.size * state, time_ns, who, number & 0xFFFFFFFF)
+        return categories
+
+    def expire(self, run: Run) -> Categories:
+        """Let the deadline of the run pass."""
+        return run.expire()
+
+    def move(self, owner: object, room: memoryview) -> None:
+        """Keep it from now on where the owner has it."""
+        self.room, self.owner = room[: len(self.room)], owner
+
+    def follow(self, earlier: "Exits | Steps") -> "Exits":
+        """Go on from what another has kept of the same property."""
+        assert isinstance(earlier, Exits)  # noqa: S101  it has the same tables
+        self.room[:] = bytes(earlier.room)
+        return self
+
+    def explain(self, category: str) -> Explanation | None:
+        """What made the last step's verdict."""
+        way = self._way()
+        if way is None:
+            return None
+        way.append(Happened(*self._last))
+        fewest = len(way) <= _LONGEST
+        return Explanation(self._named(_shortest(self._automaton, way, category) if fewest else way), fewest)
+
+    def _way(self) -> list[Happened] | None:
+        """From the initial state to where the last step began."""
+        found: list[Happened] = []
+        state = self._automaton.initial
+        while state != self._at:
+            time, who, number = ENTRY.unpack_from(self.room, ENTRY.size * state)
+            if len(found) == len(self._automaton) or (found and time < found[-1].time):
+                return None
+            sender = Sender(who >> 32, number, who >> 24 & 0xFF)
+            found.append(Happened(who & 0xFFFFFF, time, sender))
+            state = self._automaton.table[state][found[-1].event]
+        return found
+
+    def _named(self, way: Sequence[Happened]) -> tuple[Happened, ...]:
+        automaton, state, found = self._automaton, self._automaton.initial, []
+        for one in way:
+            state = automaton.table[state][one.event]
+            found.append(one._replace(state=automaton.names[state]) if automaton.names else one)
+        return tuple(found)
+
+
+def _shortest(automaton: Automaton, way: Sequence[Happened], category: str) -> Sequence[Happened]:
+    """The fewest that give the category, the latest of such; with the last of the way, unless they do without it."""
+    best: dict[int, tuple[int, ...]] = {automaton.initial: ()}
+    fewest: tuple[int, ...] = ()
+    mine: tuple[int, ...] = ()
+    for number, one in enumerate(way):
+        found = dict(best)
+        mine = ()
+        for state, before in best.items():
+            target, now = automaton.table[state][one.event], (*before, number)
+            if len(now) <= len(found.get(target, now)):
+                found[target] = now
+            if category in automaton.verdicts[target]:
+                if not mine or len(now) <= len(mine):
+                    mine = now
+                if not fewest or len(now) <= len(fewest):
+                    fewest = now
+        best = found
+    state = automaton.initial
+    for number in mine[:-1]:
+        state = automaton.table[state][way[number].event]
+    chosen = fewest if mine[:-1] and category in automaton.verdicts[state] else mine
+    return [way[number] for number in chosen]
+
+
+class Steps:
+    """What happened last to a property without tables: at least `KEPT` steps, and the run before them."""
+
+    def __init__(self, compiled: CompiledProperty, time_ns: int) -> None:
+        self._compiled = compiled
+        self._started = time_ns
+        self._steps: list[Happened] = []
+        self._before: Run | None = None
+        self._following: Run | None = None
+
+    def step(self, run: Run, event: int, time_ns: int, sender: Sender) -> Categories:
+        """Let the run take the event. Raises `RunFaultError`."""
+        self._make_room(run)
+        categories = run.step(event, time_ns)
+        self._steps.append(Happened(event, time_ns, sender))
+        return categories
+
+    def add(self, happened: Happened) -> None:
+        """It has happened."""
+        self._steps.append(happened)
+
+    def expire(self, run: Run) -> Categories:
+        """Let the deadline of the run pass."""
+        self._make_room(run)
+        self._steps.append(Happened(_DEADLINE, run.deadline or 0, NOBODY))
+        return run.expire()
+
+    def follow(self, earlier: "Exits | Steps") -> "Exits | Steps":
+        """Go on from what another has kept of the same property."""
+        return earlier
+
+    def _make_room(self, run: Run) -> None:
+        if len(self._steps) == 2 * KEPT:
+            del self._steps[:KEPT]
+            self._before = self._following
+        if len(self._steps) == KEPT:
+            self._following = copy.copy(run) if hasattr(run, "__copy__") else None
+
+    def explain(self, category: str) -> Explanation | None:
+        """What made the last step's verdict; None where that cannot be said."""
+        if not self._steps:
+            return None
+        last = self._steps[-1]
+        ended = last.time if last.event == _DEADLINE else None
+        events = [one for one in self._steps if one.event != _DEADLINE]
+        for before in (None, self._before) if self._before is not None else (None,):
+            tried = _Trial(self._compiled, before, self._started, category, ended)
+            if tried.gives(events):
+                since = self._steps[0].time if before is not None else None
+                return Explanation(*tried.fewest(events), since=since)
+        return None
+
+
+class _Trial:
+    """Whether events give a category: told with the last of them, or by a deadline when it has `ended`."""
+
+    def __init__(
+        self, compiled: CompiledProperty, before: Run | None, started: int, category: str, ended: int | None
+    ) -> None:
+        self._start: Callable[[], Run] = lambda: (
+            compiled.start(started) if before is None else copy.copy(before)
+        )
+        self._category = category
+        self._ended = ended
+        self._left = _MOST_STEPS
+
+    def gives(self, events: Sequence[Happened]) -> bool:
+        """Whether these do, and nothing else that happened."""
+        self._left -= 1 + len(events)
+        run = self._start()
+        told: Categories = ()
+        try:
+            for one in events:
+                self._expire(run, one.time)
+                told = run.step(one.event, one.time)
+        except RunFaultError:
+            return False
+        return self._category in (told if self._ended is None else self._expire(run, self._ended + 1))
+
+    def _expire(self, run: Run, time_ns: int) -> Categories:
+        """Let the deadlines before a time pass; what is told by those right before it."""
+        told: Categories = ()
+        while (deadline := run.deadline) is not None and deadline < time_ns:
+            categories = run.expire()
+            told += categories if deadline == time_ns - 1 else ()
+        return told
+
+    def fewest(self, events: list[Happened]) -> tuple[tuple[Happened, ...], bool]:
+        """As few of these as will do, and whether none of them can be left out; the last is left out last."""
+        last = events[-1:] if self._ended is None else []
+        some = self._fewer(events[: len(events) - len(last)], last)
+        if last and some and self._left > 0 and self.gives(some):
+            some, last = self._fewer(some, []), []
+        return (*some, *last), self._left > 0
+
+    def _fewer(self, some: list[Happened], last: list[Happened]) -> list[Happened]:
+        size = max(1, len(some) // 2)
+        while some and self._left > 0:
+            place, before = 0, len(some)
+            while place < len(some) and self._left > 0:
+                fewer = some[:place] + some[place + size :]
+                if self.gives([*fewer, *last]):
+                    some = fewer
+                else:
+                    place += size
+            if size == 1 and len(some) == before:
+                break
+            size = max(1, size // 2)
+        return some
+
+
+def of_slice(
+    compiled: CompiledProperty, trail: Iterable[Bound], values: Mapping[int, Any], category: str
+) -> Explanation | None:
+    """What made the verdict in the slice of a binding (parameters by number): it is the last that happened."""
+    found = Steps(compiled, 0)
+    for one in trail:
+        if all(map(_same, map(values.get, one.binds), one.key[1:])):
+            found.add(Happened(one.event, one.time, one.sender))
+    return found.explain(category)
+
+
+def _same(one: Any, other: Any) -> bool:
+    return bool(one == other or (one != one and other != other))  # noqa: PLR0124  NaN
+
+
+def history_of(compiled: CompiledProperty, time_ns: int) -> Exits | Steps:
+    """What is kept of a run that begins."""
+    return Exits(compiled.automaton) if isinstance(compiled, FiniteProperty) else Steps(compiled, time_ns)
