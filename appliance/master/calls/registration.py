@@ -18,7 +18,7 @@ from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
 from appliance.master.reach.faces import Faces
 from appliance.master.reach.relays import RelayControl
 from appliance.master.rosmaster import RosMaster
-from appliance.master.upkeep.arrivals import Arrivals
+from appliance.master.upkeep.arrivals import Arrivals, making_room_for_nobody
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import NO_SERVICE, stand_in
 
@@ -161,13 +161,8 @@ class RegistrationCalls:
         if spare is not None:
             self.enactor.carry_out(self.graph.forgotten(spare))
         incarnation = await self.arrivals.incarnation_for(caller, api)
-        while self.registry.by_key(incarnation.key) is not incarnation:  # it made room before this went on
-            incarnation = await self.arrivals.incarnation_for(caller, api)
-        incarnation.calls += 1
-        try:
+        with making_room_for_nobody(incarnation):
             yield incarnation
-        finally:
-            incarnation.calls -= 1
 
 
 def given_up(registry: Registry, denied: Attempt) -> list[Durable]:

@@ -1,7 +1,12 @@
-"""How an incarnation comes to be: a call registers under a name, from a host, with an API URI."""
+"""How an incarnation comes to be: a call registers under a name, from a host, with an API URI.
 
-import asyncio
+Who is coming makes room for nobody: else two that come at once, where there is room for one, would take it from each
+other for ever.
+"""
+
+import contextlib
 import time
+from collections.abc import Iterator
 
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.graph.graph import Graph
@@ -34,7 +39,6 @@ class Arrivals:
         self._places = places
         self._faces = faces
         self._addresses = addresses
-        self._coming: dict[tuple[str, Address, str], asyncio.Future[Incarnation]] = {}
 
     def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
         """The incarnation that calls, if it is known."""
@@ -54,18 +58,17 @@ class Arrivals:
         if incarnation is not None and incarnation.life is Life.SHADOW:
             if self._registry.holder(incarnation.name) is None:
                 # It was away and adds to what it had, before anybody saw that it is back.
-                await self._liveness.revive(incarnation)
+                with making_room_for_nobody(incarnation):
+                    await self._liveness.revive(incarnation)
                 return incarnation
             # Another took its name meanwhile: it begins anew.
             self._enactor.carry_out(self._graph.forgotten(incarnation))
-        coming = self._coming.get(identity)
-        if coming is None:
-            coming = asyncio.ensure_future(self._make(caller, api))
-            self._coming[identity] = coming
-            coming.add_done_callback(lambda _done: self._coming.pop(identity, None))
-        return await asyncio.shield(coming)
+        incarnation = self._make(caller, api)
+        with making_room_for_nobody(incarnation):
+            await self._faces.open(incarnation)
+        return incarnation
 
-    async def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
+    def _make(self, caller: Caller, api: ApiUri) -> Incarnation:
         outer_port, relay_port, *more = self._open_ports(caller.peer.host)
         incarnation = Incarnation(
             key=new_key(),
@@ -82,7 +85,6 @@ class Arrivals:
             touched=time.monotonic(),
         )
         self._enactor.carry_out(self._registry.add(incarnation))
-        await self._faces.open(incarnation)
         return incarnation
 
     def _open_ports(self, host: Address) -> tuple[int, ...]:
@@ -95,3 +97,13 @@ class Arrivals:
                 if spare is None:
                     raise
                 self._enactor.carry_out(self._graph.forgotten(spare))
+
+
+@contextlib.contextmanager
+def making_room_for_nobody(incarnation: Incarnation) -> Iterator[None]:
+    """A registering call of it is under way."""
+    incarnation.calls += 1
+    try:
+        yield
+    finally:
+        incarnation.calls -= 1

@@ -201,24 +201,26 @@ def test_values_for_a_node_that_never_answers(calm: Field) -> None:
 
 
 def test_registrations(calm: Field) -> None:
-    """Nodes and topics of one host have a limit (the rogue is at it from here on); others still get ports and names."""
+    """Nodes and topics of one host have a limit (the rogue is at it from here on); others still get ports and names.
+
+    The nodes answer: those that do not are lost, and make room for the next.
+    """
     refused: list[Any] = []
+    with Impostor(calm.attacker, answering([1, "", 4711])) as node:
 
-    def act(number: int, turn: int) -> None:
-        name = f"/many_{number}_{turn}"
-        with master_at(calm.master) as server:
-            answer = server.registerPublisher(
-                name, f"/t{name[1:]}", "std_msgs/String", f"http://{HOST}:{40000 + turn}/"
-            )
-        if answer[0] != 1:
-            refused.append(answer)
+        def act(number: int, turn: int) -> None:
+            name = f"/many_{number}_{turn}"
+            with master_at(calm.master) as server:
+                answer = server.registerPublisher(name, f"/t{name[1:]}", "std_msgs/String", node.uri)
+            if answer[0] != 1:
+                refused.append(answer)
 
-    def at_its_limit() -> list[Any]:
-        bystander(calm, 4)
-        return refused
+        def at_its_limit() -> list[Any]:
+            bystander(calm, 4)
+            return refused
 
-    with Flood(calm, 4, act):
-        eventually(at_its_limit, "the limit of one host is reached", 4 * LIMIT)
+        with Flood(calm, 4, act):
+            eventually(at_its_limit, "the limit of one host is reached", 4 * LIMIT)
     calm.denied(refused[0], "500 nodes, the limit for one host")
     calm.ros.talker("rospy", "/new_topic", name="newcomer")
     calm.ros.on(calm.ocu).listener("rospy", "/new_topic", name="new_ear").wait_for(event="received")

@@ -1,0 +1,68 @@
+"""How incarnations come: at once, also where there is no room for all of them."""
+
+import asyncio
+from typing import Any, cast
+
+import pytest
+
+from appliance.master.graph.registry import Incarnation, Registry
+from appliance.master.reach.places import NoPortError
+from appliance.master.upkeep.arrivals import Arrivals
+from appliance.policy.model import Address
+from tests.support.control_parts import ControlParts
+
+pytestmark = pytest.mark.anyio
+_NODES = 4
+
+
+class FewPorts:
+    """Places: two ports for each of `_NODES` nodes."""
+
+    def __init__(self, registry: Registry) -> None:
+        self._registry = registry
+
+    def open(self, _host: Address) -> tuple[int, ...]:
+        """As `Places`."""
+        taken = {port for node in self._registry.all() for port in node.ports}
+        free = [port for port in range(1, 2 * _NODES + 1) if port not in taken]
+        if not free:
+            raise NoPortError("all ports are in use")
+        return tuple(free[:2])
+
+
+class SlowFaces:
+    """Faces that take some turns of the loop to open."""
+
+    async def open(self, _incarnation: Incarnation) -> None:
+        """As `Faces`."""
+        for _turn in range(3):
+            await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("count", [2, 4, 8])
+async def test_who_comes_takes_no_room_from_who_comes_at_the_same_time(count: int) -> None:
+    """Where one more has room one more gets it, and the others hear that there is none."""
+    world = await ControlParts.begun()
+    arrivals = Arrivals(
+        world.registry,
+        world.graph,
+        world.enactor,
+        world.liveness,
+        places=cast(Any, FewPorts(world.registry)),
+        faces=cast(Any, SlowFaces()),
+        addresses=cast(Any, world.addresses),
+    )
+    cast(Any, world.faces).incarnation_for = arrivals.incarnation_for
+
+    async def come(number: int) -> Any:
+        uri = f"http://10.0.0.5:{4000 + number}/"
+        return await world.ask("registerPublisher", f"/n{number}", f"/t{number}", "std_msgs/String", uri)
+
+    for number in range(_NODES - 1):
+        assert (await come(number))[0] == 1
+    async with asyncio.timeout(10):
+        answers = await asyncio.gather(*(come(number) for number in range(10, 10 + count)))
+    assert [answer[0] for answer in answers] == [1] + [0] * (count - 1)
+    assert "all ports are in use" in answers[1][1]
+    assert [node.name for node in world.registry.all()] == ["/n0", "/n1", "/n2", "/n10"]
+    assert not any(node.calls for node in world.registry.all())
