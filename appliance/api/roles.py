@@ -28,7 +28,7 @@ class _Requires:
             raise ProblemError(
                 403,
                 "not-for-this-role",
-                f"this is for {self._role.name.lower()}s; the token {bearer.name} is a {bearer.role.name.lower()}'s",
+                f"this is for {self._least}s; the token {bearer.name} has the role {bearer.role.name.lower()}",
             )
         return bearer
 

@@ -73,11 +73,14 @@ def list_recordings(appliance: Appliance, as_json: Json = False) -> None:
 
     Example: rosrv record list
     """
-    for row in appliance.ask_or_exit(admin.RecordingsWanted(), as_json=as_json).recordings:
+    rows = appliance.ask_or_exit(admin.RecordingsWanted(), as_json=as_json).recordings
+    for row in rows:
         if as_json:
             say_json(row)
         else:
             say(f"{row.id}  {_moment(row.began)}  {_summary(row)}")
+    if not rows and not as_json:
+        say("nothing has been recorded: rosrv record now")
 
 
 @speaks

@@ -61,7 +61,7 @@ def list_tokens(appliance: Appliance, as_json: Json = False) -> None:
             end = f"revoked {moment(row.revoked)}"
         else:
             end = f"{'expired' if row.expires <= now else 'until'} {moment(row.expires)}"
-        say(f"{row.name:<24} {row.role:<9} {row.id}  made {moment(row.created)}  {end}")
+        say(f"{row.name:<24} {row.role:<12} {row.id}  made {moment(row.created)}  {end}")
 
 
 @app.command()

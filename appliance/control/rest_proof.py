@@ -70,7 +70,9 @@ class Askers:
             return _ITSELF if isinstance(made.request, admin.HostRequest) else ""
         row = await self._holder(made.shown)
         if not may(row.role, role):
-            raise UnprovenError(f"this is for {role}s; the token {row.name} is a {row.role}'s", row.name)
+            raise UnprovenError(
+                f"this is for {role}s; the token {row.name} has the role {row.role}", row.name
+            )
         if type(made.request) in CHANGES:
             self._require_order(made, row)
         return row.name

@@ -94,6 +94,7 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
     appliance: Appliance, ros: RosSession, tmp_path: Path
 ) -> None:
     """With what was dropped, what was said before and after, and the decisions; the log proves it, and who took it."""
+    assert appliance.rosrv("record", "list").stdout == "nothing has been recorded: rosrv record now\n"
     listener = ros.listener("roscpp", "/chatter", name="ear")
     for topic in ("/rude", "/secret/key"):
         ros.listener("rospy", topic)
