@@ -8,6 +8,7 @@ import re
 import shutil
 import struct
 import subprocess
+import sys
 import time
 import tracemalloc
 import zipfile
@@ -101,6 +102,16 @@ def test_it_proves_itself_on_a_machine_with_nothing(bundle: Path, pem: Path, tmp
         assert "right: this is what the appliance has sealed" in done.stdout
         assert "unproven" not in done.stdout.replace("unproven  that record", "")
     assert "compare it with one kept elsewhere" in done.stdout
+
+
+def test_an_old_python_runs_the_verifier(tmp_path: Path) -> None:
+    """Python 3.8, as Ubuntu 20.04 has it, knows every word, module and method of it; one that it lacks is found."""
+    newer = tmp_path / "newer.py"
+    newer.write_text(VERIFIER.read_text() + "print('a'.removeprefix('a'))\n")
+    for program, status in ((VERIFIER, 0), (newer, 1)):
+        command = [str(Path(sys.executable).with_name("vermin")), "--no-tips", "--target=3.8-", str(program)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == status, done.stdout + done.stderr
 
 
 def test_it_has_what_happened_and_what_was_in_force(bundle: Path, control: Control) -> None:
