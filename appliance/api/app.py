@@ -4,7 +4,7 @@ from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
-from starlette.routing import Match, Route
+from starlette.routing import compile_path
 
 import appliance
 from appliance.api import (
@@ -117,12 +117,10 @@ async def _of_http(request: Request, error: Exception) -> Response:
 
 
 def _methods(request: Request) -> set[str]:
-    """What can be done at a path; a path with two methods is two routes."""
-    found: set[str] = set()
-    for route in request.app.routes:
-        if isinstance(route, Route) and route.matches(request.scope)[0] is not Match.NONE:
-            found |= route.methods or set()
-    return found
+    """What can be done at a path, by the contract; pages outside it are only read."""
+    paths = request.app.openapi()["paths"].items()
+    here = [operations for path, operations in paths if compile_path(path)[0].match(request.url.path)]
+    return {method.upper() for operations in here for method in operations} or {"GET"}
 
 
 async def _invalid(request: Request, error: Exception) -> Response:
