@@ -23,7 +23,7 @@ from starlette.responses import Response
 from appliance.api.problems import ProblemError
 from appliance.config import Settings
 
-VIEWS = ("now", "graph", "audit", "policy", "monitors", "hosts")
+VIEWS = ("now", "graph", "audit", "policy", "monitors", "hosts", "recordings")
 _PREFIX = "/console/static/"
 _TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".woff2": "font/woff2"}
 _HEADERS = {

@@ -10,7 +10,16 @@ from playwright.sync_api import Browser, expect
 from tests.support.appliance import Appliance
 from tests.system.console.reader import Reader
 
-VIEWS = ["now", "graph", "audit?decision=deny", "policy", "monitors", "monitors/safeTrigger", "hosts"]
+VIEWS = [
+    "now",
+    "graph",
+    "audit?decision=deny",
+    "policy",
+    "monitors",
+    "monitors/safeTrigger",
+    "hosts",
+    "recordings",
+]
 
 
 @pytest.fixture(autouse=True)

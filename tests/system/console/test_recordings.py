@@ -37,7 +37,7 @@ def test_an_investigator_takes_a_recording_from_its_record(
     page = opened(token("investigator")).go(f"audit/{record['id']}")
     panel = page.get_by_role("region", name="Record")
     with page.expect_download() as bag:
-        panel.get_by_role("button", name="Messages").click()
+        panel.get_by_role("button", name="Bag").click()
     assert bag.value.suggested_filename == f"rosrv-{recording}.bag"
     assert bag.value.path().read_bytes().startswith(b"#ROSBAG V2.0")
     with page.expect_download() as bundle:
@@ -45,6 +45,6 @@ def test_an_investigator_takes_a_recording_from_its_record(
     with zipfile.ZipFile(bundle.value.path()) as archive:
         assert archive.read("recording/recording.bag") == bag.value.path().read_bytes()
     page = opened().go(f"audit/{record['id']}")
-    expect(page.get_by_role("button", name="Messages")).to_have_attribute(
+    expect(page.get_by_role("button", name="Bag")).to_have_attribute(
         "title", "For the role investigator; yours is admin"
     )

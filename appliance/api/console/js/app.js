@@ -17,9 +17,10 @@ import { Hosts } from "./hosts/view.js";
 import { Monitors } from "./monitors/view.js";
 import { Now } from "./now/view.js";
 import { PolicyView } from "./policy/view.js";
+import { Recordings } from "./recordings/view.js";
 import { NotLive } from "./standing.js";
 
-const SHOWN = { now: Now, graph: GraphView, audit: Audit, policy: PolicyView, monitors: Monitors, hosts: Hosts };
+const SHOWN = { now: Now, graph: GraphView, audit: Audit, policy: PolicyView, monitors: Monitors, hosts: Hosts, recordings: Recordings };
 
 export function App() {
   const { current, locked, number } = useStore(session);

@@ -31,6 +31,12 @@ export function minute(seconds) {
   return MINUTE.format(new Date(seconds * 1000));
 }
 
+/** The clock, with as much of a second as a line of so many seconds needs. @param {number} seconds since the epoch @param {number} span */
+export function clock(seconds, span) {
+  const part = span < 1 ? 3 : span < 20 ? 1 : 0;
+  return CLOCK.format(new Date(seconds * 1000)) + (part ? (seconds % 1).toFixed(3).slice(1, part + 2) : "");
+}
+
 /** A length of time in its two largest units. @param {number} seconds */
 export function lasting(seconds) {
   const units = /** @type {[string, number][]} */ ([["d", 86_400], ["h", 3600], ["min", 60], ["s", 1]]);

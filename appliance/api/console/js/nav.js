@@ -10,7 +10,7 @@ import { Pulse } from "./standing.js";
 import { useStore } from "./store.js";
 import { switchTheme, theme } from "./theme.js";
 
-export const TITLES = { now: "Now", graph: "Graph", audit: "Audit", policy: "Policy", monitors: "Monitors", hosts: "Hosts" };
+export const TITLES = { now: "Now", graph: "Graph", audit: "Audit", policy: "Policy", monitors: "Monitors", hosts: "Hosts", recordings: "Recordings" };
 
 export function Nav() {
   const { view } = useStore(place);

@@ -3,7 +3,7 @@
 import { html } from "./html.js";
 import { createStore } from "./store.js";
 
-export const VIEWS = ["now", "graph", "audit", "policy", "monitors", "hosts"];
+export const VIEWS = ["now", "graph", "audit", "policy", "monitors", "hosts", "recordings"];
 
 /** @typedef {{view: string, rest: string, query: URLSearchParams}} Place */
 

@@ -1,4 +1,4 @@
-/** Keys: 1 to 6 for the views, / for the search of a view, t for the theme, ? for this list. */
+/** Keys: 1 to 7 for the views, / for the search of a view, t for the theme, ? for this list. */
 
 import { html, useEffect, useState } from "./html.js";
 import { Dialog } from "./parts/dialog.js";
@@ -6,9 +6,10 @@ import { go, VIEWS } from "./router.js";
 import { switchTheme } from "./theme.js";
 
 const LIST = [
-  ["1 … 6", "Now, Graph, Audit, Policy, Monitors, Hosts"],
+  ["1 … 7", "Now, Graph, Audit, Policy, Monitors, Hosts, Recordings"],
   ["/", "Search in the view"],
-  ["j, k", "Next and previous record (Audit)"],
+  ["j, k", "Next and previous record (Audit), or event (a recording)"],
+  ["← →, + −, 0", "Move and zoom on the time line of a recording; Shift: ten times as far"],
   ["Esc", "Close what is open"],
   ["Ctrl S", "Dry run of the text in the editor"],
   ["t", "Dark or light"],

@@ -47,19 +47,12 @@ export function Evidence({ filter: { since, until } }) {
     title="All of this time, and what was in force, as a bundle that proves itself"><${Icon} name="down" size=${16} />Evidence</${Button}>`;
 }
 
-/** What was said while a recording was made. @param {{id: string}} given */
-export function Recording({ id }) {
-  const path = `/v1/recordings/${encodeURIComponent(id)}`;
-  return html`<div class="row"><${Button} role="investigator" onClick=${() => take(`${path}/bag`, `rosrv-${id}.bag`)}><${Icon} name="down" size=${16} />Messages</${Button}>
-    <${Button} role="investigator" onClick=${() => take(`${path}/evidence`, `rosrv-evidence-${id}.zip`)}><${Icon} name="down" size=${16} />Evidence</${Button}>
-    <span class="muted small">A bag; or a bundle with all of its time that proves itself. It is recorded who takes it.</span></div>`;
-}
-
 function now() {
   return new Date().toISOString().slice(0, 19).replaceAll(":", "");
 }
 
-async function take(/** @type {string} */ path, /** @type {string} */ name) {
+/** Give the reader what REST answers, as a file. */
+export async function take(/** @type {string} */ path, /** @type {string} */ name) {
   try {
     const response = await send("GET", path);
     save(await response.blob(), name);

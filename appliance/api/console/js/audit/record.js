@@ -8,6 +8,7 @@ import { Icon } from "../parts/icon.js";
 import { Failure, Loading } from "../parts/notice.js";
 import { useResource } from "../parts/resource.js";
 import { Rule } from "../parts/rule.js";
+import { OnTimeline } from "../recordings/taking.js";
 import { get } from "../rest.js";
 import { go, Link } from "../router.js";
 import { plain } from "../words.js";
@@ -15,7 +16,6 @@ import { Change } from "./change.js";
 import { Excerpt } from "./excerpt.js";
 import { auditPath } from "./filters.js";
 import { Grant } from "./grant.js";
-import { Recording } from "./proof.js";
 
 const EXPLAINED = new Set(["publish", "subscribe", "offer", "call", "command", "node", "read", "write"]);
 const SHOWN_APART = new Set(["before", "after", "before_fields", "after_fields"]);
@@ -51,7 +51,7 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
     ${record.rule && record.revision !== null && html`<${Excerpt} rule=${record.rule} revision=${record.revision} />`}
     ${record.decision && EXPLAINED.has(record.category) && html`<div class="row"><${Link} class="button" to=${explain(record)}>Explain in the policy</${Link}></div>`}
     ${(record.decision === "deny" || record.decision === "would deny") && EXPLAINED.has(record.category) && html`<${Grant} key=${record.id} id=${record.id} />`}
-    ${record.event === "recording closed" && html`<${Recording} id=${String(record.detail.recording)} />`}
+    <${OnTimeline} key=${`t${record.id}`} record=${record} />
     ${(record.detail.before || record.detail.after) && html`<div><h3>Message</h3><${Change} detail=${record.detail} /></div>`}
     ${detail.length > 0 && html`<div><h3>Details</h3><dl class="facts">${detail.map(([name, value]) => html`<dt key=${name}><${Given} value=${name} most=${40} /></dt><dd><${Given} value=${typeof value === "string" ? value : JSON.stringify(value)} most=${800} mono /></dd>`)}</dl></div>`}
     <${Around} title="Before it, by the same host or node" records=${before} filter=${filter} /><${Around} title="After it, by the same host or node" records=${after} filter=${filter} />

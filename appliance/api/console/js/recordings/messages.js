@@ -1,0 +1,53 @@
+/** What was said around a moment, decoded: for investigators, and each reading is recorded. */
+
+import { html, useEffect, useState } from "../html.js";
+import { clock } from "../moments.js";
+import { bytes } from "../numbers.js";
+import { Button } from "../parts/button.js";
+import { Given } from "../parts/given.js";
+import { Failure } from "../parts/notice.js";
+import { get } from "../rest.js";
+import { iso } from "./times.js";
+
+const PAUSE = 250; // after the last step on the time line
+const EACH = 5;
+
+/** @param {{path: string, at: number, topics: string[], clear: () => void, span: number}} given `topics`: none: of all */
+export function Messages({ path, at, topics, clear, span }) {
+  const [reading, setReading] = useState(false);
+  const [page, setPage] = useState(""); // the place of a message, when the reader has gone on from the moment
+  const [found, setFound] = useState(/** @type {any} */ (null));
+  const [error, setError] = useState(/** @type {unknown} */ (null));
+  useEffect(() => setPage(""), [at, topics]);
+  useEffect(() => {
+    if (!reading) return undefined;
+    const controller = new AbortController();
+    const timer = setTimeout(() => {
+      get(`${path}/messages`, { at: page || iso(at), topic: topics, neighbours: EACH }, controller.signal).then(
+        (body) => {
+          setFound(body);
+          setError(null);
+        },
+        (problem) => controller.signal.aborted || setError(problem),
+      );
+    }, PAUSE);
+    return () => {
+      clearTimeout(timer);
+      controller.abort();
+    };
+  }, [path, reading, at, page, topics]);
+  const messages = reading ? found?.messages ?? [] : [];
+  return html`<section class="panel" aria-labelledby="said"><div class="panel-head"><h2 id="said">What was said</h2>${topics.length > 0 && html`<span class="small"><${Given} value=${topics.join(", ")} mono most=${80} /> <button class="link" onClick=${clear}>all topics</button></span>`}
+      <span class="end">${reading && html`<button class="button small" disabled=${!messages.length} onClick=${() => setPage(messages[0].place)}>Earlier</button><button class="button small" disabled=${!messages.length} onClick=${() => setPage(messages[messages.length - 1].place)}>Later</button>`}
+        <${Button} small role="investigator" onClick=${() => setReading(!reading)}>${reading ? "Stop reading" : "Read messages"}</${Button}></span></div>
+    <div class="panel-body stack-tight">${error ? html`<${Failure} error=${error} />` : null}
+      ${!reading ? html`<p class="muted small">As they were sent, before monitors changed or dropped them. It is recorded who reads.</p>` : !messages.length && !error ? html`<p class="muted small" role="status">${found ? "No message." : "Reading."}</p>` : null}
+      <ul class="said" aria-label="Messages">${messages.map((/** @type {any} */ one, /** @type {number} */ place) => html`<li key=${one.place}><details open=${place === found.chosen || place === found.chosen - 1}>
+        <summary class=${place === found.chosen ? "chosen" : ""}><span class="mono small">${clock(one.time / 1e9, Math.min(span, 0.5))}</span> <${Given} value=${one.topic} mono most=${80} /> <span class="muted small"><${Given} value=${`${one.sender.node} ${one.sender.host}`} most=${120} />, ${bytes(one.size)}</span></summary>
+        ${one.why && html`<p class="small"><${Given} value=${one.why} most=${400} /></p>`}<pre class="bytes" tabindex="0" aria-label="Its fields">${lines(one.fields)}</pre></details></li>`)}</ul></div></section>`;
+}
+
+/** Fields as JSON, a field a line: the breaks are ours, whatever is in the fields. */
+function lines(/** @type {any} */ fields) {
+  return JSON.stringify(fields, null, 1).split("\n").map((line, at) => html`<div key=${at}><${Given} value=${line} most=${400} /></div>`);
+}

@@ -1,0 +1,61 @@
+/** What can be had of a recording, each by the role that may: its messages, a bundle that proves itself, its end. */
+
+import { html, useEffect, useState } from "../html.js";
+import { take } from "../audit/proof.js";
+import { isDenial } from "../notable.js";
+import { Button } from "../parts/button.js";
+import { Dialog } from "../parts/dialog.js";
+import { Icon } from "../parts/icon.js";
+import { done, failed } from "../parts/toast.js";
+import { ask, get, queryText } from "../rest.js";
+import { Link } from "../router.js";
+import { may } from "../session.js";
+import { iso } from "./times.js";
+
+/** @param {{row: any, small?: boolean}} given `row`: as `/v1/recordings` has it */
+export function Taking({ row, small = false }) {
+  const path = `/v1/recordings/${encodeURIComponent(row.id)}`;
+  const icon = !small && html`<${Icon} name="down" size=${16} />`;
+  const reads = may("investigator");
+  const evidence = reads ? `${path}/evidence` : `/v1/evidence${queryText({ since: iso(row.began), until: iso(row.ended) })}`;
+  return html`<${Button} small=${small} role="investigator" title="For rosbag, rqt_bag, PlotJuggler; it is recorded who takes it" onClick=${() => take(`${path}/bag`, `rosrv-${row.id}.bag`)}>${icon}Bag</${Button}>
+    <${Button} small=${small} role="investigator" title="For Foxglove; it is recorded who takes it" onClick=${() => take(`${path}/bag?format=mcap`, `rosrv-${row.id}.mcap`)}>${icon}MCAP</${Button}>
+    <${Button} small=${small} role=${reads ? "investigator" : "operator"} title=${`All of its time, and what was in force, as a bundle that proves itself${reads ? "" : "; without the messages, which are for investigators"}`} onClick=${() => take(evidence, `rosrv-evidence-${row.id}.zip`)}>${icon}Evidence</${Button}>`;
+}
+
+/** @param {{row: any, small?: boolean, gone: () => void}} given `gone`: what follows when it is removed */
+export function Remove({ row, small = false, gone }) {
+  const [asking, setAsking] = useState(false);
+  const remove = async () => {
+    try {
+      await ask("DELETE", `/v1/recordings/${encodeURIComponent(row.id)}`, { match: "*" });
+      done("The recording is removed", "It is recorded who removed it.");
+      setAsking(false);
+      gone();
+    } catch (failure) {
+      setAsking(false);
+      failed(failure);
+    }
+  };
+  return html`<${Button} small=${small} role="admin" tone="danger" onClick=${() => setAsking(true)}>Remove</${Button}>
+    ${asking && html`<${Dialog} title="Remove this recording?" close=${() => setAsking(false)} foot=${html`<button class="button" onClick=${() => setAsking(false)}>Keep it</button><${Button} role="admin" tone="danger" onClick=${remove}>Remove</${Button}>`}>
+      <p>Its messages are gone then. The audit log keeps its hash, and what happened.</p></${Dialog}>`}`;
+}
+
+/** Where a record of the audit log stands on the time line of a recording, if there is one of its time. @param {{record: any}} given */
+export function OnTimeline({ record }) {
+  const [found, setFound] = useState(/** @type {any} */ (null));
+  const closed = record.event === "recording closed" ? String(record.detail.recording) : "";
+  const asked = closed || isDenial(record) || record.category === "monitor" || ["warning", "alarm"].includes(record.severity);
+  useEffect(() => {
+    if (!asked) return undefined;
+    const controller = new AbortController();
+    const at = Date.parse(record.time) * 1e6;
+    // While the recorder is off, or its answer does not come, there is no time line to lead to.
+    get("/v1/recordings", {}, controller.signal).then(({ recordings }) => setFound(recordings.find((/** @type {any} */ one) => (closed ? one.id === closed : one.began <= at && at <= one.ended)) ?? null), () => setFound(null));
+    return () => controller.abort();
+  }, [record.id, asked]);
+  if (!found) return null;
+  return html`<div class="row"><${Link} class="button" to=${`/console/recordings/${found.id}${closed ? "" : `?record=${record.id}`}`}><${Icon} name="recordings" size=${16} />Time line</${Link}>${closed && html`<${Taking} row=${found} />`}
+    <span class="muted small">What was said around it was recorded.</span></div>`;
+}

@@ -1,0 +1,25 @@
+/** Times of recordings, which are nanoseconds since the epoch (a number here: exact to a microsecond). */
+
+/** RFC 3339, to the microsecond below. @param {number} time */
+export function iso(time) {
+  const micro = String(Math.floor(time / 1000) % 1000).padStart(3, "0");
+  return new Date(Math.floor(time / 1e6)).toISOString().replace("Z", `${micro}Z`);
+}
+
+/** What a trigger or event is called, and its colour. */
+export const KINDS = {
+  alarm: { name: "Alarms", tone: "deny" },
+  denial: { name: "Refused", tone: "deny" },
+  drop: { name: "Dropped", tone: "warn" },
+  change: { name: "Changed", tone: "note" },
+  verdict: { name: "Verdicts", tone: "note" },
+  fault: { name: "Faults", tone: "deny" },
+  notice: { name: "Else", tone: "" },
+  service: { name: "By a node", tone: "" },
+  order: { name: "By hand", tone: "" },
+};
+
+/** @param {string} kind @returns {{name: string, tone: string}} */
+export function kindOf(kind) {
+  return KINDS[/** @type {keyof typeof KINDS} */ (kind)] ?? { name: kind, tone: "" };
+}
