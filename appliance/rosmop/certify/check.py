@@ -11,6 +11,7 @@ would take too long.
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 from appliance.rosmop.certify import patterns, text
@@ -141,8 +142,8 @@ def _said(verdicts: Verdicts) -> str:
     return " and ".join(verdicts) or "nothing"
 
 
-def _check_past(formula: str, events: Sequence[str], tables: Tables) -> int:
-    past = Past(text.formula(formula, events, text.PTLTL))
+def _check_past(grammar: text.Grammar, formula: str, events: Sequence[str], tables: Tables) -> int:
+    past = Past(text.formula(formula, events, grammar))
     steps: dict[tuple[object, str], tuple[tuple[bool, ...], bool]] = {}
 
     def step(state: tuple[tuple[bool, ...], bool], event: str) -> tuple[tuple[bool, ...], bool]:
@@ -260,7 +261,8 @@ _CHECKS: dict[str, Callable[[str, Sequence[str], Tables], int]] = {
     "ere": _check_words,
     "fsm": _check_machine,
     "ltl": _check_future,
+    "mtl": partial(_check_past, text.MTL),
     "pattern": _check_pattern,
-    "ptltl": _check_past,
+    "ptltl": partial(_check_past, text.PTLTL),
     "tfsm": _check_machine,
 }

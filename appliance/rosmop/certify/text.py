@@ -107,6 +107,10 @@ LTL = (
     (*_BOOLEAN[:3], {**_BOOLEAN[3], **_FUTURE, **_SINCE}),
 )
 PTLTL = ({**_NOT, **_BACK}, (_SINCE, *_BOOLEAN))
+MTL = (
+    {**_NOT, **{word: word for word in ("previously", "once", "historically")}},
+    ({"since": "since"}, *_BOOLEAN),
+)
 """Of a logic: what stands before its one operand, and what stands between two, from the tightest to the loosest."""
 
 Grammar = tuple[Mapping[str, str], Sequence[Mapping[str, str]]]
@@ -115,7 +119,7 @@ Grammar = tuple[Mapping[str, str], Sequence[Mapping[str, str]]]
 def formula(text: str, events: Sequence[str], grammar: Grammar) -> Node:
     """A formula of temporal logic. Raises `UnreadError`."""
     unary, levels = grammar
-    signs = {"(", ")", *unary, *(sign for level in levels for sign in level)}
+    signs = {"(", ")", "[", "]", ",", *unary, *(sign for level in levels for sign in level)}
     words = Words(text, [sign for sign in signs if not sign.isidentifier()])
     node = _joined(words, events, grammar, len(levels) - 1, 0)
     words.end()
@@ -128,6 +132,7 @@ def _joined(words: Words, events: Sequence[str], grammar: Grammar, level: int, d
     node = _joined(words, events, grammar, level - 1, depth)
     while words.word in grammar[1][level]:
         operator = grammar[1][level][words.take()]
+        _unbounded(words, grammar)
         node = (operator, node, _joined(words, events, grammar, level - 1, depth))
     return node
 
@@ -138,6 +143,7 @@ def _operand(words: Words, events: Sequence[str], grammar: Grammar, depth: int) 
     unary, levels = grammar
     if words.word in unary:
         operator = unary[words.take()]
+        _unbounded(words, grammar)
         return (operator, _operand(words, events, grammar, depth + 1))
     if words.accept("("):
         node = _joined(words, events, grammar, len(levels) - 1, depth + 1)
@@ -149,6 +155,15 @@ def _operand(words: Words, events: Sequence[str], grammar: Grammar, depth: int) 
     if word not in events:
         raise UnreadError(f"{word!r} is no event")
     return ("event", word)
+
+
+def _unbounded(words: Words, grammar: Grammar) -> None:
+    """Take the bounds of mtl that bound nothing."""
+    if grammar is MTL and words.accept("["):
+        if words.duration() != 0:
+            raise UnreadError("a bound of time")
+        for word in (",", "inf", "]"):
+            words.expect(word)
 
 
 def expression(text: str, events: Sequence[str]) -> Node:

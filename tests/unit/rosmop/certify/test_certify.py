@@ -89,6 +89,11 @@ LOGICS: dict[str, Draw] = {
         ["U", "R", "S", "~S", "and", "or", "=>"],
         ["true"],
     ),
+    "mtl": drawn(
+        ["!", "previously", "once", "once[0,inf]", "historically"],
+        ["since", "since [0 ms, inf]", "and", "or", "xor", "=>", "<=>"],
+        ["true", "false"],
+    ),
     "pattern": pattern,
     "ptltl": drawn(
         ["!", "(*)", "~(*)", "<*>", "[*]"], ["S", "~S", "and", "or", "xor", "=>", "<=>"], ["true", "false"]
