@@ -13,7 +13,7 @@ while that is open; a cell tells its *users* when it is decided. Cells are made 
   a step costs the same however many wait.
 - `until` and `since` over parts that are open themselves keep *rows*, one for each event that matters. What is certain
   is what comes out alike whether all that is open were to fail or to hold (both operators only gain when a part comes
-  to hold); so it is computed twice, over all rows, whenever a part is decided.
+  to hold); so it is computed twice, over all rows, when a part is decided that was open.
 
 A run waits for at most `MOST_OPEN` events; a step beyond that is a fault, and its event is not seen.
 """
@@ -110,6 +110,7 @@ def _together(kind: str, operands: tuple[Value, ...]) -> bool:
 class _Row:
     """An event that an operator keeps: its time, what its operands are worth at it, and what it was asked for."""
 
+    place: int
     time: int
     left: Value | None
     right: Value | None
@@ -127,7 +128,7 @@ class _Operator(ABC):
 
     def ask(self, now: int) -> Value:
         """Its value at the event that happens now."""
-        self.rows.append(_Row(now, None, None, Cell()))
+        self.rows.append(_Row(self.run.place, now, None, None, Cell()))
         return self.rows[-1].cell or False
 
     @abstractmethod
@@ -137,6 +138,10 @@ class _Operator(ABC):
     @abstractmethod
     def settle(self) -> None:
         """Decide what can be, now that operands are decided."""
+
+    def hear(self, value: bool) -> None:
+        """An operand that was open has this value; `settle` is called for all such together."""
+        del value
 
     def pass_by(self, time: int) -> None:
         """There will be no event any more up to this time."""
@@ -183,14 +188,15 @@ def _wanted(row: _Row) -> bool:
 class _Rows(_Operator):
     """An operator that keeps what its operands are worth."""
 
-    def take(self, now: int) -> None:
+    def keep(self, now: int) -> _Row:
+        """The row of the event that happens now."""
         if not self.rows or self.rows[-1].left is not None:
-            self.rows.append(_Row(now, None, None, None))
+            self.rows.append(_Row(self.run.place, now, None, None, None))
         row = self.rows[-1]
         row.left, row.right = self.run.value(self.left), self.run.value(self.right)
         _use(row.left, self)
         _use(row.right, self)
-        self.run.look_at(self)
+        return row
 
     def drop(self) -> _Row:
         """Keep the oldest row no longer."""
@@ -202,31 +208,69 @@ class _Rows(_Operator):
 
 
 class _OpenUntil(_Rows):
-    """`until` over what may be open. All time up to `passed` is over."""
+    """`until` over what may be open. All time up to `passed` is over.
 
-    passed = -FOREVER
+    `hopes` are the rows at which the right operand may still come. As long as it has come at no row, and the left one
+    has failed at none (`noted`), a row is decided only when its time is over and nothing in it may come any more.
+    """
+
+    def __init__(self, run: "BoundedRun", number: int, one: Instruction) -> None:
+        super().__init__(run, number, one)
+        self.passed = -FOREVER
+        self.hopes: deque[_Row] = deque()
+        self.noted = False
 
     def take(self, now: int) -> None:
-        if self.rows:
-            super().take(now)
+        if not self.rows:
+            return
+        row = self.keep(now)
+        if isinstance(row.right, Cell):
+            self.hopes.append(row)
+        if row.right is True or row.left is False:
+            self.noted = True
+            self.run.look_at(self)
+
+    def hear(self, value: bool) -> None:
+        self.noted |= value or self.left in self.run.later
 
     def settle(self) -> None:
-        least, most = self._values(hopeful=False), self._values(hopeful=True)
-        for row in reversed(self.rows):
-            sure, possible = next(least), next(most)
-            if sure is possible:
-                self.run.decide(row.cell, sure)
+        if self.noted:
+            least, most = self._values(hopeful=False), self._values(hopeful=True)
+            for row in reversed(self.rows):
+                sure, possible = next(least), next(most)
+                if sure is possible:
+                    self.run.decide(row.cell, sure)
+        else:
+            self._close()
         while self.rows and not _wanted(self.rows[0]):
             self.drop()
+        if self.noted:
+            self.noted = any(
+                _supposed(row.right, hopeful=False) or not _supposed(row.left, hopeful=True)
+                for row in self.rows
+            )
+
+    def _close(self) -> None:
+        """Decide the rows whose time is over, where nothing may come any more."""
+        while self.hopes and _known(self.hopes[0].right or False) is not None:
+            self.hopes.popleft()
+        for row in self.rows:
+            if row.time + self.high > self.passed:
+                break
+            if not any(self._may_come(row, hope) for hope in self.hopes):
+                self.run.decide(row.cell, False)
+
+    def _may_come(self, row: _Row, hope: _Row) -> bool:
+        inside = self.low <= hope.time - row.time <= self.high and hope.place >= row.place
+        return inside and _known(hope.right or False) is None
 
     def _values(self, *, hopeful: bool) -> Iterator[bool]:
         """What it is worth from the newest row to the oldest if all that is open were to hold, or to fail."""
-        goods: list[
-            int
-        ] = []  # the times at which the right operand holds, negated, as far as the left one reaches
+        # The times at which the right operand holds, negated, as far as the left one reaches.
+        goods: list[int] = []
         onward = hopeful
         for row in reversed(self.rows):
-            left, right = (_supposed(value, hopeful) for value in (row.left, row.right))
+            left, right = (_supposed(value, hopeful=hopeful) for value in (row.left, row.right))
             if not left:
                 goods.clear()
                 onward = False
@@ -252,27 +296,41 @@ class _OpenUntil(_Rows):
         )
 
 
-def _supposed(value: Value | None, hopeful: bool) -> bool:
+def _supposed(value: Value | None, *, hopeful: bool) -> bool:
     known = None if value is None else _known(value)
     return hopeful if known is None else known
 
 
 class _OpenSince(_Rows):
-    """`since` over what may be open; `window` is where the rows begin."""
+    """`since` over what may be open; `window` is where the rows begin.
+
+    `least` and `most` are behind the newest row, if all that is open were to fail, or to hold.
+    """
 
     def __init__(self, run: "BoundedRun", number: int, one: Instruction) -> None:
         super().__init__(run, number, one)
         self.window = Window(self.low, self.high)
+        self.least, self.most = self.window.copy(), self.window.copy()
+
+    def take(self, now: int) -> None:
+        self._judge(self.keep(now))
+        self._forget()
 
     def settle(self) -> None:
-        least, most = self.window.copy(), self.window.copy()
+        self.least, self.most = self.window.copy(), self.window.copy()
         for row in self.rows:
-            sure, possible = (
-                window.step(_supposed(row.left, hopeful), _supposed(row.right, hopeful), row.time)
-                for window, hopeful in ((least, False), (most, True))
-            )
-            if sure is possible:
-                self.run.decide(row.cell, sure)
+            self._judge(row)
+        self._forget()
+
+    def _judge(self, row: _Row) -> None:
+        sure, possible = (
+            window.step(_supposed(row.left, hopeful=hopeful), _supposed(row.right, hopeful=hopeful), row.time)
+            for window, hopeful in ((self.least, False), (self.most, True))
+        )
+        if sure is possible:
+            self.run.decide(row.cell, sure)
+
+    def _forget(self) -> None:
         while self.rows:
             row = self.rows[0]
             left, right = (None if value is None else _known(value) for value in (row.left, row.right))
@@ -421,6 +479,8 @@ class BoundedRun:
     def __init__(self, compiled: BoundedProperty, time_ns: int) -> None:
         self._compiled = compiled
         self._at_once, _ = compiled.make(time_ns)
+        self.later = compiled.later
+        self.place = 0
         self._operators = compiled.operators(self)
         self._now = time_ns
         self._values: list[Value | None] = []
@@ -443,6 +503,7 @@ class BoundedRun:
             self._now = time_ns
         if sum(len(operator.rows) for operator in self._operators.values()) >= MOST_OPEN:
             raise RunFaultError(f"more than {MOST_OPEN} events wait for what follows them")
+        self.place += 1
         self._values = self._at_once(event, self._now)
         whole = self.value(self._compiled.program.result)
         if isinstance(whole, Cell):
@@ -515,6 +576,7 @@ class BoundedRun:
             self._told.add(cell.value)
         for user in cell.users:
             if not isinstance(user, Cell):
+                user.hear(cell.value)
                 self._looked_at.add(user)
             elif user.value is None:
                 value = user.hear(cell.value)
