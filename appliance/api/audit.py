@@ -17,7 +17,7 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.responses import JSONResponse, StreamingResponse
 
 from appliance.api.access import Bearer
-from appliance.api.judgement import granted
+from appliance.api.judgement import explained, granted, is_refusal
 from appliance.api.problems import ProblemError
 from appliance.api.roles import OPERATOR, VIEWER, Viewer, ask
 from appliance.api.routing import Responses, Routes
@@ -36,7 +36,7 @@ from appliance.audit.search import Follower, search, show
 from appliance.audit.signatures import KeyUnreadableError
 from appliance.audit.verify import verify
 from appliance.channel.admin import PolicyWanted
-from appliance.channel.answers.policy import Granted
+from appliance.channel.answers.policy import Granted, Why
 from appliance.policy.grant import UngrantableError
 from appliance.shares.table import REST_STREAM_PEERS, REST_STREAMS
 
@@ -250,6 +250,23 @@ def routes(services: Services) -> Routes:
             raise ProblemError(404, "unknown", f"there is no record {record_id}")
         around = {"before": list(map(as_object, shown.before)), "after": list(map(as_object, shown.after))}
         return JSONResponse({"record": as_object(shown.entry), **around})
+
+    @router.get("/{record_id}/why", operation_id="why_of_record", responses=_UNKNOWN)
+    async def why_of_record(record_id: OneRecord, bearer: Viewer) -> Why:
+        """Why what a record tells happened: who did it, which events and values made it so, at which line.
+
+        Of a monitor's verdict the events are such that they alone give it; of a refusal there is the smallest change of
+        the policy in force that would allow it.
+        """
+        shown = await desk.read(show, desk.path, record_id, 0)
+        if shown is None:
+            raise ProblemError(404, "unknown", f"there is no record {record_id}")
+        record = shown.entry.record
+        known = None
+        if is_refusal(record):
+            known = await ask(services.control, PolicyWanted(), bearer)
+        async with services.judging:
+            return await asyncio.to_thread(explained, record, known)
 
     @router.get("/{record_id}/grant", operation_id="grant_of_record", responses=_UNKNOWN | _NO_GRANT)
     async def grant_of_record(record_id: OneRecord, bearer: Viewer) -> Granted:

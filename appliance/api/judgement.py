@@ -12,9 +12,10 @@ import msgspec
 
 from appliance.api.problems import Finding, ProblemError
 from appliance.audit.record import Record
+from appliance.audit.why import lines_of
 from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.graph import Registration
-from appliance.channel.answers.policy import Granted, PolicyKnown
+from appliance.channel.answers.policy import Granted, PolicyKnown, Why
 from appliance.policy import (
     Category,
     Difference,
@@ -32,7 +33,7 @@ from appliance.policy import (
     judge,
 )
 from appliance.policy.actions import BadWordError, check_resource, find_hosts
-from appliance.policy.grant import asked, grant
+from appliance.policy.grant import UngrantableError, asked, grant
 from appliance.policy.rights import needs_node
 
 
@@ -73,6 +74,23 @@ def granted(record: Record, current: PolicyKnown) -> Granted:
         text=found.text,
         findings=found.findings("policy", known) if found.added else [],
     )
+
+
+def explained(record: Record, current: PolicyKnown | None) -> Why:
+    """Why what a record tells happened; for a refusal the policy in force is needed."""
+    found, refusal = None, ""
+    if current is not None:
+        try:
+            found = granted(record, current)
+        except UngrantableError as error:
+            refusal = str(error)
+    added = [f"would be allowed by: {line}" for line in found.added] if found is not None else []
+    return Why(lines=[*lines_of(record), *added], grant=found, refusal=refusal)
+
+
+def is_refusal(record: Record) -> bool:
+    """Whether a change of the policy might have allowed what a record tells."""
+    return record.event == "decision" and record.decision in ("deny", "would deny")
 
 
 def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Judged:

@@ -48,6 +48,10 @@ def test_what_was_refused_is_granted_on_trial(appliance: Appliance) -> None:
     rest = appliance.rest().get(f"/v1/audit/{record}/grant").json
     assert rest["added"] == ["/cmd_vel = ocu robot"]
     assert rest["findings"] == []
+    why = appliance.rosrv("audit", "why", record).stdout.splitlines()
+    assert why[-1] == "would be allowed by: /cmd_vel = ocu robot"
+    assert any(line.startswith("rule: [Publishers] /cmd*") for line in why)
+    assert appliance.rest().get(f"/v1/audit/{record}/why").json["lines"] == why
     done = appliance.rosrv("policy", "grant", record, "--load", "--confirm-within", "5m")
     assert "unless you say: rosrv policy confirm" in done.stdout
     with ServerProxy(appliance.master_uri) as master:
@@ -65,5 +69,7 @@ def test_what_no_policy_grants_is_said(appliance: Appliance) -> None:
     rest = appliance.rest()
     assert rest.get(f"/v1/audit/{record}/grant").status == 409
     assert rest.get("/v1/audit/ffffffffffffffffffff/grant").status == 404
+    assert rest.get("/v1/audit/ffffffffffffffffffff/why").status == 404
+    assert rest.get(f"/v1/audit/{record}/why").json["refusal"]
     started = appliance.recorded("--event", "appliance started")[0]["id"]
     assert "no record of a decision" in appliance.rosrv("policy", "grant", started, check=False).stderr

@@ -72,6 +72,16 @@ class PolicyConfirmed(msgspec.Struct, frozen=True):
     revision: int
 
 
+class Why(msgspec.Struct, frozen=True, kw_only=True):
+    """Why what a record tells happened; of a refusal also what would have to change in the policy."""
+
+    lines: Annotated[
+        list[str], told("for people: who, which events and values made it so, at which lines of which files")
+    ]
+    grant: Annotated["Granted | None", told("of a refusal: the smallest change that would allow it")]
+    refusal: Annotated[str, told("of a refusal: why no change of the policy would; else empty")]
+
+
 class Granted(msgspec.Struct, frozen=True, kw_only=True):
     """The smallest change of the policy in force that grants what a record says was refused. Nothing is changed."""
 

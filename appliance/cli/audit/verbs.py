@@ -31,10 +31,12 @@ from appliance.cli.audit.output import (
     print_verification,
     write,
 )
+from appliance.cli.policy.granting import why
 from appliance.cli.progress import progress
 from appliance.cli.running import Appliance, speaks
 
 app = typer.Typer(help="Review the audit log and prove that it is complete.", no_args_is_help=True)
+app.command()(why)
 
 _POLL_SECONDS = 0.2
 _CHECKPOINT_SECONDS = 5.0  # between two looks: one is made a minute, and a look over REST is itself recorded

@@ -19,6 +19,7 @@ from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.why import Sender
 
 _OWN = "/rosrv"  # the appliance: what monitors publish is not given to monitors
 
@@ -188,13 +189,18 @@ def replay(
         connection.topic for connection in reader.connections if refusals.get(connection.id, "") is None
     )
     begun = False
+    asked = _Asked()
+    monitors.explain_when(asked, asked)
     try:
         for index, (connection, time_ns, data) in enumerate(reader.messages()):
             if connection.id not in refusals or not span[0] <= time_ns <= span[1]:
                 continue
             if not begun:
                 started, begun = monitors.start(time_ns, expected), True
-            outcome = _outcome(monitors, connection, time_ns, data, refusals[connection.id])
+            asked.now = time_ns
+            outcome = _outcome(
+                monitors, connection, time_ns, data, refusals[connection.id], Sender(index + 1)
+            )
             if started is not None:
                 outcome = _after(started, outcome)
                 started = None
@@ -211,11 +217,31 @@ def replay(
         raise usage_error(f"the bag is damaged: {error}") from error
 
 
-def _outcome(
-    monitors: MonitorSet, connection: Connection, time_ns: int, data: bytes, refusal: str | None
+class _Asked:
+    """Of each category of a property the first verdict of a second is explained, as on the robot."""
+
+    def __init__(self) -> None:
+        self.now = 0
+        self._told: dict[tuple[str, int, str], int] = {}
+
+    def __call__(self, monitor: str, index: int, category: str, _source: int) -> bool:
+        key, second = (monitor, index, category), self.now // 10**9
+        if self._told.get(key) == second:
+            return False
+        self._told[key] = second
+        return True
+
+
+def _outcome(  # noqa: PLR0917  a message, and what is known of it
+    monitors: MonitorSet,
+    connection: Connection,
+    time_ns: int,
+    data: bytes,
+    refusal: str | None,
+    sender: Sender,
 ) -> Outcome:
     if refusal is None:
-        return monitors.judge(connection.topic, data, time_ns)
+        return monitors.judge(connection.topic, data, time_ns, sender)
     outcome = Outcome(data, time_ns)
     outcome.result, outcome.reason, outcome.before = "dropped", refusal, monitors.advance(time_ns)
     return outcome

@@ -1,10 +1,13 @@
 """How the monitor verbs show things: findings, and what came of every message of a recording."""
 
 from collections.abc import Iterator
+from typing import Any
 
+from appliance.audit.why import lines_of_why
 from appliance.cli.output import say, say_json
+from appliance.rosmop.explained import explained as reasons
 from appliance.rosmop.monitor import Monitor
-from appliance.rosmop.outcomes import Fault, Outcome, bound
+from appliance.rosmop.outcomes import Fault, Outcome, Verdict, bound
 from appliance.rosmop.positions import Finding
 
 BILLION = 1_000_000_000
@@ -43,6 +46,7 @@ def record(outcome: Outcome, index: int | None = None, topic: str | None = None)
                 "logic": verdict.logic,
                 "category": verdict.category,
                 **({"binding": dict(verdict.binding)} if verdict.binding else {}),
+                **reasons(verdict, _place),
             }
             for verdict in outcome.verdicts
         ],
@@ -65,6 +69,15 @@ def explained(monitor: Monitor) -> Iterator[str]:
     yield f"a slice for each {names}, begun by {begins}; at most {slices.limit} at a time"
 
 
+def because(verdict: Verdict) -> Iterator[str]:
+    """Which messages of the recording made a verdict so."""
+    return lines_of_why(reasons(verdict, _place).get("why", {}))
+
+
+def _place(source: int) -> dict[str, Any]:
+    return {"index": source - 1}
+
+
 def _fault(fault: Fault) -> dict[str, object]:
     return {
         "file": fault.position.file,
@@ -84,6 +97,7 @@ def lines(outcome: Outcome, index: int | None = None, topic: str | None = None) 
     for verdict in outcome.verdicts:
         name = f"{verdict.monitor} ({verdict.logic} property {verdict.property})"
         yield f"{head}: {verdict.category} of {name}{bound(verdict)}"
+        yield from (f"{head}:   {line}" for line in because(verdict))
     for message in outcome.published:
         yield f"{head}: published {message.topic} {message.type}"
     for line in outcome.log:

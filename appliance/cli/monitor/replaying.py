@@ -16,7 +16,7 @@ from rosbags.rosbag1 import Reader
 from appliance.channel import admin
 from appliance.cli.monitor.bag import Replayed, definitions_of, open_bag, refusals, replay
 from appliance.cli.monitor.input import read_definitions, read_specifications, usage_error
-from appliance.cli.monitor.output import BILLION
+from appliance.cli.monitor.output import BILLION, because
 from appliance.cli.monitor.recorded import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
 from appliance.cli.monitor.running import WIDE
 from appliance.cli.output import Json, counted, printable, say, say_json
@@ -279,7 +279,7 @@ def _found(outcome: Outcome) -> Iterator[_Found]:
         yield _Found(monitor, "change", ", ".join(own))
     for verdict in outcome.verdicts:
         text = f"{verdict.category} of property {verdict.property + 1} ({verdict.logic}){bound(verdict)}"
-        yield _Found(verdict.monitor, "verdict", text)
+        yield _Found(verdict.monitor, "verdict", "; ".join((text, *because(verdict))))
     for line in outcome.log:
         if line.level not in ("DEBUG", "INFO"):
             yield _Found(line.monitor, "warning", line.text)

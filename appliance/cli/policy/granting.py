@@ -1,18 +1,61 @@
 """`rosrv policy grant`: what would grant a request that was refused, as the smallest change of the policy in force."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import typer
 
 from appliance.channel.admin import PolicyLoad, PolicyWanted
-from appliance.channel.answers.policy import Granted
+from appliance.channel.answers.policy import Granted, Why
+from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.audit.errors import Errors, fail
 from appliance.cli.output import Json, printable, say, say_json, usage_error
 from appliance.cli.policy.running import say_loaded
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.trials import ConfirmWithin, seconds_within
+
+
+@speaks
+def why(
+    appliance: Appliance,
+    record: Annotated[str, typer.Argument(metavar="RECORD", help="The record's id, or its sequence")],
+    *,
+    as_json: Json = False,
+) -> None:
+    """Say why what a record tells happened: who, which events and values, which line; what would allow a refusal.
+
+    The named events alone give a monitor's verdict. The record may be of a log whose appliance is stopped; only what
+    would allow a refusal is asked of the running appliance.
+
+    Example: rosrv audit why 18e9aa02efc40abb0e51
+    """
+    found = _explained(appliance, record)
+    if as_json:
+        say_json(found)
+        return
+    for line in found.lines:
+        say(printable(line), "green" if line.startswith("would be allowed by") else "")
+    if found.refusal:
+        say(printable(found.refusal), "yellow")
+
+
+def _explained(appliance: Appliance, record: str) -> Why:
+    if appliance.place is not None:
+        return msgspec.convert(_over_rest(appliance, record, "why"), Why)
+    from appliance.api.judgement import explained, is_refusal  # noqa: PLC0415  not for every verb
+
+    with Errors():
+        shown = appliance.audit().show(record, 0)
+        if shown is None:
+            fail(f"no record with the id {record!a} is in the log", 1)
+        found = shown.entry.record
+        try:
+            known = appliance.ask(PolicyWanted()).given() if is_refusal(found) else None
+        except NotRunningError as error:
+            typer.echo(f"rosrv audit: {error}; what would allow it is not known without it", err=True)
+            known = None
+        return explained(found, known)
 
 
 @speaks
@@ -74,7 +117,7 @@ def _show(found: Granted) -> None:
 def _granted(appliance: Appliance, record: str) -> Granted:
     """Over REST the appliance works it out, over the socket this program."""
     if appliance.place is not None:
-        return _over_rest(appliance, record)
+        return msgspec.convert(_over_rest(appliance, record, "grant"), Granted)
     from appliance.api.judgement import granted  # noqa: PLC0415  not for every verb
     from appliance.policy.grant import UngrantableError  # noqa: PLC0415  as above
 
@@ -89,7 +132,7 @@ def _granted(appliance: Appliance, record: str) -> Granted:
             fail(str(error), 1)
 
 
-def _over_rest(appliance: Appliance, record: str) -> Granted:
+def _over_rest(appliance: Appliance, record: str, what: str) -> dict[str, Any]:
     from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
     from appliance.cli.rest.way import RestWay  # noqa: PLC0415  as above
 
@@ -97,7 +140,7 @@ def _over_rest(appliance: Appliance, record: str) -> Granted:
     if not record.isalnum():
         raise usage_error(f"{printable(record)} is no id of a record")
     try:
-        return msgspec.convert(appliance.way.client.call("GET", f"/v1/audit/{record}/grant"), Granted)
+        return appliance.way.client.call("GET", f"/v1/audit/{record}/{what}")
     except ProblemError as problem:
         typer.echo(f"rosrv policy: {problem.lines[0]}", err=True)
         raise typer.Exit(1) from None

@@ -43,7 +43,9 @@ from appliance.policy import (
 from appliance.policy.actions import BadWordError, check_resource
 from appliance.policy.explain import Explanation, render
 from appliance.policy.findings import Severity
-from appliance.policy.rights import needs_node
+from appliance.policy.grant import Asked, UngrantableError
+from appliance.policy.grant import grant as grant_of
+from appliance.policy.rights import needs_node, rights_of
 
 app = typer.Typer(
     help="Check, explain, test, compare, learn and change access policies.", no_args_is_help=True
@@ -107,6 +109,20 @@ def _tried(appliance: Appliance, file: Path, robot: list[str] | None, enrolled: 
         return Trial(error.findings, [])
 
 
+def _allowing(
+    file: Path, request: Request, robot: list[str] | None, enrolled: list[str] | None
+) -> Iterator[str]:
+    """The smallest change of the policy that would allow it."""
+    try:
+        found = grant_of(
+            read_text(file), str(file), known_of(robot, enrolled), Asked(request, rights_of(request))
+        )
+    except UngrantableError as error:
+        yield str(error)
+        return
+    yield from (f"would be allowed by: {line}" for line in found.added)
+
+
 @app.command("explain")
 def explain_request(
     file: _File,
@@ -156,6 +172,9 @@ def explain_request(
     else:
         for line in render(explanation):
             say(line, "green" if explanation.allowed else "red")
+        if not explanation.allowed:
+            for line in _allowing(file, request, robot, enrolled):
+                say(line)
     raise typer.Exit(0 if explanation.allowed else 1)
 
 

@@ -108,6 +108,7 @@ def test_answers_are_as_the_contract_shows_them(rest: Rest) -> None:
     for call, name in (
         (f"GET /v1/audit/{refusal}", "audit_record"),
         (f"GET /v1/audit/{refusal}/grant", "Granted"),
+        (f"GET /v1/audit/{refusal}/why", "Why"),
     ):
         found += differences(asked(rest, call), EXAMPLES[name], call)
     assert found == []

@@ -239,13 +239,18 @@ def test_a_recording_goes_through_the_monitors(tmp_path: Path) -> None:
     result = invoke("run", write(tmp_path, "a.rv", GOOD), "--bag", bag, "--json")
     assert result.exit_code == 0, result.stderr
     empty: dict[str, object] = {"verdicts": [], "published": [], "log": [], "faults": []}
+    events = [
+        {"event": "e", "index": 0, "time": "1970-01-01T00:01:40.250000+00:00"},
+        {"event": "tick", "time": "1970-01-01T00:01:41.250000+00:00"},
+    ]
+    why = {"events": events, "fewest": True}
     assert records(result) == [
         {"index": 0, "topic": "/t", "time": 100.25, "outcome": "changed", "events": ["counter.e"], **empty,
          "log": [{"level": "INFO", "text": "1", "monitor": "counter"}]},
         {"index": 1, "topic": "/t", "time": 100.5, "outcome": "dropped", "events": ["counter.e"], **empty},
         {"index": 2, "topic": "/other", "time": 100.75, "outcome": "passed", "events": [], **empty},
         {"timer": "counter.tick", "time": 101.25, "outcome": "passed", "events": ["counter.tick"], **empty,
-         "verdicts": [{"monitor": "counter", "property": 0, "logic": "ere", "category": "match"}],
+         "verdicts": [{"monitor": "counter", "property": 0, "logic": "ere", "category": "match", "why": why}],
          "log": [{"level": "WARN", "text": "tick", "monitor": "counter"}]},
         {"index": 3, "topic": "/t", "time": 101.5, "outcome": "changed", "events": ["counter.e"], **empty,
          "log": [{"level": "INFO", "text": "3", "monitor": "counter"}]},

@@ -695,3 +695,29 @@ def test_a_monitor_that_comes_from_another_relay_holds_its_topics_if_it_is_decla
     world.state(MonitorResumed("gate"))
     world.state(SpecificationsStated(4, files, {}, {}, False, moved=("gate", "free")))
     assert world.until(lambda: world.taken(SpecificationsTaken, 4)).held == []
+
+
+def test_a_verdict_says_who_and_which_messages_made_it_so(world: Monitored) -> None:
+    """Those that alone give it, by name, though others came between and most went through the module."""
+    world.load("""latch() {
+    event on(std::string text) /chatter std_msgs/String '{data:text}' when (text == "on") { }
+    event off(std::string text) /chatter std_msgs/String '{data:text}' when (text == "off") { }
+    event go(std::string text) /chatter std_msgs/String '{data:text}' when (text == "go") { }
+    fsm: idle [ on -> armed, off -> idle, go -> idle ] armed [ on -> armed, off -> idle, go -> fired ]
+         fired [ default fired ]
+    @fired { ROS_WARN("fired"); DROP; }
+}""")
+    publisher, _subscriber = world.typed()
+    publisher.send(b"".join(map(string, ("on", "off", "x", "on", "on", "y", "go"))))
+    verdict = world.event("verdict", monitor="latch", count=0)
+    assert verdict.detail["at"] == ["0.rv:5:10"]
+    assert verdict.detail["number"] == 7
+    why = verdict.detail["why"]
+    told = [(one["event"], one["state"], one["node"], one["host"], one["on"]) for one in why["events"]]
+    assert told == [
+        (name, state, "/talker", LOOPBACK, "/chatter") for name, state in (("on", "armed"), ("go", "fired"))
+    ]
+    assert why["fewest"] is True
+    drop = world.event("drop", monitor="latch", count=0)
+    assert drop.detail["at"] == ["0.rv:7:33"]
+    assert drop.detail["conditions"] == {"0.rv:4:77": {"text": "go"}}

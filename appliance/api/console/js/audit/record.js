@@ -16,9 +16,11 @@ import { Change } from "./change.js";
 import { Excerpt } from "./excerpt.js";
 import { auditPath } from "./filters.js";
 import { Grant } from "./grant.js";
+import { Why } from "./why.js";
 
 const EXPLAINED = new Set(["publish", "subscribe", "offer", "call", "command", "node", "read", "write"]);
-const SHOWN_APART = new Set(["before", "after", "before_fields", "after_fields"]);
+const SHOWN_APART = new Set(["before", "after", "before_fields", "after_fields", "at", "conditions", "why"]);
+const MONITORS = new Set(["monitor verdict", "message dropped", "message changed", "trial observed"]);
 
 /** @param {{id: string, filter: Record<string, string>}} given */
 export function RecordPanel({ id, filter }) {
@@ -48,6 +50,7 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
       ${record.revision !== null && html`<dt>Policy</dt><dd>revision ${record.revision}</dd>`}
       ${record.decision && html`<dt>Rule</dt><dd><${Rule} rule=${record.rule} revision=${record.revision} /></dd>`}
     </dl>
+    ${MONITORS.has(record.event) && !record.detail.count && html`<${Why} key=${record.id} id=${record.id} />`}
     ${record.rule && record.revision !== null && html`<${Excerpt} rule=${record.rule} revision=${record.revision} />`}
     ${record.decision && EXPLAINED.has(record.category) && html`<div class="row"><${Link} class="button" to=${explain(record)}>Explain in the policy</${Link}></div>`}
     ${(record.decision === "deny" || record.decision === "would deny") && EXPLAINED.has(record.category) && html`<${Grant} key=${record.id} id=${record.id} />`}

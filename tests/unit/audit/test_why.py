@@ -1,0 +1,57 @@
+"""Why what a record tells happened, in lines."""
+
+from appliance.audit.record import Record, RuleReference, Severity
+from appliance.audit.why import lines_of
+
+
+def test_a_verdict() -> None:
+    """Who, where, the values, the events, and how far they explain it."""
+    event = {
+        "event": "go",
+        "time": "12:00",
+        "node": "/a",
+        "host": "10.0.0.1",
+        "on": "/t",
+        "seq": 7,
+        "state": "bad",
+    }
+    why = {"events": [event], "fewest": False, "since": "11:00", "decided": ["a is true"]}
+    detail = {"number": 3, "at": ["x.rv:1:2"], "conditions": {"x.rv:3:4": {"x": 2}}, "why": why}
+    record = Record(
+        id="1", time=1, event="monitor verdict", reason="bad", host="10.0.0.1", caller_id="/a", detail=detail
+    )
+    assert list(lines_of(record)) == [
+        "bad",
+        "by: message number 3 of /a on 10.0.0.1",
+        "at: x.rv:1:2",
+        "where: x.rv:3:4, x = 2",
+        "because: go at 12:00, on /t, by /a, on 10.0.0.1 seq 7 -> bad",
+        "but: this is enough only for the property as it was at 11:00; what came before is not kept",
+        "but: fewer of them might do",
+        "so: a is true",
+    ]
+
+
+def test_what_is_not_known_is_said() -> None:
+    """A verdict without an explanation, one that needed no event, one whose events are too many to be told."""
+    bare = Record(id="1", time=1, event="monitor verdict", reason="bad")
+    assert list(lines_of(bare))[-1].startswith("because: which events made it so is not known")
+    silent = Record(id="1", time=1, event="monitor verdict", reason="bad", detail={"why": {"events": []}})
+    assert list(lines_of(silent)) == ["bad", "because: no event was needed: time has passed"]
+    events = [{"event": str(number), "time": "12:00"} for number in range(10)]
+    many = Record(id="1", time=1, event="monitor verdict", detail={"why": {"events": events, "left_out": 4}})
+    assert list(lines_of(many))[6] == "because: … 4 more …"
+
+
+def test_a_refusal() -> None:
+    """Its rule; what would allow it is asked of the policy in force."""
+    rule = RuleReference("Publishers", "/t", "robot.ini", 4)
+    record = Record(
+        id="1", time=1, event="decision", decision="deny", severity=Severity.WARNING, reason="no", host="10.0.0.1",
+        rule=rule,
+    )  # fmt: skip
+    assert list(lines_of(record)) == ["no", "by: on 10.0.0.1", "rule: [Publishers] /t robot.ini:4"]
+    other = Record(
+        id="1", time=1, event="policy loaded", reason="by somebody", detail={"why": "strange", "at": 3}
+    )
+    assert list(lines_of(other)) == ["by somebody"]
