@@ -1,0 +1,213 @@
+"""The flight recorder beside `rosbag record`, on the same traffic: `python -m benchmarks.recorder [--seconds 15]`.
+
+One node talks on fifty topics (20 MB/s in all) or on five (0.1 MB/s), one listens, on loopback, in turns: at a plain
+master, there with `rosbag record -a` (and `rosbag_snapshot`, if the machine has it), at the appliance without and with
+the recorder. Of what was recorded: messages, and those that are missing between the first and the last of a topic;
+seconds from the end of what is recorded until the whole file is there. Of the machine: processor time of the relay and
+the recorder until then, or of `rosbag record` until it is asked to end, in percent of a core over the seconds that are
+recorded; the median delay from publisher to subscriber.
+"""
+
+import argparse
+import json
+import os
+import signal
+import statistics
+import struct
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+from rosbags.rosbag1 import Reader
+
+from benchmarks.relay_throughput import cpu_seconds
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.nodes import ROOT, RosSession
+from tests.support.rosmaster import PlainMaster
+from tests.support.waiting import eventually
+
+LOADS = {"fifty topics, 20 MB/s": (50, 8192, 50), "five topics, 0.1 MB/s": (5, 1024, 20)}
+_SOURCE = Path(__file__).parent / "nodes" / "recorder_load.cpp"
+_PROGRAM = ROOT / "build" / "benchmarks" / "recorder_load"
+_SNAPSHOT = next((place for place in Path("/").glob("opt/ros/*/lib/rosbag_snapshot/snapshot")), None)
+_HEAD = struct.Struct("<4xQ")  # of a std_msgs/String: its length, the number
+_WARM_SECONDS = 3.0
+_CONFIGURATION = """
+recorder: {{enabled: {enabled}, memory: 512MiB, before: {seconds}, disk: 8GiB, triggers: []}}
+audit: {{reserve_bytes: 1MiB}}
+"""
+
+
+class Bag(NamedTuple):
+    """What a bag has of the load."""
+
+    messages: int
+    lost: int
+    closed: float
+    """Seconds from the end of what is recorded to the whole file."""
+
+
+@dataclass
+class Result:
+    """One run; `cpu` is percent of a core by the name of the process."""
+
+    p50: float
+    bag: Bag | None = None
+    cpu: dict[str, float] = field(default_factory=dict)
+
+
+class Load:
+    """The two nodes at a master, warm."""
+
+    def __init__(self, session: RosSession, topics: int, size: int, hertz: int) -> None:
+        self._talker = session.start(
+            [str(_PROGRAM), "talk", str(topics), str(size), str(hertz)], label="talker"
+        )
+        self._talker.wait_for(event="ready")
+        self._listener = session.start([str(_PROGRAM), "listen", str(topics)], label="listener")
+        self._listener.wait_for(event="ready")
+        self.last(_WARM_SECONDS)
+
+    def last(self, seconds: float) -> None:
+        """For so long it goes on."""
+        try:
+            self._listener.popen.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return
+        raise SystemExit(f"the listener ended: {self._listener.story()}")
+
+    def end(self) -> float:
+        """The median delay that the listener saw, in microseconds."""
+        self._listener.interrupt()
+        heard = self._listener.wait_for(event="heard")
+        self._talker.stop()
+        return float(heard["p50_us"])
+
+
+@contextmanager
+def measured(pids: Mapping[str, int], seconds: float, into: dict[str, float]) -> Iterator[None]:
+    """The processor time of these processes within, in percent of a core over so many seconds."""
+    before = {name: cpu_seconds(pid) for name, pid in pids.items()}
+    yield
+    into |= {name: 100 * (cpu_seconds(pid) - before[name]) / seconds for name, pid in pids.items()}
+
+
+def counted(path: Path, closed: float) -> Bag:
+    """How many messages of the load a bag has, and how many are missing between the first and the last of a topic."""
+    numbers: dict[str, set[int]] = {}
+    with Reader(path) as reader:
+        for connection, _time, data in reader.messages():
+            if connection.topic.startswith("/load/"):
+                numbers.setdefault(connection.topic, set()).add(_HEAD.unpack_from(data)[0])
+    lost = sum(max(seen) - min(seen) + 1 - len(seen) for seen in numbers.values())
+    return Bag(sum(map(len, numbers.values())), lost, closed)
+
+
+def at_plain_master(folder: Path, load: tuple[int, int, int], seconds: float, recorder: str) -> Result:
+    """With no recorder, `rosbag`, or `snapshot`."""
+    with PlainMaster(folder) as master, RosSession(master.master_uri, folder) as session:
+        running = Load(session, *load)
+        if not recorder:
+            running.last(seconds)
+            return Result(running.end())
+        bag, cpu = folder / "rosbag.bag", dict[str, float]()
+        if recorder == "rosbag":
+            command = ["/usr/lib/rosbag/record", "-a", "-O", str(bag)]
+        else:
+            names = [f"/load/t{number}" for number in range(load[0])]
+            command = [str(_SNAPSHOT), "-d", str(seconds), "-s", "1000", *names]
+        process = session.start(command, label=recorder)
+        if recorder == "rosbag":
+            eventually(bag.with_suffix(".bag.active").exists, "rosbag records")
+        with measured({recorder: process.pid}, seconds, cpu):
+            running.last(seconds)
+        ended = time.monotonic()
+        if recorder == "rosbag":
+            process.interrupt(signal.SIGINT)
+            process.popen.wait(120)
+        else:
+            session.run(str(_SNAPSHOT), "-t", "-O", str(bag), timeout=120)
+        closed = time.monotonic() - ended
+        return Result(running.end(), counted(bag, closed), cpu)
+
+
+def at_appliance(folder: Path, load: tuple[int, int, int], seconds: float, *, recorder: bool) -> Result:
+    """Without and with the recorder, which is asked at the end for the seconds before."""
+    configuration = folder / "appliance.yaml"
+    configuration.write_text(_CONFIGURATION.format(enabled=str(recorder).lower(), seconds=seconds))
+    options = ("--config", str(configuration))
+    with (
+        Appliance(policy=OPEN_POLICY, options=options) as appliance,
+        RosSession(appliance.master_uri, folder) as session,
+    ):
+        pids = {
+            row["role"]: row["pid"]
+            for row in appliance.status()["processes"]
+            if row["role"] in ("relay", "recorder")
+        }
+        running, cpu = Load(session, *load), dict[str, float]()
+        if not recorder:
+            with measured(pids, seconds, cpu):
+                running.last(seconds)
+            return Result(running.end(), cpu=cpu)
+        with measured(pids, seconds, cpu):
+            running.last(seconds)
+            order = ("record", "now", "--before", f"{seconds:g}s", "--after", "1s", "--json")
+            begun = json.loads(appliance.rosrv(*order).stdout)
+            bag = appliance.state / "recordings" / begun["id"] / "recording.bag"
+            eventually(bag.exists, appliance.story, 120)
+            closed = time.time() - begun["ends"] / 1e9
+        return Result(running.end(), counted(bag, closed), cpu)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--seconds", type=float, default=15, help="that are recorded")
+    parser.add_argument("--rounds", type=int, default=1)
+    given = parser.parse_args()
+    subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(_SOURCE), str(_PROGRAM)], check=True)
+    snapshot = ["snapshot"] if _SNAPSHOT is not None else []
+    for title, load in LOADS.items():
+        results: dict[str, list[Result]] = {}
+        for _round in range(given.rounds):
+            for name in ("plain", "rosbag", *snapshot, "appliance", "recorder"):
+                with tempfile.TemporaryDirectory(prefix="rosrv-benchmark-") as place:
+                    folder = Path(place)
+                    folder.chmod(0o755)  # the appliance's processes run as other users
+                    if name in ("appliance", "recorder"):
+                        result = at_appliance(folder, load, given.seconds, recorder=name == "recorder")
+                    else:
+                        result = at_plain_master(folder, load, given.seconds, name if name != "plain" else "")
+                results.setdefault(name, []).append(result)
+        show(title, results)
+    if not snapshot:
+        Console().print("rosbag_snapshot is not on this machine: no row for it")
+    Console().print(f"load average of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+
+
+def show(title: str, results: Mapping[str, list[Result]]) -> None:
+    """Print the medians of the rounds."""
+    table = Table("", "messages", "lost", "file after s", "percent of a core", "p50 µs", title=title)
+    for name, runs in results.items():
+        bags = [run.bag for run in runs if run.bag is not None]
+        cells = [
+            f"{statistics.median(bag[place] for bag in bags):,.{digits}f}" if bags else "-"
+            for place, digits in ((0, 0), (1, 0), (2, 1))
+        ]
+        cpu = ", ".join(
+            f"{role} {statistics.median(run.cpu[role] for run in runs):.0f}" for role in runs[0].cpu
+        )
+        table.add_row(name, *cells, cpu or "-", f"{statistics.median(run.p50 for run in runs):,.0f}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
