@@ -8,6 +8,7 @@ What the monitors do is otherwise the same, and nobody's messages are kept.
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 from appliance.learning.recordings import Recording
@@ -116,7 +117,7 @@ class _Marked:
     def _mark(self, item: Item) -> tree.Statement:
         name = f"covered_{len(self.items)}_"
         self.items[name] = item
-        text = f"m() {{ long {name} = 0; init() {{ {name} = {name} + 1; }} }}"
+        text = f"m() {{ static long {name} = 0; init() {{ {name} = {name} + 1; }} }}"
         (specification,) = parse(text, item.position.file).specifications
         self._declared += specification.declarations
         return specification.inits[0].body.statements[0]
@@ -203,6 +204,9 @@ class _Run:
         self._watch = watch
         self._run = run
         self._state = state
+
+    def __copy__(self) -> "_Run":
+        return _Run(self._watch, copy(self._run), self._state)
 
     @property
     def deadline(self) -> int | None:

@@ -590,11 +590,12 @@ class MonitorSet:
             return False
 
         key = (True,) if found is True else tuple(found)
-        slices = step.monitor.slices
         self._bound = Bound(step.index, step.event.binds, key, message.time, self._sender)
-        if slices is not None and slices.step(step.index, key):
-            step.monitor.trail.append(self._bound)
-            outcome.events = (*outcome.events, step.name)
+        happened = step.monitor.slices.step(step.index, key)  # type: ignore[union-attr]  # who has a key has slices
+        if happened is not None:
+            if happened:
+                step.monitor.trail.append(self._bound)
+                outcome.events = (*outcome.events, step.name)
             return False
 
         def act(outcome: Outcome, message: Message | None) -> bool:
@@ -923,7 +924,8 @@ class MonitorSet:
         self._begin_variables(monitors, outcome)
         for monitor in monitors:
             if monitor.slices is not None:
-                monitor.slices.begin(tuple(running.run for running in monitor.properties))
+                codes = [running.code for running in monitor.properties]
+                monitor.slices.begin(codes, tuple(running.run for running in monitor.properties))
 
     def _begin_variables(self, monitors: Sequence[Monitor], outcome: Outcome) -> None:
         beginning = list(monitors)

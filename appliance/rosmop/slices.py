@@ -78,9 +78,8 @@ class Slices:
 
     def __init__(self, code: SpecificationCode, namespace: dict[str, Any], limit: int) -> None:
         assert code.slicing is not None  # noqa: S101  who asks has looked
-        finite = [one for one in code.properties if isinstance(one.property, FiniteProperty)]
-        every = len(finite) == len(code.properties)
-        self.limit = limit if every else min(limit, GROWING_LIMIT)
+        grows = any(not isinstance(one.property, FiniteProperty) for one in code.properties)
+        self.limit = min(limit, GROWING_LIMIT) if grows else limit
         self.refused: Mapping[str, object] | None = None
         """What the last event bound of which there can be no slice."""
         self.why = ""
@@ -96,27 +95,33 @@ class Slices:
         self._first: Slice
         self._known = {domain: _Known() for domain in _joined(_domain(event) for event in code.events)}
         self._ended: deque[tuple[int, Key]] = deque()
-        ends = (
-            every and bool(finite) and not any(event.acts for event in code.events if event.period_ns is None)
-        )
-        self._lost = [_lost(one) for one in finite] if ends else []
-        self._idles = _idles(code, self._all)
         self._whole = self._known[self._all].slices
+        self._look_at(code.properties)
+        for wanted in {_domain(event) for event in code.events}:
+            for domain, known in self._known.items():
+                if wanted & domain not in (0, domain):
+                    known.parts.setdefault(wanted & domain, {})
+
+    def _look_at(self, properties: Sequence[PropertyCode]) -> None:
+        """Find out in which states of automata a slice is over, as if there were none, or nothing but a state."""
+        events = self._code.events
+        finite = [one for one in properties if isinstance(one.property, FiniteProperty)]
+        every = len(finite) == len(properties)
+        ends = every and bool(finite) and not any(one.acts for one in events if one.period_ns is None)
+        self._lost = [_lost(one) for one in finite] if ends else []
+        self._idles = _idles(events, finite, self._all) if every and finite else None
         lost = self._lost or [frozenset()] * len(finite)
         idles = self._idles or [-1] * len(finite)
         self._calm = [
             [*map(_calm, finite, repeat(number), lost, idles)]
             if every and event.plain and _domain(event) == self._all
             else None
-            for number, event in enumerate(code.events)
+            for number, event in enumerate(events)
         ]
-        for wanted in {_domain(event) for event in code.events}:
-            for domain, known in self._known.items():
-                if wanted & domain not in (0, domain):
-                    known.parts.setdefault(wanted & domain, {})
 
-    def begin(self, runs: tuple[Run, ...]) -> None:
+    def begin(self, properties: Sequence[PropertyCode], runs: tuple[Run, ...]) -> None:
         """The specification begins: there are no slices, and the next ones begin as it has."""
+        self._look_at(properties)
         zero = tuple(self._namespace[code] for _, code, _ in self._parameters)
         values = tuple(self._namespace[name] for name in self._own)
         self._first = Slice(0, (True, *zero), runs, values)
@@ -139,19 +144,29 @@ class Slices:
 
     # What an event belongs to
 
-    def step(self, event: int, key: Key) -> bool:
-        """Let an event happen in the slice of this binding if it has all parameters and nothing else comes of it."""
-        calm = self._calm[event]
-        one = self._whole.get(key)
+    def step(self, event: int, key: Key) -> bool | None:
+        """Let an event happen in the one slice that it binds all parameters of, if nothing comes of it but states.
+
+        Whether it has happened (not where the slice is over); None: there is more to do, and nothing is done.
+        """
+        if key not in self._whole:
+            return None
+        one, calm = self._whole[key], self._calm[event]
         if one is None or calm is None:
-            return False
-        runs = one.runs
-        after = [*map(getitem, calm, _states(runs))]
-        if after and min(after) < 0:
-            return False
-        for run, state in zip(runs, after, strict=True):
-            run.state = state  # type: ignore[attr-defined]  # of tables
-        return True
+            return False if one is None else None
+        if len(calm) == 1:  # as below, for most
+            run: Any = one.runs[0]
+            state = calm[0][run.state]
+            if state < 0:
+                return None
+            run.state = state
+            return True
+        after = [*map(getitem, calm, _states(one.runs))]
+        if min(after, default=0) >= 0:
+            for run, state in zip(one.runs, after, strict=True):
+                run.state = state
+            return True
+        return None
 
     def targets(self, event: EventCode, key: Key) -> tuple[Sequence[Slice], Sequence[Slice]]:
         """The slices with all parameters that an event belongs to, in the order in which they began, and the others.
@@ -365,21 +380,22 @@ def _lost(code: PropertyCode) -> frozenset[int]:
         hopeful |= more
 
 
-def _idles(code: SpecificationCode, everything: int) -> list[int] | None:
+def _idles(
+    events: Sequence[EventCode], properties: Sequence[PropertyCode], everything: int
+) -> list[int] | None:
     """The states of the properties in which a slice is as if there were none; None if that cannot be."""
-    properties = [one.property for one in code.properties if isinstance(one.property, FiniteProperty)]
-    if not properties or len(properties) < len(code.properties):
-        return None
-    for number, event in enumerate(code.events):
-        if _domain(event) != everything:
-            return None
+    automata = [
+        (one.property.automaton, {*one.order})
+        for one in properties
+        if isinstance(one.property, FiniteProperty)
+    ]
+    initial = [automaton.initial for automaton, _ in automata]
+    for number, event in enumerate(events):
         stays = event.plain and all(
-            one.property.automaton.table[one.property.automaton.initial][number]
-            == one.property.automaton.initial
-            and not {*one.property.automaton.verdicts[one.property.automaton.initial]} & {*one.order}
-            for one in code.properties
-            if isinstance(one.property, FiniteProperty)
+            automaton.table[automaton.initial][number] == automaton.initial
+            and handled.isdisjoint(automaton.verdicts[automaton.initial])
+            for automaton, handled in automata
         )
-        if not (event.creates or stays):
+        if _domain(event) != everything or not (event.creates or stays):
             return None
-    return [one.automaton.initial for one in properties]
+    return initial

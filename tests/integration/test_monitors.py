@@ -476,3 +476,21 @@ def test_the_publisher_has_the_configured_name_and_is_hidden_and_faults_pass(
         assert [text.startswith("checked") for text in heard] == [True, False, True]
         assert appliance.recorded(event="monitor fault")[0]["detail"]["values"]["heard"] == 2
         assert "/guard" not in ros.run("rostopic", "info", "/alarm").stdout
+
+
+def test_each_goal_of_an_action_is_monitored_by_itself(appliance: Appliance, ros: RosSession) -> None:
+    """The shipped `goals.rv`: an id that comes again and again is told of; actionlib's own goal has no record."""
+    appliance.rosrv("monitor", "load", str(ROOT / "monitors" / "goals.rv"))
+    goal = "{goal_id: {id: twin}, goal: {goal: 1}}"
+    twins = ros.start(["rostopic", "pub", "-r", "5", "/count/goal", "actionlib/TestActionGoal", goal])
+    verdicts = appliance.recorded(event="monitor verdict", resource="/count/goal")
+    told = next(one for one in verdicts if "category" in one["detail"])  # the others are sums of a second
+    assert (told["detail"]["category"], told["detail"]["binding"]) == ("twice", {"id": "twin"})
+    assert told["reason"] == "property 1 of goals (fsm) with id = twin: twice"
+    said = "another goal has the id twin, which is not answered yet"
+    assert all(one["reason"].endswith(said) for one in appliance.recorded(event="monitor log"))
+    twins.stop()
+    ros.node("rospy", "action", "server", name="counter")
+    client = ros.node("rospy", "action", "client", name="asker")
+    assert client.wait_for(event="result")["result"] == 3
+    assert all("twin" in one["reason"] for one in appliance.recorded(event="monitor verdict"))

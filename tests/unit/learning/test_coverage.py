@@ -115,3 +115,21 @@ def test_an_error_is_that_of_the_text() -> None:
     with pytest.raises(SpecificationError) as caught:
         covered({"gate.rv": TEXT.replace("n--", "m--")}, standard_definitions(), [])
     assert str(caught.value.findings[0]).startswith("gate.rv:7:28: error: there is no variable `m`")
+
+
+def test_slices_are_counted_together() -> None:
+    """Of a parametric specification: what any of its slices exercised."""
+    text = """gate(int id) {
+    event open(int id) /open std_msgs/Int32 '{data:id}' { }
+    event shut(int id) /shut std_msgs/Int32 '{data:id}' { if (id == 2) ROS_INFO("2"); }
+    fsm: closed [ open -> opened ] opened [ shut -> closed ]
+    @fail { __RESET; }
+}"""
+    messages = [("/open", 1), ("/open", 2), ("/shut", 1), ("/shut", 2), ("/shut", 1)]
+    found = covered({"gate.rv": text}, standard_definitions(), [recorded("a", messages)])
+    counts = {f"{item.kind} {item.what}": count for item, count in found.items()}
+    assert counts["event open"] == 2
+    assert counts["branch if"] == 1
+    assert counts["state opened"] == 2
+    assert counts["state closed"] == 2
+    assert counts["handler @fail"] == 1

@@ -45,9 +45,7 @@ class Made:
     parameters: str
     binds: dict[str, str]
     creation: str
-    logic: str
-    formula: str
-    handlers: tuple[tuple[str, str], ...]
+    properties: tuple[str, ...]
     actions: dict[str, str]
 
     def text(self, binding: bool) -> str:
@@ -61,9 +59,17 @@ class Made:
             lines.append(
                 f"{word}event {event}({own}) /{event} std_msgs/Header '{{{fields}}}' {{ {self.actions[event]} }}"
             )
-        lines.append(f"{self.logic}: {self.formula}")
-        lines += [f"@{category} {{ {body} }}" for category, body in self.handlers]
-        return "\n".join([*lines, "}"])
+        return "\n".join([*lines, *self.properties, "}"])
+
+
+def a_property(random: Random) -> str:
+    """A random formula with handlers."""
+    logic = random.choice(list(FORMULAS))
+    body = ['ROS_INFO("%d", n);', "n = n * 2;", 'ROS_INFO("%d", n); __RESET;', ""]
+    handlers = [
+        f"@{one} {{ {random.choice(body)} }}" for one in random.sample(TWO[logic], random.randint(1, 2))
+    ]
+    return "\n".join([f"{logic}: {random.choice(FORMULAS[logic])}", *handlers])
 
 
 def made(random: Random) -> Made:
@@ -73,17 +79,12 @@ def made(random: Random) -> Made:
         binds = {event: "".join(one for one in parameters if random.random() < 0.7) for event in "abc"}
         if set("".join(binds.values())) == set(parameters):
             break
-    logic = random.choice(list(FORMULAS))
-    categories = random.sample(TWO[logic], random.randint(1, 2))
-    body = ['ROS_INFO("%d", n);', "n = n * 2;", 'ROS_INFO("%d", n); __RESET;', ""]
     actions = ["", "", "n = n + 1;", "if (n % 3 == 2) n = 7; else n = n + 1;", 'ROS_WARN("%d", n);']
     return Made(
         parameters,
         binds,
         random.choice(["", "", "a", "ab", "b"]),
-        logic,
-        random.choice(FORMULAS[logic]),
-        tuple((category, random.choice(body)) for category in categories),
+        tuple(a_property(random) for _ in range(random.choice((1, 1, 2)))),
         {event: random.choice(actions) for event in "abc"},
     )
 

@@ -1,0 +1,98 @@
+"""What slices cost: `python -m benchmarks.slices`.
+
+The same property without parameters and with one, at 10,000 live slices that are visited in turn; the memory of 100,000
+slices; an event that concerns all of them, and one that brings a verdict of each; how fast ids that nobody has seen are
+taken, and refused beyond the bound. Microseconds of processor time, the least of the rounds.
+"""
+
+import struct
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from appliance.ros.standard import standard_definitions
+from appliance.rosmop.engine import MonitorSet
+
+LIVE = 10_000
+MANY = 100_000
+ROUNDS = 7
+
+PROPERTIES = {
+    "fsm": 'fsm: idle [ goal -> active ] active [ goal -> active, result -> idle ] @fail { ROS_WARN("twice"); }',
+    "ere": 'ere: goal+ result @match { ROS_INFO("answered"); }',
+    "ptltl": 'ptltl: result => <*> goal @violation { ROS_WARN("answered what was not asked"); }',
+}
+SPECIFICATION = """goals(%s) {
+    event goal(std::string id) /goal std_msgs/String '{data:id}' { }
+    event result(std::string id) /result std_msgs/String '{data:id}' { }
+    event stop() /stop std_msgs/Empty '{}' { }
+    %s
+}
+"""
+ALL = SPECIFICATION % ("std::string id", "ere: goal stop stop @match { }")
+
+
+def ids(count: int) -> list[bytes]:
+    """Messages with ids as actionlib makes them."""
+    made = (b"/planner-%d-%d.%09d" % (number, 1_700_000_000 + number, number) for number in range(count))
+    return [struct.pack("<I", len(one)) + one for one in made]
+
+
+def monitors(text: str) -> MonitorSet:
+    """A set that has begun."""
+    loaded = MonitorSet.load({"slices.rv": text}, standard_definitions(), slices=MANY)
+    loaded.start(0)
+    return loaded
+
+
+def microseconds(action: Callable[[], object], times: int, rounds: int = ROUNDS) -> float:
+    """Processor time of one of so many."""
+    found = []
+    for _ in range(rounds):
+        started = time.process_time()
+        action()
+        found.append((time.process_time() - started) / times)
+    return min(found) * 1e6
+
+
+def visited(text: str, messages: Sequence[bytes]) -> float:
+    """Of a message, when those of all slices come in turn."""
+    loaded = monitors(text)
+
+    def visit() -> None:
+        for message in messages:
+            loaded.process("/goal", message, 1)
+
+    visit()
+    return microseconds(visit, len(messages))
+
+
+def resident() -> float:
+    """Megabytes of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+
+
+def main() -> None:
+    """Print what is measured."""
+    few, many = ids(LIVE), ids(MANY + LIVE)
+    for name, formula in PROPERTIES.items():
+        plain = visited(SPECIFICATION % ("", formula), few)
+        sliced = visited(SPECIFICATION % ("std::string id", formula), few)
+        print(
+            f"{name}: {plain:.2f} µs without parameters, {sliced:.2f} µs with {LIVE} slices: {sliced / plain:.2f} x"
+        )
+    loaded, before = monitors(ALL), resident()
+    begun = microseconds(lambda: [loaded.process("/goal", one, 1) for one in many[:MANY]], MANY, 1)
+    print(f"{MANY} slices: {resident() - before:.0f} MB, {begun:.2f} µs for each that begins")
+    refused = microseconds(lambda: [loaded.process("/goal", one, 1) for one in many[MANY:]], LIVE, 1)
+    print(f"beyond the bound: {refused:.2f} µs for each that is refused")
+    print(
+        f"an event of all of them: {microseconds(lambda: loaded.process('/stop', b'', 2), MANY, 1):.2f} µs for each"
+    )
+    print(
+        f"a verdict of all of them: {microseconds(lambda: loaded.process('/stop', b'', 3), MANY, 1):.2f} µs for each"
+    )
+
+
+if __name__ == "__main__":
+    main()
