@@ -56,6 +56,9 @@ Asked = Callable[[str, int, str, int], bool]
 TRIAL_BUDGET = 100_000
 """Instructions that a specification on trial may spend on one message: what waits meanwhile waits some milliseconds."""
 
+EXPLAINED = 20
+"""Verdicts of slices that are explained of those which one message brings about: each takes a millisecond."""
+
 MAX_TICKS = 100_000
 """Ticks of one timer between two messages; a clock that jumps further leaves the rest out, and says so."""
 
@@ -154,6 +157,7 @@ class MonitorSet:
         self._asked: Asked | None = None
         self._sender = NOBODY
         self._bound: Bound | None = None
+        self._explains = True
         self._timed = False
         self._walks = Walks()
         self._broken = False
@@ -637,12 +641,14 @@ class MonitorSet:
                 return
         for one in whole:
             outcome.events, outcome.verdicts, outcome.faults = before, (), ()
+            self._explains = len(verdicts) < EXPLAINED
             dropped = self._in_slice(step.monitor, one, outcome, message, act)
             names = outcome.events if outcome.events is not before else names
             verdicts += outcome.verdicts  # many slices: a tuple would be copied with each
             faults += outcome.faults
             if dropped:
                 break
+        self._explains = False  # of seeds nothing is told
         for one in () if dropped else seeds:
             unseen = Outcome(time=outcome.time)
             lines, published = len(turn.log), len(turn.published)
@@ -650,6 +656,7 @@ class MonitorSet:
             self._in_slice(step.monitor, one, unseen, copied, act)
             del turn.log[lines:], turn.published[published:]
             faults += unseen.faults
+        self._explains = True
         outcome.events, outcome.verdicts, outcome.faults = names, tuple(verdicts), tuple(faults)
         if refused is not None and not dropped:
             self._refuse_slice(step, refused, why, message, outcome)
@@ -772,7 +779,7 @@ class MonitorSet:
         if slices is None or one is None:
             why = running.history.explain(category) if asked else None
             return Verdict(monitor.name, index, source.logic, category, source, why)
-        if asked:
+        if asked and self._explains:
             why = of_slice(running.code.property, monitor.trail, slices.values(one), category)
         return Verdict(monitor.name, index, source.logic, category, source, why, slices.binding(one))
 

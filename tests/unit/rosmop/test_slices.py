@@ -13,7 +13,7 @@ import pytest
 
 from appliance.rosmop.certify.properties import certificates_of
 from appliance.rosmop.compile.specification import compile_files
-from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.engine import EXPLAINED, MonitorSet
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.slices import GROWING_LIMIT, MAX_BINDING
 from appliance.rosmop.syntax.parser import parse
@@ -388,5 +388,8 @@ def test_one_message_may_concern_all_slices() -> None:
         monitors.process("/goal", text(str(number)), 1)
     outcome = monitors.process("/stop", b"", 2)
     assert [each.binding["id"] for each in outcome.verdicts] == [str(number) for number in range(3000)]
+    assert [each.why is not None for each in outcome.verdicts] == [True] * EXPLAINED + [False] * (
+        3000 - EXPLAINED
+    )
     assert outcome.events == ("goals.stop",)
     assert live(monitors) == 0
