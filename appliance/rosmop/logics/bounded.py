@@ -578,7 +578,7 @@ class BoundedRun:
             if not isinstance(user, Cell):
                 user.hear(cell.value)
                 self._looked_at.add(user)
-            elif user.value is None:
+            elif user.wanted:  # who waited for it may have been decided by another user a moment ago
                 value = user.hear(cell.value)
                 if value is not None:
                     self.decide(user, value)

@@ -258,3 +258,17 @@ def test_without_an_upper_bound(text: str) -> None:
     """It is refused, and what to write is said."""
     (finding,) = refusal("mtl", text)
     assert "has no upper bound, so its verdict might never come; write" in finding
+
+
+def test_a_part_that_nobody_waits_for_any_more() -> None:
+    """It may hear, in the same step, of what it had waited for."""
+    text = (
+        "next[0ns,1ns] previously[0ns,inf] (b -> a)"
+        " or historically[0ns,inf] eventually[0ns,1ns] false and next[1ns,4ns] eventually[0ns,2ns] true"
+    )
+    part: Tree = ("previously", ("implies", ("event", "b"), ("event", "a")), (0, None))
+    other: Tree = ("historically", ("eventually", ("false",), (0, 1)), (0, None))
+    last: Tree = ("next", ("eventually", ("true",), (0, 2)), (1, 4))
+    tree: Tree = ("or", ("next", part, (0, 1)), ("and", other, last))
+    trace = list(zip((4, 4, 5, 5, 5, 5, 6, 7, 8), "cbbaaacbb", strict=True))
+    assert told(text, trace, 40) == expected(tree, trace, 40)
