@@ -29,7 +29,13 @@ RUN python3 -m venv /opt/rosrv \
  && find /opt/rosrv/lib -name '*.so' -exec strip --strip-unneeded {} + \
  && find /opt/rosrv/lib -name direct_url.json -delete
 COPY appliance /opt/rosrv/lib/python3.11/site-packages/appliance
-RUN printf '#!/opt/rosrv/bin/python -P\nfrom appliance.cli.main import main\n\nmain()\n' > /opt/rosrv/bin/rosrv \
+COPY policies /build/etc/policies
+COPY monitors /build/etc/monitors
+# Rights and times of a checkout are its owner's. He may keep his files to himself (umask 077): the processes' users
+# read them all the same; and when he fetched them is nothing that an image is to say.
+RUN chmod -R u=rwX,go=rX /opt/rosrv/lib/python3.11/site-packages/appliance /build/etc \
+ && find /opt/rosrv/lib/python3.11/site-packages/appliance /build/etc -exec touch {} + \
+ && printf '#!/opt/rosrv/bin/python -P\nfrom appliance.cli.main import main\n\nmain()\n' > /opt/rosrv/bin/rosrv \
  && chmod 755 /opt/rosrv/bin/rosrv \
  && find /opt/rosrv/lib -name __pycache__ -prune -exec rm -rf {} + \
  && cd /opt/rosrv/lib/python3.11/site-packages \
@@ -74,8 +80,7 @@ RUN apt-get update -q \
  && sed -i '/^rosrv-api:/s/$/root/' /etc/group \
  && install -d -m 711 /var/lib/rosrv
 COPY --from=python /opt/rosrv /opt/rosrv
-COPY policies /etc/rosrv/policies
-COPY monitors /etc/rosrv/monitors
+COPY --from=python /build/etc /etc/rosrv
 # The configuration of the container: mount another file here, or override a key with ROSRV_… (docs/operating.md).
 # REST listens on all addresses because only then it can be published; the firewall lets in whom `api_networks` names.
 RUN printf '%s\n' 'isolation: container' 'policy: policies/default.ini' 'monitors: monitors' 'enable: none' \

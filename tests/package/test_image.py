@@ -1,11 +1,12 @@
 """`make site`: the image as it is released, its list of parts, and the archive for a site without a network."""
 
 import hashlib
+import io
 import json
 import os
-import shutil
 import subprocess
 import sys
+import tarfile
 from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
@@ -24,6 +25,7 @@ from tests.support.requirements import needs
 pytestmark = pytest.mark.timeout(1800)  # the image is built
 NAME = f"rosrv/appliance:{__version__}"
 OPTIONS = ("--network", "host", "--build-arg", f"BASE={BASE}")
+LATER = "+40h"
 INSIDE = """\
 from importlib.metadata import distributions
 import re
@@ -34,8 +36,8 @@ for found in distributions():
 
 @pytest.fixture(scope="module")
 def engine() -> Iterator[Engine]:
-    """One that has the base."""
-    with builder() as engine:
+    """One that has the base, and a clock that can be changed."""
+    with builder(clock=True) as engine:
         yield engine
 
 
@@ -164,13 +166,62 @@ def test_the_archive_protects_a_robot(unpacked: Path, tmp_path: Path) -> None:
 
 
 def test_two_builds_are_the_same(engine: Engine, unpacked: Path, tmp_path: Path) -> None:
-    """Who builds the same commit, with nothing of the first build, gets the same image, byte by byte."""
-    first = shutil.copy(next(unpacked.glob("rosrv-image_*.tar")), tmp_path)
-    command = [sys.executable, "-m", "distribution.image", *OPTIONS]
+    """Who builds the same commit gets the same image, byte by byte: two days later, with nothing of the first build.
+
+    In another folder, too, where files are for nobody but their owner.
+    """
+    elsewhere = tmp_path / "elsewhere"
+    git = ["git", "-c", f"safe.directory={ROOT}", "-c", f"safe.directory={ROOT}/.git"]
+    subprocess.run(
+        [*git, "clone", "--quiet", "--no-hardlinks", str(ROOT), str(elsewhere)], umask=0o077, check=True
+    )
+    changes = subprocess.run(
+        [*git, "diff", "--binary", "HEAD"], cwd=ROOT, capture_output=True, check=True
+    ).stdout
+    if changes:
+        subprocess.run([*git, "apply"], cwd=elsewhere, input=changes, umask=0o077, check=True)
+    engine.go_ahead(LATER)
+    command = ["faketime", "-f", LATER, sys.executable, "-m", "distribution.image", *OPTIONS]
     environment = os.environ | {"DOCKER_HOST": engine.address}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=elsewhere, env=environment, capture_output=True, text=True, umask=0o077, check=False
+    )
     assert done.returncode == 0, done.stderr[-3000:]
-    digests = {
-        hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in (first, ROOT / done.stdout.split()[0])
-    }
-    assert len(digests) == 1
+    second = elsewhere / done.stdout.split()[0]
+    assert differences(next(unpacked.glob("rosrv-image_*.tar")), second)[:50] == []
+
+
+def differences(first: Path, second: Path) -> list[str]:
+    """The files of two images that are not the same, with what of them is not."""
+    if first.read_bytes() == second.read_bytes():
+        return []
+    with tarfile.open(first) as one, tarfile.open(second) as other:
+        named = [json.loads(content(archive, "manifest.json"))[0]["Layers"] for archive in (one, other)]
+        found = []
+        for layers in zip(*named, strict=True):
+            here, there = (
+                entries(content(archive, layer)) for archive, layer in zip((one, other), layers, strict=True)
+            )
+            for name in sorted(here.keys() | there.keys()):
+                pairs = here.get(name, {}).items() ^ there.get(name, {}).items()
+                found += [f"{name}: {aspect}" for aspect in sorted({aspect for aspect, _ in pairs})]
+    return found or ["the configuration"]
+
+
+def content(archive: tarfile.TarFile, name: str) -> bytes:
+    """A member of an archive."""
+    file = archive.extractfile(name)
+    assert file is not None, name
+    return file.read()
+
+
+def entries(layer: bytes) -> dict[str, dict[str, object]]:
+    """What a layer says of each of its files."""
+    found: dict[str, dict[str, object]] = {}
+    with tarfile.open(fileobj=io.BytesIO(layer)) as members:
+        for member in members:
+            about = {key: getattr(member, key) for key in ("mode", "uid", "gid", "mtime", "size", "linkname")}
+            if member.isreg():
+                about["content"] = hashlib.sha256(content(members, member.name)).hexdigest()
+            found[member.name] = about
+    return found

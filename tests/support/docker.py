@@ -37,6 +37,23 @@ APPLIANCE, DEMO = "rosrv/appliance", "rosrv/demo"
 START_SECONDS = 60.0
 BUILD_SECONDS = 900.0
 HEALTHY_SECONDS = 120.0
+# In the place of runc. The library is put where nothing of a container is kept; what files say of their times is left
+# as it is.
+_RUNTIME = """\
+#!/usr/bin/python3
+import json, os, sys
+
+bundle = next((after for one, after in zip(sys.argv, sys.argv[1:]) if one == "--bundle"), None)
+if bundle is not None and "create" in sys.argv:
+    path = os.path.join(bundle, "config.json")
+    config = json.load(open(path))
+    config["process"]["env"] += ["LD_PRELOAD=/dev/later.so", "FAKETIME={ahead}", "NO_FAKE_STAT=1"]
+    mount = {{"destination": "/dev/later.so", "type": "bind", "source": "{library}", "options": ["bind", "ro"]}}
+    config["mounts"].append(mount)
+    json.dump(config, open(path, "w"))
+os.execvp("runc", ["runc", *sys.argv[1:]])
+"""
+_FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
 Output = subprocess.CompletedProcess[str]
 
 
@@ -45,19 +62,26 @@ class DockerError(AssertionError):
 
 
 class Engine:
-    """A running dockerd; a context manager. With `builds`, one that only builds. `data` is where it keeps images."""
+    """A running dockerd; a context manager. With `builds`, one that only builds. `data` is where it keeps images.
 
-    def __init__(self, host: Host | None = None, *, builds: bool = False, data: Path = DATA) -> None:
+    `clock`: the time of its containers can be changed (`go_ahead`).
+    """
+
+    def __init__(
+        self, host: Host | None = None, *, builds: bool = False, clock: bool = False, data: Path = DATA
+    ) -> None:
         need_root()
         self._program = need_program("dockerd", "docker.io")
         self._client = need_program("docker", "docker.io")
         self._compose = need_program("docker-compose", "docker-compose")
         self.host: Host = host or ThisMachine()
         self._builds = builds
+        self._clock = clock
         self._data = data
         # Short, for the sockets in it.
         self.directory = Path(tempfile.mkdtemp(prefix="rosrv-engine-"))
         self._log = self.directory / "log"
+        self._runtime = self.directory / "runtime"
         self._process: subprocess.Popen[bytes] | None = None
         self._lock: int | None = None
 
@@ -86,6 +110,11 @@ class Engine:
         arguments = ("--network", "host", "--build-arg", f"BASE={BASE}", "--target", target, "--tag", tag)
         self.docker("build", *arguments, str(context), timeout=BUILD_SECONDS)
 
+    def go_ahead(self, ahead: str) -> None:
+        """Have what is built from now on be built so much later (`+40h`), by the clock of its containers."""
+        need_program("faketime", "faketime")
+        self._runtime.write_text(_RUNTIME.format(ahead=ahead, library=_FAKETIME))
+
     def clear(self) -> None:
         """Remove every container, network and volume that an earlier run may have left; images stay."""
         left = self.docker("ps", "--all", "--quiet").stdout.split()
@@ -105,6 +134,10 @@ class Engine:
             # Should the tests be killed, nobody else would end it (the lab ends what lives on its hosts).
             command = ["setpriv", "--pdeathsig", "TERM", *command]
             command += ["--bridge=none", "--iptables=false", "--ip-forward=false", "--ip-masq=false"]
+        if self._clock:
+            self._runtime.write_text('#!/bin/sh\nexec runc "$@"\n')
+            self._runtime.chmod(0o755)
+            command += ["--add-runtime", f"own={self._runtime}", "--default-runtime", "own"]
         with self._log.open("ab") as log:
             self._process = self.host.popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
         deadline = time.monotonic() + START_SECONDS
@@ -302,10 +335,10 @@ def images() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def builder() -> Iterator[Engine]:
-    """An engine that only builds, and has the base of the images."""
+def builder(*, clock: bool = False) -> Iterator[Engine]:
+    """An engine that only builds, and has the base of the images; `clock`: as `Engine` has it."""
     archive = base_archive()
-    with Engine(builds=True) as engine:
+    with Engine(builds=True, clock=clock) as engine:
         label = f"base={archive.stem}"
         known = engine.docker("images", "--quiet", "--filter", f"label={label}", BASE).stdout.strip()
         if not known:
