@@ -63,17 +63,24 @@ function Incident(/** @type {{row: any, path: string}} */ { row, path }) {
       <span class="end"><button class="button small" aria-label="Nearer" title="Nearer (+)" onClick=${() => zoom(1 / 3)}><${Icon} name="plus" size=${16} /></button><button class="button small" aria-label="Farther" title="Farther (-)" onClick=${() => zoom(3)}><${Icon} name="minus" size=${16} /></button><button class="button small" onClick=${() => setPart({ since: row.began, until: row.ended })} title="All of it (0)">All</button></span></div>
       ${line.error ? html`<div class="panel-body"><${Failure} error=${line.error} retry=${line.again} /></div>` : !line.value ? html`<${Loading} rows=${8} />`
         : html`<${Lanes} line=${line.value} at=${at} move=${setAt} zoom=${zoom} all=${() => setPart({ since: row.began, until: row.ended })} topics=${topics} choose=${setTopics} about=${chosen?.resource ?? null} />`}</section>
-    <div class="incident-grid"><${Events} line=${line.value} at=${at} chosen=${chosen} pick=${pick} row=${row} />
+    <div class="incident-grid"><${Events} line=${line.value} chosen=${chosen} pick=${pick} row=${row} />
       <div class="stack">${chosen && html`<${Event} event=${chosen} />`}<${Messages} path=${path} at=${at} topics=${topics} clear=${() => setTopics([])} span=${(part.until - part.since) / 1e9} /></div></div>`;
 }
 
-function Events(/** @type {any} */ { line, at, chosen, pick, row }) {
+function Events(/** @type {any} */ { line, chosen, pick, row }) {
   const [most, setMost] = useState(SHOWN);
   const events = line?.events ?? [];
+  const list = useRef(/** @type {HTMLElement | null} */ (null));
+  const place = events.indexOf(chosen);
+  useEffect(() => {
+    if (place >= most) setMost(place + SHOWN);
+    const row = /** @type {HTMLElement | null} */ (list.current?.children[place]);
+    if (list.current && row) list.current.scrollTop = row.offsetTop - list.current.offsetTop - row.offsetHeight; // the page stays
+  }, [place, most]);
   const span = (row.ended - row.began) / 1e9;
   return html`<section class="panel" aria-labelledby="happened"><div class="panel-head"><h2 id="happened">What happened</h2><span class="muted small end">j, k: next, previous</span></div>
     ${!line ? html`<${Loading} />` : !events.length ? html`<p class="panel-body muted">Nothing but messages in this time.</p>`
-      : html`<ul class="event-list tall happened">${events.slice(0, most).map((/** @type {any} */ one) => html`<li key=${one.record} class=${`event${one === chosen ? " chosen" : ""}`}>
+      : html`<ul class="event-list tall happened" ref=${list}>${events.slice(0, most).map((/** @type {any} */ one) => html`<li key=${one.record} class=${`event${one === chosen ? " chosen" : ""}`}>
         <button class="event-pick" aria-pressed=${String(one === chosen)} onClick=${() => pick(one)}><span class="event-time mono small">${clock(one.time / 1e9, span)}</span><span class="event-badge"><${Badge} word=${one.kind === "notice" ? "else" : one.kind} tone=${kindOf(one.kind).tone} /></span>
         <span class="event-body"><${Given} value=${one.resource} mono most=${80} none="" /> <span class="event-reason"><${Given} value=${one.reason || one.event} most=${140} /></span></span></button></li>`)}</ul>
         ${events.length > most ? html`<div class="panel-body"><button class="button" onClick=${() => setMost(most + SHOWN)}>More events</button></div>` : null}

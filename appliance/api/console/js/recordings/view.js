@@ -53,7 +53,7 @@ function Row(/** @type {{row: any, again: () => void}} */ { row, again }) {
   const messages = row.topics.reduce((/** @type {number} */ sum, /** @type {any} */ one) => sum + one.messages, 0);
   return html`<tr><td class="first"><${Link} to=${`/console/recordings/${row.id}`}><${Moment} at=${row.began / 1e9} /></${Link}></td>
     <td class="why" data-label="Why"><span><${Badge} word=${why.what} tone=${kindOf(why.what).tone} /> <${Given} value=${why.text} most=${120} />${more.length > 0 && html` <span class="muted">and ${counted(more.length, "more", "more")}</span>`}</span></td>
-    <td class="number nowrap" data-label="Lasts">${lasting((row.ended - row.began) / 1e9)}</td><td class="number" data-label="Messages"><span class="nowrap">${count(messages)}</span> <span class="muted small nowrap">of ${counted(row.topics.length, "topic")}</span></td><td class="number nowrap" data-label="Size">${bytes(row.size)}</td>
+    <td class="number nowrap" data-label="Lasts">${lasting((row.ended - row.began) / 1e9)}</td><td class="number" data-label="Messages"><span>${count(messages)} <span class="muted small nowrap">of ${counted(row.topics.length, "topic")}</span></span></td><td class="number nowrap" data-label="Size">${bytes(row.size)}</td>
     <td data-label="State">${row.complete ? html`<${Badge} word="complete" tone="allow" />` : html`<${Badge} word="not complete" tone="warn" title=${row.why_not} />`}</td>
     <td><div class="row taking"><${Taking} row=${row} small /><${Remove} row=${row} small gone=${again} /></div></td></tr>`;
 }
