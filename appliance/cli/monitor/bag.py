@@ -3,6 +3,7 @@
 A topic whose messages have another definition than the specifications mean is refused: its messages are dropped.
 """
 
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.why import Sender
 
 _OWN = "/rosrv"  # the appliance: what monitors publish is not given to monitors
+# What `rosbags` raises for a damaged bag, beside an error of its own.
+_DAMAGE = (ReaderError, ValueError, LookupError, AssertionError, struct.error, MemoryError, OverflowError)
 
 
 @dataclass(frozen=True)
@@ -44,10 +47,22 @@ def open_bag(path: Path) -> Reader:
     try:
         reader = Reader(path)
         reader.open()
-    except (ReaderError, OSError) as error:
-        raise usage_error(f"cannot read the bag {path}: {error}") from error
+    except (*_DAMAGE, OSError) as error:
+        raise usage_error(f"cannot read the bag {path}: {_said_by(error)}") from error
     _order_by_place(reader)
     return reader
+
+
+def messages_of(reader: Reader) -> Iterator[tuple[Connection, int, bytes]]:
+    """Connection, nanoseconds and bytes of every message, in the order of the bag, or an end with the reason."""
+    try:
+        yield from reader.messages()
+    except _DAMAGE as error:
+        raise usage_error(f"the bag {reader.path} is damaged: {_said_by(error)}") from error
+
+
+def _said_by(error: Exception) -> str:
+    return str(error) or type(error).__name__
 
 
 def _order_by_place(reader: Reader) -> None:
@@ -102,12 +117,9 @@ class Recorded:
     def messages(self) -> Iterator[tuple[str, int, bytes]]:
         """Topic, nanoseconds and bytes of every message, in the order of the bag."""
         with closing(open_bag(self._path)) as reader:
-            try:
-                for connection, time_ns, data in reader.messages():
-                    if connection.topic in self.topics:
-                        yield connection.topic, time_ns, data
-            except ReaderError as error:
-                raise usage_error(f"the bag {self._path} is damaged: {error}") from error
+            for connection, time_ns, data in messages_of(reader):
+                if connection.topic in self.topics:
+                    yield connection.topic, time_ns, data
 
 
 _Header = tuple[
@@ -191,30 +203,25 @@ def replay(
     begun = False
     asked = _Asked()
     monitors.explain_when(asked, asked)
-    try:
-        for index, (connection, time_ns, data) in enumerate(reader.messages()):
-            if connection.id not in refusals or not span[0] <= time_ns <= span[1]:
-                continue
-            if not begun:
-                started, begun = monitors.start(time_ns, expected), True
-            asked.now = time_ns
-            outcome = _outcome(
-                monitors, connection, time_ns, data, refusals[connection.id], Sender(index + 1)
-            )
-            if started is not None:
-                outcome = _after(started, outcome)
-                started = None
-            for earlier in outcome.before:
-                if output is not None:
-                    output.publish(earlier)
-                yield Replayed(earlier)
+    for index, (connection, time_ns, data) in enumerate(messages_of(reader)):
+        if connection.id not in refusals or not span[0] <= time_ns <= span[1]:
+            continue
+        if not begun:
+            started, begun = monitors.start(time_ns, expected), True
+        asked.now = time_ns
+        outcome = _outcome(monitors, connection, time_ns, data, refusals[connection.id], Sender(index + 1))
+        if started is not None:
+            outcome = _after(started, outcome)
+            started = None
+        for earlier in outcome.before:
             if output is not None:
-                if outcome.result != "dropped":
-                    output.relay(connection, time_ns, bytes(outcome.buffer))
-                output.publish(outcome)
-            yield Replayed(outcome, index, connection.topic)
-    except ReaderError as error:
-        raise usage_error(f"the bag is damaged: {error}") from error
+                output.publish(earlier)
+            yield Replayed(earlier)
+        if output is not None:
+            if outcome.result != "dropped":
+                output.relay(connection, time_ns, bytes(outcome.buffer))
+            output.publish(outcome)
+        yield Replayed(outcome, index, connection.topic)
 
 
 class _Asked:

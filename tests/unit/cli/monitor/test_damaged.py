@@ -1,0 +1,27 @@
+"""Damaged recordings: whatever the reader raises for one, who gives it is told that it is damaged."""
+
+import random
+from pathlib import Path
+
+import typer
+
+from appliance.cli.monitor.bag import Recorded
+from tests.unit.cli.monitor.test_verbs import make_bag, number
+
+
+def test_a_damaged_bag_ends_with_the_reason(tmp_path: Path) -> None:
+    """Bytes changed anywhere: the messages are read, or it is a mistake of the command line."""
+    rows = [(f"/t{at % 2}", "std_msgs/Int32", 1000.0 + at, number(at)) for at in range(20)]
+    whole = make_bag(tmp_path / "whole.bag", rows).read_bytes()
+    place, chance, ended = tmp_path / "damaged.bag", random.Random(5), 0  # noqa: S311  the same each time
+    for _turn in range(300):
+        data = bytearray(whole)
+        for _byte in range(3):
+            data[chance.randrange(4100, len(data))] = chance.randrange(256)
+        place.write_bytes(data)
+        try:
+            list(Recorded(place, ["*"]).messages())
+        except typer.Exit as end:
+            assert end.exit_code == 2
+            ended += 1
+    assert ended > 50
