@@ -25,6 +25,7 @@ class Rings:
         self._rings: list[tuple[RingGiven, int, int]] = []  # to be written and to be read
         for index in range(relays):
             writable = os.memfd_create(f"rosrv-ring-{index}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+            os.fchmod(writable, 0o600)  # else whoever has it to read opens it anew, to write
             os.ftruncate(writable, size)
             fcntl.fcntl(writable, fcntl.F_ADD_SEALS, _SEALS)
             readable = os.open(f"/proc/self/fd/{writable}", os.O_RDONLY | os.O_CLOEXEC)

@@ -41,3 +41,11 @@ def test_nobody_makes_it_smaller_and_the_recorder_changes_nothing() -> None:
     with pytest.raises(PermissionError):
         mmap.mmap(read, 0)
     rings.close()
+
+
+def test_another_user_does_not_open_it_anew_to_write() -> None:
+    """Who has it to read finds it in /proc: there the mode of the file says who may write, and the recorder may not."""
+    rings = Rings(RecorderRules(memory=ByteSize(16 * MIB)), 1)
+    [(_given, read)] = rings.given_to("recorder", 0)
+    assert os.fstat(read).st_mode & 0o777 == 0o600
+    rings.close()
