@@ -1,6 +1,7 @@
 """`rosrv record now|list|show|timeline|messages|fetch|remove`: what the flight recorder has of the robot's messages."""
 
 import hashlib
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -204,6 +205,10 @@ def fetch(
         raise usage_error(f"{target} is there already")
     part = target.with_name(f"{target.name}.part")
     try:
+        os.close(_private(part))
+    except OSError as error:
+        raise usage_error(f"{part}: {error.strerror}") from None
+    try:
         body = appliance.ask_or_exit(admin.RecordingWanted(recording), as_json=as_json)
         bag = bag_of(appliance, body.id, part, as_json=as_json)
         if bag is not part:
@@ -310,10 +315,15 @@ def _drawn(found: Timeline) -> Iterator[str]:
         yield f"  {counted(found.more_events, 'more event')}: a shorter time (--since, --until) lists them"
 
 
+def _private(path: Path) -> int:
+    """A new file for its owner only: what the robot said is not for whoever uses this machine. Raises `OSError`."""
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+
+
 def _convert(bag: Path, target: Path) -> None:
     """Write the bag as MCAP. Raises `OSError`; ends the program with 1 where a message type makes no sense."""
     try:
-        with target.open("xb") as file:
+        with os.fdopen(_private(target), "wb") as file:
             for piece in as_mcap(bag):
                 file.write(piece)
     except ValueError as error:

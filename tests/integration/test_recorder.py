@@ -77,6 +77,7 @@ def fetched(appliance: Appliance, recording: str, folder: Path) -> Path:
     """The bag of a recording, as an operator gets it."""
     bag = folder / f"{recording}.bag"
     appliance.rosrv("record", "fetch", recording, "--out", str(bag))
+    assert stat.S_IMODE(bag.stat().st_mode) == 0o600
     return bag
 
 
