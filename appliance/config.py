@@ -385,7 +385,7 @@ class Settings(_Section):
         default=100_000,
         ge=1,
         le=1_000_000,
-        description="slices of a parametric specification: bindings that are monitored at a time, about 500 bytes each",
+        description="slices of a parametric specification: bindings that are monitored at a time, about 700 bytes each",
     )
     publish_as: Annotated[str, AfterValidator(_checked_name)] = Field(
         default="/rosrv", description="the node name under which monitors publish"
