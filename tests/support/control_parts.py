@@ -280,9 +280,11 @@ class ControlParts:
         self._not_ours = asyncio.all_tasks()  # the test's own
         self.current = compile_policy(OPEN, file="policy")
         self.registry, self.grants = Registry(), Grants(set)
-        self.records, self.deliveries, self.relay = Records(), Deliveries(), Relays()
+        self.records, self.watchlist = Records(), Watchlist()
         self.hidden, self.clients = HiddenMaster(), Clients()
+        self.deliveries, self.relay, self.store = Deliveries(), Relays(), idle(StateStore)
         self.faces = Inner(self.registry)
+        self.surround()
         self.mediation, self.addresses, self.parameters = (
             Modes(),
             Addresses(),
@@ -302,7 +304,7 @@ class ControlParts:
         self.enactor = Noted(
             self.graph,
             self.entries,
-            store=idle(StateStore),
+            store=self.store,
             trail=trail,
             delivery=cast(Any, self.deliveries),
             relay=self.relay,
@@ -321,7 +323,6 @@ class ControlParts:
             trail,
             own_parameters=dict,
         )
-        self.watchlist = Watchlist()
         self.liveness = Liveness(
             self.registry,
             self.graph,
@@ -344,7 +345,7 @@ class ControlParts:
             trail=self.records,
             rights=rights,
             faces=self.faces,
-            arrivals=self.faces,
+            arrivals=self.arrivals(),
             relay=self.relay,
             mediation=self.mediation,
             addresses=self.addresses,
@@ -352,6 +353,13 @@ class ControlParts:
             redecide_for=self.redecide_for,
         )
         self._serve = self._serving()
+
+    def surround(self) -> None:
+        """Others may stand around control: before it is connected with them."""
+
+    def arrivals(self) -> Any:
+        """Who makes incarnations."""
+        return self.faces
 
     def redecide_for(self, host: Address, caller_id: str) -> int:
         """What one caller has is decided again; how much was taken back."""

@@ -1,0 +1,830 @@
+"""Histories of RVMaster by seed: its parts as control connects them, among nodes, relay and ROSMaster that are models.
+
+    .venv/bin/python -m tests.support.histories SEED            # one history, with each thing that happens in it
+    .venv/bin/python -m tests.support.histories --many NUMBER   # so many, from 0 on: those that break a promise
+    .venv/bin/python -m tests.support.histories --mutants NUMBER   # faults of the core, and the first that finds each
+
+Time is virtual: it goes on when nothing else is left to do, so that a history of minutes takes milliseconds, and one
+seed is one order of events. Each call, delivery and order to the relay takes its own time. What goes wrong: nodes die,
+hang, come back, are replaced under their name; ROSMaster and the relay begin anew, control dies between two steps and
+comes back with what its store has; calls to ROSMaster break off, before or after they have had their effect; policies
+are reloaded. After the last fault there is time to settle.
+
+Nodes are as ROS's: they take a list of publishers, ask each new one, connect where they were told to, try again what
+broke off, and end when they are told to shut down. They are told nothing about a topic while their own registering
+call for it is under way: how the two overtake each other is ROS's own affair, with a plain master, too.
+"""
+
+import asyncio
+import contextlib
+import logging
+import os
+import selectors
+import sys
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import count
+from random import Random
+from types import SimpleNamespace
+from typing import Any, cast
+
+import structlog
+
+from appliance.channel import messages
+from appliance.master.caller import Answer
+from appliance.master.graph import graph as graph_module
+from appliance.master.graph.effects import Effect, Place, PlaceGrant, PlaceNode, RevokeGrant, SaveGrant
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.registry import Incarnation, Kind, Registry, SaveRegistration
+from appliance.master.graph.revocation import Revocation
+from appliance.master.reach.carried import Carried
+from appliance.master.reach.delivery import Delivery
+from appliance.master.reach.relays import RelayControl
+from appliance.master.upkeep import arrivals as arrivals_module
+from appliance.master.upkeep import liveness as liveness_module
+from appliance.master.upkeep.arrivals import Arrivals
+from appliance.master.upkeep.enactor import Enactor, restore
+from appliance.master.upkeep.reminders import Reminders
+from appliance.policy import Policy, compile_policy
+from appliance.ros.xmlrpc import Limits, Value
+from appliance.rpc.client import BrokenOffError, RefusedError, UnansweredError
+from appliance.shares.pool import Standing
+from appliance.specifications.allocation import Allocation
+from appliance.store.state import IncarnationRow, PermissionRow, RegistrationRow, StateStore
+from tests.support.control_parts import OPEN, POLICY, ControlParts, HiddenMaster, Inner
+from tests.support.idle import idle, idle_class
+
+TOPICS = ("/a", "/b")
+HOSTS = ("10.0.0.1", "10.0.0.2", "10.0.0.3")
+NAMES = ("/one", "/two", "/three")
+POLICIES: dict[str, tuple[str, dict[str, set[str]], dict[str, set[str]]]] = {
+    "open": (OPEN, {}, {}),
+    "/a is published by 1": (POLICY.format("/a = 10.0.0.1\n", ""), {"/a": {HOSTS[0]}}, {}),
+    "/a is subscribed to by 2 and 3": (
+        POLICY.format("", "/a = 10.0.0.2, 10.0.0.3\n"), {}, {"/a": {HOSTS[1], HOSTS[2]}},
+    ),
+    "/b is nobody's": (POLICY.format("/b =\n", "/b =\n"), {"/b": set()}, {"/b": set()}),
+}  # fmt: skip
+"""Each with who may publish and who may subscribe to the topics that it names: an oracle of a few lines."""
+
+_SETTLES = 150.0  # seconds
+_RELAY_PORTS = 30_000
+
+
+class BrokenPromiseError(AssertionError):
+    """What a history must not have."""
+
+
+class VirtualLoop(asyncio.SelectorEventLoop):
+    """A loop whose time goes on only when nothing else is left to do."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+        super().__init__(_Jumping(self))
+
+    def time(self) -> float:
+        """Seconds of this loop."""
+        return self.now
+
+
+class _Jumping(selectors.SelectSelector):
+    def __init__(self, loop: VirtualLoop) -> None:
+        super().__init__()
+        self._loop = loop
+
+    def select(self, timeout: float | None = None) -> Any:
+        """As a selector's, of files that never have anything."""
+        if timeout is None:
+            raise BrokenPromiseError("everybody waits for ever")
+        self._loop.now += max(timeout, 0.0)
+        return []
+
+
+@dataclass(eq=False)
+class Subscription:
+    """What a node knows of a topic: the list it was told, and by which of those it is connected to which publisher."""
+
+    known: list[str] = field(default_factory=list)
+    ways: dict[str, str] = field(default_factory=dict)  # URI to the key behind the port it was told
+
+
+@dataclass(eq=False)
+class Process:
+    """A node as it runs."""
+
+    name: str
+    host: str
+    port: int
+    alive: bool = True
+    answers: bool = True
+    publishes: set[str] = field(default_factory=set)
+    subscribes: dict[str, Subscription] = field(default_factory=dict)
+    calling: set[tuple[str, str]] = field(default_factory=set)
+
+    @property
+    def api(self) -> str:
+        """Its URI."""
+        return f"http://{self.host}:{self.port}/"
+
+
+class Relay:
+    """One life of the relay: what it was told, in order, and who is connected."""
+
+    def __init__(self, world: "World") -> None:
+        self._world = world
+        self.orders: deque[messages.Message] = deque()
+        self.nodes: set[str] = set()
+        self.publications: set[tuple[str, str]] = set()
+        self.grants: set[tuple[str, str, str, str]] = set()
+        self.connections: dict[tuple[str, str, str, str], Process] = {}
+        self._restated = True
+        self.stirred = asyncio.Event()
+
+    def attach(self, *_given: object) -> None:
+        """As `Channel`."""
+
+    def close(self) -> None:
+        """As `Channel`."""
+
+    def send(self, message: messages.Message, _descriptors: tuple[int, ...] = ()) -> None:
+        """As `Channel`."""
+        if isinstance(message, messages.GrantInstalled):
+            self._world.check_grant(message.topic, message.host, message.caller_id)
+        self.orders.append(message)
+        self.stirred.set()
+
+    def carry_out(self) -> None:
+        """The next order."""
+        match self.orders.popleft():
+            case messages.StateBegan():
+                self._restated = False
+                self.nodes, self.publications, self.grants = set(), set(), set()
+            case messages.NodePlaced(key):
+                self.nodes.add(key)
+            case messages.NodeWithdrawn(key):
+                self.nodes.discard(key)
+                self.publications = {one for one in self.publications if one[0] != key}
+                self.grants = {one for one in self.grants if one[0] != key}
+            case messages.PublicationPlaced(key, topic):
+                self.publications.add((key, topic))
+            case messages.PublicationWithdrawn(key, topic):
+                self.publications.discard((key, topic))
+            case messages.GrantInstalled(key, topic, host, name):
+                self.grants.add((key, topic, host, name))
+            case messages.GrantRevoked(key, topic, host, name):
+                self.grants.discard((key, topic, host, name))
+            case messages.StateEnded():
+                self._restated = True
+        if self._restated:
+            self.connections = {row: one for row, one in self.connections.items() if self.lets_in(row)}
+
+    def lets_in(self, row: tuple[str, str, str, str]) -> bool:
+        """Whether a subscriber may have a topic of a publisher."""
+        return row in self.grants and row[:2] in self.publications and row[0] in self.nodes
+
+
+class Kept(idle_class(StateStore)):  # type: ignore[misc]  # it is made
+    """The store: what outlasts control."""
+
+    def __init__(self) -> None:
+        self.nodes: dict[str, IncarnationRow] = {}
+        self.registrations: dict[tuple[str, str, str], RegistrationRow] = {}
+        self.grants: dict[PermissionRow, None] = {}
+
+    def save_incarnation(self, row: IncarnationRow) -> None:
+        """As `StateStore`."""
+        self.nodes[row.key] = row
+
+    def forget_incarnation(self, key: str) -> None:
+        """As `StateStore`."""
+        self.nodes.pop(key, None)
+        self.registrations = {at: row for at, row in self.registrations.items() if row.key != key}
+        self.grants = {row: None for row in self.grants if row.key != key}
+
+    def save_registration(self, row: RegistrationRow) -> None:
+        """As `StateStore`."""
+        self.registrations[row.key, row.kind, row.resource] = row
+
+    def remove_registration(self, key: str, kind: str, resource: str) -> None:
+        """As `StateStore`."""
+        self.registrations.pop((key, kind, resource), None)
+
+    def load_registry(self) -> tuple[list[IncarnationRow], list[RegistrationRow]]:
+        """As `StateStore`."""
+        return [*self.nodes.values()], sorted(self.registrations.values(), key=lambda row: row.ordinal)
+
+    def save_permission(self, row: PermissionRow) -> None:
+        """As `StateStore`."""
+        self.grants[row] = None
+
+    def remove_permission(self, row: PermissionRow) -> None:
+        """As `StateStore`."""
+        self.grants.pop(row, None)
+
+    def permissions(self) -> list[PermissionRow]:
+        """As `StateStore`."""
+        return [*self.grants]
+
+
+class Master(HiddenMaster):
+    """ROSMaster: each call takes its time, and while there are faults some break off, with or without their effect."""
+
+    def __init__(self, world: "World") -> None:
+        super().__init__()
+        self._world = world
+
+    async def call(self, method: str, *params: Value) -> Answer:
+        """As `HiddenMaster`."""
+        await self._world.some_time()
+        breaks = self._world.faulty and self._world.rng.random() < 0.04
+        if breaks and self._world.rng.random() < 0.5:
+            raise RefusedError("nobody is there")
+        if (
+            method in ("registerPublisher", "registerSubscriber")
+            and self.nodes.get(str(params[0]), params[-1]) != params[-1]
+        ):
+            for table in self.tables.values():  # as ROSMaster does with a node that has another URI
+                for holders in table.values():
+                    holders.pop(str(params[0]), None)
+        answer = await super().call(method, *params)
+        await self._world.some_time()
+        if breaks:
+            raise BrokenOffError("the connection ended")
+        return answer
+
+
+class Reach:
+    """Calls to the node of an incarnation."""
+
+    def __init__(self, world: "World", incarnation: Incarnation) -> None:
+        self._world = world
+        self._incarnation = incarnation
+
+    async def call(self, method: str, *params: Value) -> Value:
+        """As `XmlRpcClient`."""
+        await self._world.some_time()
+        uri = self._incarnation.call_uri
+        process = next(
+            (
+                one
+                for one in self._world.processes
+                if one.alive and (one.host, one.port) == (uri.host, uri.port)
+            ),
+            None,
+        )
+        if process is None:
+            raise RefusedError("nobody is there")
+        if not process.answers:
+            await asyncio.sleep(3.0)
+            raise UnansweredError("no answer")
+        if method == "publisherUpdate":
+            await self._world.update(
+                process, str(params[1]), [str(one) for one in cast(list[Value], params[2])]
+            )
+        elif method == "shutdown":
+            self._world.ends(process)
+        return [1, "", 1]
+
+
+class _Faces(Inner):
+    """As `Faces`; they are open at once."""
+
+    async def open(self, _incarnation: Incarnation) -> None:
+        """As `Faces`."""
+
+
+class Deliveries(Delivery):
+    """The queues of calls to nodes, over `Reach`."""
+
+    world: "World"
+
+    def client(self, incarnation: Incarnation) -> Any:
+        """As `Delivery`."""
+        return Reach(self.world, incarnation)
+
+
+class Control(ControlParts):
+    """One life of control."""
+
+    def __init__(self, world: "World") -> None:
+        self.world = world
+        super().__init__(silent=20.0)
+        cast(Any, self.liveness).client = lambda incarnation: Reach(world, incarnation)
+        self.reminders = Reminders(self.registry, self.relay, self.graph, self.enactor)
+
+    def surround(self) -> None:
+        """As `ControlParts`."""
+        world = self.world
+        self.current = world.policy_in_force
+        self.hidden, self.store = world.master, cast(Any, world.kept)
+        delivery = Deliveries(
+            timeout=3.0,
+            limits=Limits(),
+            troubled=self.watchlist.could_not_tell,
+            standing=lambda _host: Standing.REGISTERED,
+        )
+        delivery.world = world
+        self.deliveries = cast(Any, delivery)
+        self.faces = _Faces(self.registry)
+        self.relay = cast(
+            Any,
+            RelayControl(
+                self.registry, self.grants, cast(Any, _Ports()), delivery, idle(Carried), allocation=Allocation(1),
+                policy=lambda: self.current, broken=self.watchlist.look_at, own_header=None,
+            ),
+        )  # fmt: skip
+        cast(Any, self.relay.carried).used = world.used
+
+    def arrivals(self) -> Any:
+        """As `ControlParts`."""
+        return Arrivals(
+            self.registry, self.graph, self.enactor, self.liveness, places=cast(Any, self.world),
+            faces=cast(Any, self.faces), addresses=cast(Any, self.addresses),
+        )  # fmt: skip
+
+    async def begin(self) -> None:
+        """As the process does: what was kept, then its loops."""
+        restore(self.registry, cast(Any, self.world.kept))
+        self.enactor.carry_out(self.grants.restore(self.world.kept.permissions()))
+        self.enactor.carry_out(self.revocation.policy_changed(self.current, self.current))
+        self.attach()
+        self.world.task(self.reconciler.run())
+        self.world.task(self.liveness.run())
+
+    def attach(self) -> None:
+        """The relay is there, as it is now."""
+        cast(Any, self.relay).attach(0, self.world.relay, _Monitors())
+        self.enactor.carry_out(self.graph.tell_everybody())
+        self.reminders.begin()
+
+
+class World:
+    """Everything in one history."""
+
+    def __init__(self, seed: int, loop: VirtualLoop, say: Callable[[str], None] = lambda _line: None) -> None:
+        self.rng = Random(seed)  # noqa: S311  histories, no secrets
+        self.loop = loop
+        self._say = say
+        self.faulty = True
+        self.policy = "open"
+        self.processes: list[Process] = []
+        self.kept, self.relay = Kept(), Relay(self)
+        self.master = Master(self)
+        self._ports, self._node_ports = count(20_001), count(40_001)
+        self._tasks: dict[asyncio.Task[Any], None] = {}
+        self.errors: list[Exception] = []
+        self.control = Control(self)
+
+    # --- what others are made of ---
+
+    @property
+    def policy_in_force(self) -> Policy:
+        """Of this life of control."""
+        return compile_policy(POLICIES[self.policy][0], file="policy")
+
+    def open(self, _host: object) -> tuple[int, int]:
+        """As `Places`: ports for a node."""
+        return next(self._ports), next(self._ports)
+
+    async def some_time(self) -> None:
+        """How long something takes on its way."""
+        await asyncio.sleep(self.rng.choice((0.0, 0.0, 0.001, 0.01, 0.1)))
+
+    def used(self) -> set[PermissionRow]:
+        """Grants that somebody is connected by."""
+        return {
+            PermissionRow(key, "topic", topic, host, name)
+            for key, topic, host, name in self.relay.connections
+        }
+
+    def say(self, line: str) -> None:
+        """Something happens."""
+        self._say(f"{self.loop.now - 1000.0:9.3f}  {line}")
+
+    def task(self, work: Awaitable[Any]) -> None:
+        """Something that goes on until control or the history ends."""
+        task = asyncio.ensure_future(work)
+        self._tasks[task] = None
+        task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.pop(task, None)
+        if not task.cancelled() and task.exception() is not None:
+            self.errors.append(cast(Exception, task.exception()))
+
+    # --- nodes ---
+
+    def ends(self, process: Process) -> None:
+        """A process ends, and what it was connected by."""
+        if process.alive:
+            self.say(f"{process.name} at {process.host}:{process.port} ends")
+        process.alive = False
+        connections = self.relay.connections
+        self.relay.connections = {row: one for row, one in connections.items() if one is not process}
+
+    def call(self, process: Process, method: str, topic: str) -> None:
+        """A node begins a registering call; it makes it again when control died before it answered."""
+        if (method, topic) not in process.calling:
+            process.calling.add((method, topic))
+            self.say(f"{process.name} at {process.host}:{process.port} {method} {topic}")
+            self.task(self._call(process, method, topic))
+
+    async def _call(self, process: Process, method: str, topic: str) -> None:
+        kind = ["std_msgs/String"] if method.startswith("register") else []
+        given = (process.name, topic, *kind, process.api)
+        while process.alive:
+            await self.some_time()
+            answer = cast(list[Any], await self.control.ask(method, *given, host=process.host))
+            await self.some_time()
+            if answer[0] == 1 or "not come back" not in str(answer[1]):
+                break
+        process.calling.discard((method, topic))
+        self.say(f"  {process.name} is answered {method} {topic}: {answer[0]}")
+        if not process.alive or not method.startswith("register"):
+            return
+        if answer[0] != 1:
+            if method == "registerPublisher":
+                process.publishes.discard(topic)
+            else:
+                process.subscribes.pop(topic, None)
+            self.say(f"{process.name} at {process.host}:{process.port}: {answer[1]}")
+        elif method == "registerSubscriber":
+            await self.update(process, topic, answer[2])
+
+    async def update(self, process: Process, topic: str, uris: list[str]) -> None:
+        """A node is told who publishes a topic."""
+        while process.alive and ("registerSubscriber", topic) in process.calling:
+            await asyncio.sleep(0.01)
+        self.see(process, uris)
+        subscription = process.subscribes.get(topic)
+        if subscription is None or not process.alive:
+            return
+        self.say(f"  {process.name} is told {topic} {uris}")
+        uris = [uri for uri in uris if uri != process.api]  # what it publishes itself stays within it
+        new = [uri for uri in uris if uri not in subscription.known]
+        for uri in subscription.known:
+            if uri not in uris:
+                self.disconnect(process, topic, subscription.ways.pop(uri, ""))
+        subscription.known = list(uris)
+        for uri in new:
+            self.task(self._request(process, topic, subscription, uri))
+
+    async def _request(self, process: Process, topic: str, subscription: Subscription, uri: str) -> None:
+        await self.some_time()
+        target = next((one for one in self.control.registry.all() if one.outer_uri("10.0.0.1") == uri), None)
+        answer: Value = [0]
+        if target is not None:
+            answer = await self.control.ask(
+                "requestTopic", process.name, topic, [["TCPROS"]], host=process.host, target=target
+            )
+        await self.some_time()
+        self.say(f"  {process.name} asked {uri} for {topic}: {answer!r}")
+        if uri in subscription.known:
+            if target is not None and cast(list[Any], answer)[0] == 1:
+                subscription.ways[uri] = target.key
+            else:
+                subscription.known.remove(uri)
+
+    def disconnect(self, process: Process, topic: str, key: str) -> None:
+        """A node closes a connection."""
+        self.relay.connections.pop((key, topic, process.host, process.name), None)
+
+    async def connecting(self) -> None:
+        """Nodes connect where they were told to, and try again what broke off."""
+        while True:
+            await asyncio.sleep(0.5)
+            for process in self.processes:
+                for topic, subscription in process.subscribes.items():
+                    for key in subscription.ways.values():
+                        row = (key, topic, process.host, process.name)
+                        if process.alive and process.answers and self.relay.lets_in(row):
+                            self.relay.connections[row] = process
+
+    async def carrying(self, relay: Relay) -> None:
+        """The relay carries out what it is told."""
+        while relay is self.relay:
+            await relay.stirred.wait()
+            relay.stirred.clear()
+            while relay.orders:
+                await self.some_time()
+                for _ in range(min(len(relay.orders), self.rng.randrange(1, 9))):
+                    relay.carry_out()
+
+    # --- what happens ---
+
+    def _living(self) -> Process | None:
+        there = [one for one in self.processes if one.alive]
+        return self.rng.choice(there) if there else None
+
+    def starts(self) -> None:
+        """A node starts; with the name of another it takes its place."""
+        name, host = self.rng.choice(NAMES), self.rng.choice(HOSTS)
+        process = Process(name, host, next(self._node_ports))
+        self.processes.append(process)
+        for topic in TOPICS:
+            if self.rng.random() < 0.5:
+                self.publishes(process, topic)
+            if self.rng.random() < 0.5:
+                self.subscribes(process, topic)
+
+    def publishes(self, process: Process, topic: str) -> None:
+        """A node publishes a topic."""
+        process.publishes.add(topic)
+        self.call(process, "registerPublisher", topic)
+
+    def subscribes(self, process: Process, topic: str) -> None:
+        """A node subscribes to a topic."""
+        process.subscribes.setdefault(topic, Subscription())
+        self.call(process, "registerSubscriber", topic)
+
+    def changes_its_mind(self) -> None:
+        """A node registers something, or gives it up."""
+        process, topic = self._living(), self.rng.choice(TOPICS)
+        if process is None or any(one[1] == topic for one in process.calling):
+            return
+        if self.rng.random() < 0.5:
+            if topic in process.publishes:
+                process.publishes.discard(topic)
+                self.call(process, "unregisterPublisher", topic)
+            else:
+                self.publishes(process, topic)
+        elif topic in process.subscribes:
+            for key in process.subscribes.pop(topic).ways.values():
+                self.disconnect(process, topic, key)
+            self.call(process, "unregisterSubscriber", topic)
+        else:
+            self.subscribes(process, topic)
+
+    def dies(self) -> None:
+        """A node dies without a word."""
+        process = self._living()
+        if process is not None:
+            self.ends(process)
+
+    def hangs(self) -> None:
+        """A node answers nothing, or does again."""
+        process = self._living()
+        if process is not None:
+            process.answers = not process.answers
+            self.say(
+                f"{process.name} at {process.host}:{process.port} {'answers' if process.answers else 'hangs'}"
+            )
+
+    def reloads(self) -> None:
+        """Another policy comes into force."""
+        self.policy = self.rng.choice(list(POLICIES))
+        self.say(f"policy: {self.policy}")
+        self.control.reload(POLICIES[self.policy][0])
+
+    def master_dies(self) -> None:
+        """ROSMaster is another, and knows nothing."""
+        self.say("ROSMaster begins anew")
+        self.master.restart()
+        self.control.reconciler.wake()
+
+    def relay_dies(self) -> None:
+        """The relay is another, and knows nothing."""
+        self.say("the relay begins anew")
+        self.relay = Relay(self)
+        self.task(self.carrying(self.relay))
+        self.control.attach()
+
+    async def control_dies(self) -> None:
+        """Control dies between two steps; what is under way ends with it, and nodes make their calls again."""
+        self.say("control begins anew")
+        calls = [(one, what) for one in self.processes if one.alive for what in one.calling]
+        await self.stop()
+        for process in self.processes:
+            process.calling.clear()
+            for subscription in process.subscribes.values():
+                subscription.known = list(subscription.ways)
+        self.relay.orders.clear()
+        self.control = Control(self)
+        await self.go_on()
+        for process, (method, topic) in calls:
+            self.call(process, method, topic)
+
+    async def go_on(self) -> None:
+        """All that goes on by itself."""
+        await self.control.begin()
+        self.task(self.carrying(self.relay))
+        self.task(self.connecting())
+
+    async def stop(self) -> None:
+        """End what goes on."""
+        mine = asyncio.current_task()
+        tasks = sorted(asyncio.all_tasks() - {mine}, key=lambda one: int(one.get_name().rpartition("-")[2]))
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    # --- promises ---
+
+    def may(self, process: Process, topic: str, *, publish: bool) -> bool:
+        """Whether the policy in force lets a node publish, or subscribe to, a topic."""
+        _, publishers, subscribers = POLICIES[self.policy]
+        return process.host in (publishers if publish else subscribers).get(topic, HOSTS)
+
+    def see(self, process: Process, uris: list[str]) -> None:
+        """Nobody is told another way than the relay's: the messages of a node go past the monitors there."""
+        for uri in uris:
+            if not uri.startswith("http://10.0.0.1:2") and uri != process.api:
+                self.errors.append(
+                    BrokenPromiseError(f"{process.name} is told {uri}, which is past the relay")
+                )
+
+    def check_granted(self) -> None:
+        """Nobody has what the policy in force does not grant, once the relay has carried out what it was told."""
+        for _key, topic, host, name in self.relay.grants:
+            self.check_grant(topic, host, name)
+        for key, topic in self.relay.publications:
+            publisher = self.control.registry.by_key(key)
+            if publisher is None or str(publisher.host) not in POLICIES[self.policy][1].get(topic, HOSTS):
+                raise BrokenPromiseError(f"{key} publishes {topic}, which the policy does not grant")
+
+    def check_grant(self, topic: str, host: str, name: str) -> None:
+        """The policy in force grants this to a subscriber: when the relay is told, and at the end."""
+        if host not in POLICIES[self.policy][2].get(topic, HOSTS):
+            text = f"{name} of {host} has {topic}, which the policy does not grant"
+            self.errors.append(BrokenPromiseError(text))
+
+    def check_connected(self) -> None:
+        """Every live subscriber hears every live publisher, as far as the policy lets them, and nobody else."""
+        holders = {}
+        for incarnation in self.control.registry.live():
+            for process in self.processes:
+                if process.alive and (process.name, process.api) == (incarnation.name, incarnation.api_text):
+                    holders[incarnation.key] = process
+        for process in self.processes:
+            if process in holders.values():  # else it is dead, or another has its name
+                for topic, subscription in process.subscribes.items():
+                    self._check_heard(process, topic, subscription, holders)
+
+    def _check_heard(
+        self, process: Process, topic: str, subscription: Subscription, holders: dict[str, Process]
+    ) -> None:
+        wanted = {
+            key
+            for key, one in holders.items()
+            if one is not process and topic in one.publishes
+            if self.may(one, topic, publish=True) and self.may(process, topic, publish=False)
+        }
+        whose = topic, process.host, process.name
+        heard = {key for key, *rest in self.relay.connections if tuple(rest) == whose}
+        told = {subscription.ways.get(uri, uri) for uri in subscription.known}
+        if not heard == told == wanted:
+            who = f"{process.name} at {process.host}:{process.port}"
+            raise BrokenPromiseError(f"{who} hears {heard} on {topic}, knows {told}, and may have {wanted}")
+
+
+class _Ports:
+    """As `Places`: a socket for each port that is none."""
+
+    def socket(self, port: int) -> "_Ports":
+        """As `Places`."""
+        self._port = port
+        return self
+
+    def fileno(self) -> int:
+        """As a socket's."""
+        return self._port
+
+
+class _Monitors:
+    """No specifications are in force."""
+
+    def statement(self, _relay: int) -> messages.SpecificationsStated:
+        """As `Monitors`."""
+        return messages.SpecificationsStated(0, [], {}, {}, restarted=False)
+
+
+@contextlib.contextmanager
+def instead_of(place: Any, name: str, other: object) -> Iterator[None]:
+    """What is there, which must be there, is another for a while."""
+    before = getattr(place, name)
+    setattr(place, name, other)
+    try:
+        yield
+    finally:
+        setattr(place, name, before)
+
+
+async def _history(seed: int, loop: VirtualLoop, say: Callable[[str], None]) -> None:
+    world = World(seed, loop, say)
+    try:
+        await _run(world)
+    finally:
+        await world.stop()
+
+
+async def _run(world: World) -> None:
+    await world.go_on()
+    for _ in range(world.rng.randrange(6, 24)):
+        action = world.rng.choice((
+            world.starts, world.starts, world.starts, world.changes_its_mind, world.changes_its_mind, world.dies,
+            world.hangs, world.reloads, world.reloads, world.master_dies, world.relay_dies, world.control_dies,
+        ))  # fmt: skip
+        done = action()
+        if done is not None:
+            await done
+        await asyncio.sleep(world.rng.choice((0.0, 0.001, 0.05, 0.5, 3.0, 30.0)))
+    world.faulty = False
+    for process in world.processes:
+        process.answers = True
+    world.say("no faults any more")
+    await asyncio.sleep(_SETTLES)
+    world.check_granted()
+    if world.errors:
+        raise world.errors[0]
+    world.check_connected()
+
+
+def run(seed: int, say: Callable[[str], None] = lambda _line: None) -> None:
+    """One history. Raises `BrokenPromiseError`."""
+    loop = VirtualLoop()
+    clock = SimpleNamespace(time=loop.time, monotonic=loop.time)
+    keys = count(1)
+    with contextlib.ExitStack() as stack:
+        stack.callback(loop.close)
+        for module in (arrivals_module, graph_module, liveness_module):
+            stack.enter_context(instead_of(module, "time", clock))
+        stack.enter_context(instead_of(arrivals_module, "new_key", lambda: f"{next(keys):032x}"))
+        loop.run_until_complete(_history(seed, loop, say))
+
+
+def _nothing(*_given: Any, **_named: Any) -> list[Effect]:
+    """A part that is forgotten."""
+    return []
+
+
+def _without(kind: type[Any]) -> Callable[[Enactor, Any], None]:
+    """An enactor that leaves out effects of a kind."""
+    whole = Enactor.carry_out
+    return lambda enactor, effects: whole(enactor, [one for one in effects if not isinstance(one, kind)])
+
+
+def _granted_nowhere(self: RelayControl, post: Any, incarnation: Incarnation) -> None:
+    for one in incarnation.registrations.values():
+        if one.kind is Kind.PUBLICATION:
+            self._place_one(post, incarnation, one.kind, one.resource, one.detail)
+
+
+MUTANTS: dict[str, tuple[Any, str, Any]] = {
+    "a subscriber is not told of a new publisher": (Graph, "tell", _nothing),
+    "nodes are told each other's own URIs": (
+        Incarnation,
+        "uri_for",
+        lambda node, _told, hidden: node.real_uri,
+    ),
+    "a reload takes back no registration": (Revocation, "_take_back", _nothing),
+    "a reload takes back no grant": (Revocation, "_revoke", _nothing),
+    "what a policy took is not put back": (Revocation, "returned", _nothing),
+    "an earlier life keeps its name": (Graph, "_take_name", _nothing),
+    "a lost node keeps its publications": (Registry, "_unindex", _nothing),
+    "a new relay is not told of grants": (RelayControl, "_place", _granted_nowhere),
+    "a grant is not kept": (Enactor, "carry_out", _without(SaveGrant)),
+    "a registration is not kept": (Enactor, "carry_out", _without(SaveRegistration)),
+    "the relay is not told of a grant": (Enactor, "carry_out", _without(PlaceGrant)),
+    "the relay is not told what is revoked": (Enactor, "carry_out", _without(RevokeGrant)),
+    "the relay is not told who publishes": (Enactor, "carry_out", _without(Place)),
+    "a node that comes back is placed nowhere": (Enactor, "carry_out", _without(PlaceNode)),
+}
+"""Faults of the core: where, and what stands there instead."""
+
+
+def first_broken(mutant: str, limit: int) -> int | None:
+    """The first seed whose history a faulty core does not keep the promises in."""
+    place, name, instead = MUTANTS[mutant]
+    with instead_of(place, name, instead):
+        for seed in range(limit):
+            try:
+                run(seed)
+            except (AssertionError, KeyError):
+                return seed
+    return None
+
+
+def main(arguments: list[str]) -> None:
+    """See the head of this file."""
+    if os.environ.get("PYTHONHASHSEED") != "0":  # sets of texts have another order in each process
+        os.environ["PYTHONHASHSEED"] = "0"
+        os.execv(sys.executable, [sys.executable, "-m", "tests.support.histories", *arguments])  # noqa: S606  this program again
+    structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
+    write = sys.stdout.write
+    match arguments:
+        case ["--many", number]:
+            for seed in range(int(number)):
+                try:
+                    run(seed)
+                except BrokenPromiseError as error:
+                    write(f"seed {seed}: {error}\n")
+        case ["--mutants", number]:
+            for mutant in MUTANTS:
+                write(f"{mutant}: {first_broken(mutant, int(number))}\n")
+        case [seed]:
+            run(int(seed), lambda line: print(line))  # noqa: T201, PLW0108
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
