@@ -140,16 +140,16 @@ class MonitorSet:
         self.tapped: list[Tapped] = []
         self._tapped_topics: frozenset[str] = frozenset()
         self.warnings: tuple[Finding, ...] = compiled.warnings
-        self._compiled = compiled
+        self.compiled = compiled
         self._turn = compiled.turn
-        self._on_fault: OnFault = on_fault
-        self._patience = patience
+        self.on_fault: OnFault = on_fault
+        self.patience = patience
         nodes = {node.name: node for file in files for node in file.specifications}
         self._order = tuple(nodes)
         self._monitors = monitors_of(
             compiled, [nodes[one.name] for one in compiled.specifications], 0, slices
         )
-        self._steps: dict[str, tuple[Step, ...]] = {}
+        self.steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
         self._requests: dict[tuple[str, str], tuple[Step, ...]] = {}
         self._due: int | None = None
@@ -256,26 +256,24 @@ class MonitorSet:
     def publications(self) -> Mapping[str, str]:
         """The topics that specifications publish, or would if they were not on trial, and their message types."""
         sets = (self, *self.trials)
-        return MappingProxyType(
-            {each.topic: each.type for one in sets for each in one._compiled.publications}
-        )
+        return MappingProxyType({each.topic: each.type for one in sets for each in one.compiled.publications})
 
     def published_by(self, file: str) -> frozenset[str]:
         """The topics that the specifications of a file publish."""
-        return frozenset(one.topic for one in self._compiled.publications if one.position.file == file)
+        return frozenset(one.topic for one in self.compiled.publications if one.position.file == file)
 
     def md5sum(self, message_type: str) -> str:
         """The md5sum of a message type as the specifications understand it."""
-        return self._compiled.messages.definitions.md5sum(message_type)
+        return self.compiled.messages.definitions.md5sum(message_type)
 
     @property
     def definitions(self) -> Definitions:
         """The definitions that the specifications were compiled against."""
-        return self._compiled.messages.definitions
+        return self.compiled.messages.definitions
 
     def wants(self, topic: str) -> bool:
         """Whether an enabled monitor has an event on this topic."""
-        return topic in self._steps
+        return topic in self.steps
 
     def taps(self, topic: str) -> bool:
         """Whether messages on this topic may be copied into `tapped`."""
@@ -283,12 +281,12 @@ class MonitorSet:
 
     def type_of(self, topic: str, *, tried: bool = False) -> str | None:
         """The message type of a topic that `wants`; None where none does, or (unless `tried`) only on trial."""
-        steps = self._steps.get(topic, ())
+        steps = self.steps.get(topic, ())
         return next((step.event.type for step in steps if tried or not isinstance(step, _Tap)), None)
 
     def stamped(self, topic: str) -> bool:
         """Whether the messages of a topic begin with a `std_msgs/Header`, as their type is known here."""
-        return self._compiled.is_stamped(self.type_of(topic, tried=True))
+        return self.compiled.is_stamped(self.type_of(topic, tried=True))
 
     def service_type_of(self, service: str, *, tried: bool = False) -> str | None:
         """The type of a service with an enabled event; None of another, or (unless `tried`) where it is on trial."""
@@ -300,7 +298,7 @@ class MonitorSet:
 
     def write_module(self) -> None:
         """Write the module that `walker` offers the walks of."""
-        self._walks = walks_of(self._compiled, self._monitors)
+        self._walks = walks_of(self.compiled, self._monitors)
 
     def explain_when(self, asked: Asked, tried: Asked) -> None:
         """Explain only verdicts that are asked for, by monitor, property, category and source; and those on trial."""
@@ -319,7 +317,7 @@ class MonitorSet:
 
     def walker(self, topic: str) -> Walker | None:
         """The walk for messages on this topic; None if there is none."""
-        return self._walks.of_topic.get(topic) if topic in self._steps and not self.taps(topic) else None
+        return self._walks.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
 
     def walks(self, walker: Walker, time_ns: int) -> bool:
         """Whether walks may be used now: nothing is due, no monitor waits for its first message or could not begin."""
@@ -336,13 +334,13 @@ class MonitorSet:
         """What a shared variable of a running specification is now; raises KeyError."""
         monitor = self.monitor(name)
         _come_home(monitor)
-        return self._compiled.namespace[monitor.code.variables[variable]]
+        return self.compiled.namespace[monitor.code.variables[variable]]
 
     def take_margins(self) -> Iterator[Margin]:
         """How close the comparisons of numbers came since this was asked last: of each that came up in this time, the
         nearest while it was true and the nearest while it was not.
         """
-        namespace = self._compiled.namespace
+        namespace = self.compiled.namespace
         for monitor in self.monitors:
             for number, one in enumerate(monitor.code.comparisons):
                 for holds, sides in ((True, one.when_true), (False, one.when_false)):
@@ -391,7 +389,7 @@ class MonitorSet:
         another definition now. One that begins anew goes on holding its topics if it did and is still declared
         `hold`. Raises `SpecificationError`, and nothing changed.
         """
-        following = MonitorSet.load(sources, definitions, self._on_fault, self._patience)
+        following = MonitorSet.load(sources, definitions, self.on_fault, self.patience)
         return following, following.succeed(self, time_ns)
 
     def succeed(
@@ -403,7 +401,7 @@ class MonitorSet:
         `incomplete` have not seen all messages on trial: they begin anew when they are not on trial any more.
         """
         known = {
-            monitor.name: (monitor, one._compiled)
+            monitor.name: (monitor, one.compiled)
             for one in (before, *before.trials)
             for monitor in one.monitors
         }
@@ -424,7 +422,7 @@ class MonitorSet:
     ) -> Outcome:
         fresh = []
         for monitor in self.monitors:
-            earlier, compiled = known.get(monitor.name, (None, self._compiled))
+            earlier, compiled = known.get(monitor.name, (None, self.compiled))
             if (
                 earlier is not None
                 and earlier.node == monitor.node
@@ -480,7 +478,7 @@ class MonitorSet:
 
     def process(self, topic: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY) -> Outcome:
         """What is to be done with a message: the bytes of its fields, received at this time on this topic."""
-        return self._process(self._steps.get(topic, ()), buffer, time_ns, sender)
+        return self._process(self.steps.get(topic, ()), buffer, time_ns, sender)
 
     def judge(self, topic: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY) -> Outcome:
         """What `process` says, by the walk where that takes the message: as in the relay."""
@@ -509,7 +507,7 @@ class MonitorSet:
         self._sender = NOBODY
         outcomes: list[Outcome] = []
         ticks: dict[int, int] = {}
-        over = self._patience()
+        over = self.patience()
         while self._due is not None and self._due <= time_ns:
             timer = self._next_timer()
             deadline = self._next_deadline()
@@ -700,12 +698,12 @@ class MonitorSet:
         if turn.log or turn.published:
             self._collect(outcome)
         if message.looked:
-            outcome.looked, outcome.sites = message.looked, self._compiled.module.sites
+            outcome.looked, outcome.sites = message.looked, self.compiled.module.sites
         if message.dropped:
             outcome.result = "dropped"
             outcome.overwritten = message.overwritten
             if message.cause is not None and outcome.fatal is None:
-                outcome.cause, outcome.sites = message.cause, self._compiled.module.sites
+                outcome.cause, outcome.sites = message.cause, self.compiled.module.sites
         elif message.changed:
             outcome.result = "changed"
             outcome.buffer = message.buffer
@@ -720,7 +718,7 @@ class MonitorSet:
             outcome.reason = f"{monitor.name} holds its topics until it is resumed"
             message.dropped = True
             return True
-        if monitor.broken and self._on_fault == "drop":
+        if monitor.broken and self.on_fault == "drop":
             outcome.reason = f"{monitor.name} could not begin: its first values or `init` faulted"
             message.dropped = True
             return True
@@ -799,12 +797,12 @@ class MonitorSet:
 
     def _block(self, message: Message | None, outcome: Outcome) -> None:
         """What the last fault does to the message."""
-        if message is not None and self._on_fault == "drop":
+        if message is not None and self.on_fault == "drop":
             message.dropped = True
             outcome.fatal = outcome.faults[-1]
 
     def _fault(self, error: Exception, monitor: Monitor, otherwise: Position, outcome: Outcome) -> None:
-        fault: Fault = explain(error, self._compiled.module, monitor.name, otherwise)
+        fault: Fault = explain(error, self.compiled.module, monitor.name, otherwise)
         monitor.faults += 1
         outcome.faults = (*outcome.faults, fault)
 
@@ -939,7 +937,7 @@ class MonitorSet:
         for stage in range(3):
             for monitor in tuple(beginning):
                 try:
-                    self._compiled.namespace[monitor.code.start[stage]]()
+                    self.compiled.namespace[monitor.code.start[stage]]()
                 except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of its beginning and is recorded
                     self._fault(error, monitor, monitor.node.position, outcome)
                     monitor.broken = True
@@ -947,7 +945,7 @@ class MonitorSet:
 
     def _take_over(self, monitor: Monitor, before: Monitor, compiled: Compiled) -> None:
         for name, code in monitor.code.variables.items():
-            self._compiled.namespace[code] = compiled.namespace[before.code.variables[name]]
+            self.compiled.namespace[code] = compiled.namespace[before.code.variables[name]]
         for running, old in zip(monitor.properties, before.properties, strict=True):
             running.run = old.run
             running.history = running.history.follow(old.history)
@@ -984,11 +982,11 @@ class MonitorSet:
         self._tapped_topics = frozenset(
             topic for topic, found in steps.items() if any(isinstance(step, _Tap) for step in found)
         )
-        self._steps = {topic: tuple(found) for topic, found in steps.items()}
+        self.steps = {topic: tuple(found) for topic, found in steps.items()}
         self._requests = {key: tuple(found) for key, found in requests.items()}
         self._contexts = {
             topic: tuple(step.monitor.context for step in found if step.first)
-            for topic, found in self._steps.items()
+            for topic, found in self.steps.items()
         }
         self._timed = any(
             monitor.timers or any(running.code.property.timed for running in monitor.properties)
@@ -999,7 +997,7 @@ class MonitorSet:
         """One for each topic and part of a service on which the trial has an enabled event."""
         return tuple(
             _Tap(found[0].monitor, found[0].event, 0, "", self._tap(trial, found[0].event))
-            for found in (*trial._steps.values(), *trial._requests.values())
+            for found in (*trial.steps.values(), *trial._requests.values())
         )
 
     def _tap(self, trial: "MonitorSet", event: EventCode) -> Callable[[Message | None], bool]:

@@ -121,13 +121,21 @@ class Message:
     """
 
     __slots__ = (
-        "_replaced", "_written", "buffer", "cause", "dropped", "looked", "past", "time", "touched",
+        "_replaced",
+        "buffer",
+        "cause",
+        "dropped",
+        "looked",
+        "past",
+        "time",
+        "touched",
+        "written",
     )  # fmt: skip
 
     def __init__(self, buffer: Buffer, time: int) -> None:
         self.buffer = buffer
         self.time = time
-        self._written: list[tuple[int, bytes]] | None = None  # where bytes were others, and which, in order
+        self.written: list[tuple[int, bytes]] | None = None  # where bytes were others, and which, in order
         self._replaced: bytes | None = None  # the bytes as received, once the buffer is another
         self.dropped = False
         self.cause: int | None = None
@@ -140,10 +148,10 @@ class Message:
         """Whether the bytes differ from those received."""
         if self._replaced is not None:
             return bytes(self.buffer) != self._replaced
-        if self._written is None:
+        if self.written is None:
             return False
         ends = -1
-        for start, old in sorted(self._written):
+        for start, old in sorted(self.written):
             if start < ends:  # written twice: it may be as it was
                 return bytes(self.buffer) != self._original()
             ends = start + len(old)
@@ -152,7 +160,7 @@ class Message:
     @property
     def overwritten(self) -> Sequence[tuple[int, bytes]]:
         """Where the buffer that came in had other bytes, and which, in order."""
-        return self._written or ()
+        return self.written or ()
 
     def patch(self, start: int, new: bytes) -> None:
         """Put bytes in the place of as many."""
@@ -162,13 +170,13 @@ class Message:
             return
         self.touched = True
         if self._replaced is None:
-            if self._written is None:
-                self._written = []
+            if self.written is None:
+                self.written = []
                 if isinstance(self.buffer, bytes) or (
                     isinstance(self.buffer, memoryview) and self.buffer.readonly
                 ):
                     self.buffer = bytearray(self.buffer)
-            self._written.append((start, bytes(old)))
+            self.written.append((start, bytes(old)))
         self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
 
     def splice(self, edits: list[tuple[int, int, bytes]]) -> None:
@@ -190,10 +198,10 @@ class Message:
 
     def _original(self) -> bytes:
         """The bytes as received, while the buffer is as long."""
-        if not self._written:
+        if not self.written:
             return bytes(self.buffer)
         original = bytearray(self.buffer)
-        for start, old in reversed(self._written):
+        for start, old in reversed(self.written):
             original[start : start + len(old)] = old
         return bytes(original)
 

@@ -27,7 +27,7 @@ def interpreted(compiled: Compiled) -> Compiled:
 
 def beside(monitors: MonitorSet) -> MonitorSet:
     """The set of the interpreter that belongs to one of generated code; not started."""
-    return MonitorSet(interpreted(monitors._compiled), monitors.files, monitors._on_fault, monitors._patience)
+    return MonitorSet(interpreted(monitors.compiled), monitors.files, monitors.on_fault, monitors.patience)
 
 
 def check_same(one: Outcome, other: Outcome) -> None:

@@ -250,7 +250,7 @@ def test_identifiers_are_not_those_of_the_generated_code() -> None:
 def test_the_namespace_of_generated_code_has_no_builtins() -> None:
     """Nothing that Python offers is in reach: no import, no attribute of a class, no file."""
     monitors = load("a() { event e(int x) /t std_msgs/Int32 '{data:x}' { x = 1; } }")
-    namespace = monitors._compiled.namespace
+    namespace = monitors.compiled.namespace
     assert namespace["__builtins__"] == {}
     dangerous = {
         builtins.eval,

@@ -34,9 +34,9 @@ def check(monitors: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) 
         check_same(
             monitors.process(topic, bytearray(body), time), other.process(topic, bytearray(body), time)
         )
-    for one in monitors._compiled.specifications:
+    for one in monitors.compiled.specifications:
         for code in one.variables.values():
-            known, found = (each._compiled.namespace[code] for each in (monitors, other))
+            known, found = (each.compiled.namespace[code] for each in (monitors, other))
             assert repr(known) == repr(found)  # a NaN is one, too
 
 

@@ -108,7 +108,7 @@ class Fed:
 def _state(monitors: MonitorSet) -> list[str]:
     state = []
     for monitor in monitors.monitors:
-        names = monitors._compiled.namespace
+        names = monitors.compiled.namespace
         state += [f"{name} {names.get(code)!r}" for name, code in monitor.code.variables.items()]
         state += [str(one.run.state) for one in monitor.properties if isinstance(one.run, FiniteRun)]
     return [*state, *map(str, monitors.take_margins())]

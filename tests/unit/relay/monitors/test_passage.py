@@ -114,7 +114,7 @@ class Monitored:
         state: list[object] = [self.set.next_due]
         for monitor in self.set.monitors:
             state.append((monitor.name, monitor.seen, monitor.faults, monitor.held))
-            names = self.set._compiled.namespace
+            names = self.set.compiled.namespace
             state += [(name, repr(names.get(code))) for name, code in monitor.code.variables.items()]
             state += [one.run.state for one in monitor.properties if isinstance(one.run, FiniteRun)]
             state += [one.run.deadline for one in monitor.properties]

@@ -195,7 +195,7 @@ def test_a_defect_in_it_ends_no_message(world: Trying) -> None:
     publisher, subscriber = world.typed()
     assert world.engine.middle.monitors is not None
     (trial,) = world.engine.middle.monitors.trials
-    trial._steps = {"/chatter": (None,)}  # type: ignore[dict-item]
+    trial.steps = {"/chatter": (None,)}  # type: ignore[dict-item]
     publisher.send(string("a"))
     world.gets(subscriber, string("a"))
     assert "a defect of rosrv" in world.event("trial fault").text

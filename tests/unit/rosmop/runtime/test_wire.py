@@ -47,7 +47,7 @@ def test_only_what_is_overwritten_is_kept_of_a_large_message() -> None:
     message.patch(8, b"\x01")
     message.patch(100, b"\x01\x02")
     assert message.changed
-    assert message._written == [(8, b"\0"), (100, b"\0\0")]
+    assert message.written == [(8, b"\0"), (100, b"\0\0")]
 
 
 @pytest.mark.parametrize("seed", range(200))
