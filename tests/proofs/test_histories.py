@@ -1,4 +1,4 @@
-"""Three thousand histories of RVMaster with faults: the promises of the model of the insertion, kept by the program."""
+"""A thousand histories of RVMaster with faults: the promises of the model of the insertion, kept by the program."""
 
 import pytest
 
@@ -8,4 +8,4 @@ from tests.unit.master.test_histories import said
 @pytest.mark.timeout(1200)
 def test_many_histories() -> None:
     """None breaks a promise; one that did is had again by its seed."""
-    assert said("--many", "3000") == []
+    assert said("--many", "1000") == []
