@@ -1,6 +1,6 @@
 /** A value that several parts of the page show: whoever uses it is drawn again when it changes. */
 
-import { useEffect, useState } from "./html.js";
+import { useEffect, useRef, useState } from "./html.js";
 
 /**
  * @template T
@@ -40,16 +40,16 @@ export function createStore(value) {
 export function useStore(store, select = (value) => /** @type {any} */ (value)) {
   const [, again] = useState(0);
   const part = select(store.get());
+  // Another `select` may come each time it is drawn: what is looked for is the part by the last one.
+  const drawn = useRef({ select, part });
+  drawn.current = { select, part };
   useEffect(() => {
-    let known = select(store.get());
-    if (!Object.is(known, part)) again((n) => n + 1);
-    return store.subscribe(() => {
-      const now = select(store.get());
-      if (!Object.is(now, known)) {
-        known = now;
-        again((n) => n + 1);
-      }
-    });
+    const look = () => {
+      const { select, part } = drawn.current;
+      if (!Object.is(select(store.get()), part)) again((n) => n + 1);
+    };
+    look();
+    return store.subscribe(look);
   }, [store]);
   return part;
 }

@@ -1,0 +1,181 @@
+"""An incident in the console by keys alone, as docs/review-an-incident.md has it; a recording; a trial's page."""
+
+import json
+import re
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Locator, Page, expect
+
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession, has_ros
+from tests.support.requirements import needs
+from tests.support.waiting import eventually
+from tests.system.console.reader import Reader
+
+POLICY = """\
+[Nodes]
+default = *
+
+[Publishers]
+default = *
+/rude = *
+
+[Subscribers]
+default = *
+
+[Commands]
+default = *
+"""
+CONFIG = """
+api: 127.0.0.1:0
+api_tls: off
+api_limits: {requests_per_second: 500, burst: 2000}
+audit: {reserve_bytes: 1MiB}
+recorder: {enabled: true, memory: 16MiB, disk: 512MiB, before: 20, after: 1, triggers: [drop]}
+"""
+MONITOR = """
+NAME() {
+    event said(std::string text) TOPIC std_msgs/String '{data:text}' { return; }
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def appliance() -> Iterator[Appliance]:
+    """An appliance with a flight recorder, and monitors that drop what is said on /rude and on /loud."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with tempfile.TemporaryDirectory(prefix="rosrv-incident-") as name:
+        folder = Path(name)
+        folder.chmod(0o755)  # the appliance's processes run as other users
+        (folder / "appliance.yaml").write_text(CONFIG)
+        (folder / "monitors").mkdir()
+        for monitor, topic in (("censor", "/rude"), ("hush", "/loud")):
+            text = MONITOR.replace("NAME", monitor).replace("TOPIC", topic)
+            (folder / "monitors" / f"{monitor}.rv").write_text(text)
+        options = ("--config", str(folder / "appliance.yaml"), "--monitors", str(folder / "monitors"))
+        with Appliance(policy=POLICY, options=options) as running:
+            yield running
+
+
+@pytest.fixture(scope="module")
+def recording(appliance: Appliance, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """/lout says something rude amid what /voice says; the monitor drops it, and the recorder has it."""
+    with RosSession(appliance.master_uri, tmp_path_factory.mktemp("ros")) as ros:
+        ear = ros.listener("rospy", "/chatter", name="ear")
+        ros.listener("rospy", "/rude", name="prude")
+        ros.talker("rospy", "/chatter", name="voice")
+        ear.wait_for_count(5, event="received")
+        ros.talker("rospy", "/rude", "--text", "<b>bad</b>", name="lout")
+        appliance.recorded(event="message dropped")
+
+    def closed() -> dict[str, Any] | None:
+        listed = appliance.rosrv("record", "list", "--json", check=False).stdout.splitlines()
+        row: dict[str, Any] | None = json.loads(listed[-1]) if listed else None
+        return row
+
+    return eventually(closed, appliance.story)
+
+
+def press(locator: Locator, key: str = "Enter") -> None:
+    """What a reader does who has no pointer."""
+    locator.focus()
+    locator.page.keyboard.press(key)
+
+
+def come_in(page: Page, token: str) -> None:
+    """Sign out, and in again with another token."""
+    press(page.get_by_role("button", name="Sign out"))
+    expect(page.get_by_label("Access token")).to_be_focused()
+    page.keyboard.insert_text(token)
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("navigation", name="Views")).to_be_visible()
+
+
+def test_an_incident_by_keys(
+    recording: dict[str, Any], appliance: Appliance, opened: Callable[..., Reader], token: Callable[..., str]
+) -> None:
+    """From Now to the drop, its record, the time line, what was said, the evidence; then the right is taken away."""
+    reader = opened(token("investigator", "carol"))
+    page = reader.go("now")
+    press(page.get_by_role("region", name="Done by monitors lately").get_by_role("link").nth(1))
+    panel = page.locator(".record")
+    expect(panel).to_contain_text("/lout")
+    press(panel.get_by_role("link", name="Time line"))
+
+    expect(page.get_by_role("heading", level=1, name="Recording")).to_be_visible()
+    chosen = page.locator(".incident-grid").get_by_role("region", name="message dropped")
+    expect(chosen).to_contain_text("/rude")
+    expect(chosen).to_contain_text("127.0.0.1")
+    expect(page.get_by_role("img", name="/rude: ")).to_be_visible()
+    slider = page.get_by_role("slider", name="Moment")
+    before = slider.get_attribute("aria-valuenow")
+    press(slider, "ArrowLeft")
+    expect(slider).not_to_have_attribute("aria-valuenow", str(before))
+    page.keyboard.press("+")
+    expect(page.locator(".skeleton")).to_have_count(0)
+    page.keyboard.press("0")
+    press(page.get_by_role("button", name="/rude", exact=True))
+    press(page.get_by_role("button", name="Read messages"))
+    said = page.get_by_role("list", name="Messages")
+    expect(said).to_contain_text("<b>bad</b>")
+    expect(said).to_contain_text("/lout")
+    records = appliance.recorded("--event", "recording read")
+    assert {record["detail"]["who"] for record in records} == {"carol"}
+    with page.expect_download() as bundle:
+        press(page.get_by_role("button", name="Evidence"))
+    with zipfile.ZipFile(bundle.value.path()) as archive:
+        assert "recording/recording.bag" in archive.namelist()
+
+    come_in(page, str(appliance.ready["token"]))
+    page.keyboard.press("4")
+    expect(page.locator("[data-editor] .cm-content").first).to_contain_text("/rude")
+    reader.editor().focus()
+    page.keyboard.press("Control+a")
+    page.keyboard.insert_text(POLICY.replace("/rude = *", "/rude = 10.9.9.9"))
+    page.keyboard.press("Control+s")
+    press(page.get_by_role("button", name="Load", exact=True))
+    press(page.get_by_role("dialog").get_by_role("button", name="Load the policy"))
+    expect(reader.toast("is in force")).to_be_visible()
+    assert appliance.rest().get("/v1/policy").json["text"].count("/rude = 10.9.9.9") == 1
+
+
+def test_who_may_not_read_is_told_why(
+    recording: dict[str, Any], opened: Callable[..., Reader], token: Callable[..., str]
+) -> None:
+    """A viewer sees the list and the time line, and whom the messages are for; nothing is wider than the window."""
+    reader = opened(token("viewer"), width=390, height=844)
+    page = reader.go("recordings")
+    press(page.locator("tbody").get_by_role("link").first)
+    expect(page.get_by_role("slider", name="Moment")).to_be_visible()
+    expect(page.get_by_role("button", name="Read messages")).to_have_attribute(
+        "title", "For the role investigator; yours is viewer"
+    )
+    expect(page.get_by_role("button", name="Evidence")).to_have_attribute("aria-disabled", "true")
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    assert reader.axe() == []
+    assert recording["id"] in page.url
+
+
+def test_a_monitor_on_trial_says_what_it_would_drop_and_is_promoted(
+    appliance: Appliance, opened: Callable[..., Reader], tmp_path: Path
+) -> None:
+    """Its page counts and lists what it would have dropped while nothing is; promoted, it drops."""
+    appliance.rosrv("monitor", "disable", "hush")
+    page = opened().go("monitors/hush", heading="hush")
+    press(page.get_by_role("button", name="Try"))
+    expect(page.get_by_text("on trial", exact=True)).to_be_visible()
+    with RosSession(appliance.master_uri, tmp_path) as ros:
+        ear = ros.listener("rospy", "/loud", name="neighbour")
+        ros.talker("rospy", "/loud", name="shouter")
+        ear.wait_for_count(3, event="received")
+        count = page.locator(".figures div").filter(has_text="Would have dropped").locator("dd")
+        expect(count).to_have_text(re.compile("[1-9]"))
+        expect(page.get_by_role("region", name="What it did last")).to_contain_text("/loud")
+        press(page.get_by_role("button", name="Promote"))
+        expect(page.get_by_role("switch", name="hush enabled")).to_have_attribute("aria-checked", "true")
+        appliance.recorded(event="message dropped", resource="/loud")
