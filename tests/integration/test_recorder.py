@@ -22,7 +22,9 @@ from tests.support.waiting import eventually
 
 MONITOR = """
 censor() {
-    event said(std::string text) /rude std_msgs/String '{data:text}' { return; }
+    event said(std::string text) /rude std_msgs/String '{data:text}' {
+        if (text.size() > 2) { return; }
+    }
 }
 """
 CONFIGURATION = """
@@ -147,6 +149,12 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
     table = appliance.rosrv("monitor", "replay", "censor", "--since", "1h").stdout.splitlines()
     assert table[0].startswith("not recorded: ")
     assert table[-1].endswith(" of 2 recordings")
+    closest = ("monitor", "replay", "censor", "--since", "1h", "--margins", "--json")
+    margins = [json.loads(line) for line in appliance.rosrv(*closest).stdout.splitlines()]
+    [offline] = [margin for margin in margins if margin["kind"] == "margin"]
+    live = json.loads(appliance.rosrv("monitor", "margins", "censor", "--json").stdout)
+    assert (live["line"], live["holds"]) == (offline["line"], offline["holds"]) == (4, True)
+    assert live["since_load"]["threshold_at"] == offline["threshold_at"] == len("bad 1")
     secret = tmp_path / "secret.rv"
     secret.write_text(MONITOR.replace("/rude", "/secret/key"))
     refused = appliance.rosrv("monitor", "replay", str(secret), "--since", "1h", check=False)
