@@ -201,7 +201,18 @@ class Graph:
         return self._grants.give(row) if caller_id else []
 
     def _give_up(self, subscriber: Incarnation, topic: str) -> Effects:
-        """The subscriber gave the topic up: its grants for it, on every publisher, are gone."""
+        """The subscriber gave the topic up: its grants for it, on every publisher, are gone.
+
+        Unless another of its name and host has the topic by now: grants are for these two, so they are its own.
+        """
+        other = self._registry.holder(subscriber.name)
+        if (
+            other is not None
+            and other is not subscriber
+            and other.host == subscriber.host
+            and (Kind.SUBSCRIPTION, topic) in other.registrations
+        ):
+            return []
         host, name = str(subscriber.host), subscriber.name
         return [
             effect
@@ -239,15 +250,23 @@ class Graph:
         ]
 
     def tell_everybody(self, concerned: Callable[[str], bool] = lambda _topic: True) -> Effects:
-        """Give every subscriber the lists of all (the concerned) topics, once: after a rebuild or a new relay."""
+        """Give every subscriber the lists of all (the concerned) topics: after a rebuild, a new relay or control.
+
+        An empty one of a topic that the policy took: control may have died before the subscriber was told.
+        """
         topics = {
             registration.resource
             for _node, registration in self._registry.in_order()
             if registration.kind is Kind.SUBSCRIPTION
         }
-        return [
+        effects = [
             effect for topic in sorted(topics) if concerned(topic) for effect in self.tell(topic, always=True)
         ]
+        for node in self._registry.live():
+            for kind, topic in node.shelf:
+                if kind is Kind.SUBSCRIPTION and concerned(topic):
+                    effects.append(_emptied(node, topic))
+        return effects
 
     def renew_all(self, topic: str) -> Effects:
         """Have every subscriber of a topic drop its publishers and take them again: they are reached elsewhere."""
