@@ -308,7 +308,7 @@ inline monitors_changed() {
 }
 
 /* A set of monitors takes the place of the one before, between two messages.
-   = appliance/relay/monitors/middle.py Middle._compiled */
+   = appliance/relay/monitors/middle.py Middle.compiled */
 inline swap(revision, how) {
     has = revision;
     blocked = false;

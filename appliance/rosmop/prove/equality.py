@@ -45,6 +45,7 @@ from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
 EQUAL = "equal"
+IN_PYTHON = "no module: messages of this topic are judged in Python"
 PATIENCE = 1.0
 """Seconds for each event."""
 
@@ -80,6 +81,11 @@ def findings_of(
                 specification = compiled.specifications[number]
                 name = f"{specification.name}.{specification.events[index].name}"
                 yield validation.finding(topic, name, each.function, place)
+    in_module = {numbers for group in found for events in group.events for numbers in events}
+    for number, specification in enumerate(compiled.specifications):
+        for index, event in enumerate(specification.events):
+            if event.topic is not None and event.part is None and (number, index) not in in_module:
+                yield Finding(event.topic, f"{specification.name}.{event.name}", IN_PYTHON)
 
 
 class Validation:
@@ -104,7 +110,7 @@ class Validation:
         """What is known of the event that is at this place among those of a topic."""
         feed = self._module.feeds.get(topic)
         if feed is None:
-            return Finding(topic, event, "no module: messages of this topic are judged in Python")
+            return Finding(topic, event, IN_PYTHON)
         numbers = list(_called(self.codes[self._exports[feed.name]].body))
         try:
             return Finding(topic, event, self._compared(function, numbers[place], topic))

@@ -69,6 +69,8 @@ REQUESTS: list[tuple[str, str, Any]] = [
     ("PATCH", "/v1/monitors", {"names": ["a"], "held": False}),
     ("POST", "/v1/recordings", {}),
     ("POST", "/v1/recordings", {"before": 30, "after": 2.5, "note": "n"}),
+    ("POST", "/v1/recordings/memory", {}),
+    ("POST", "/v1/recordings/memory", {"since": 7, "until": 9}),
     ("DELETE", f"/v1/recordings/{'a' * 20}", None),
     ("DELETE", "/v1/tokens/two%20words", None),
     ("POST", "/v1/hosts", {"name": "laptop"}),
@@ -106,16 +108,21 @@ class Listening(ControlLink):
 
 
 @functools.cache
-def api() -> tuple[Gate, Listening, str]:
-    """The api with a token of an admin."""
-    row, token = make_token("alice", "admin", now=time.time(), seconds=6000)
+def api() -> tuple[Gate, Listening, dict[str, str]]:
+    """The api with a token of each role that gives orders."""
+    made = {
+        role: make_token("alice", role, now=time.time(), seconds=6000) for role in ("admin", "investigator")
+    }
     door, control, journal = Doorkeeper(10), Listening(), Journal(lambda _call: None)
-    door.state([messages.TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)])
+    door.state([
+        messages.TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
+        for row, _token in made.values()
+    ])  # fmt: skip
     limits = Settings().api_limits.model_copy(update={"burst": 100_000})
     gate = Gate(
         application(control, door, journal), limits=limits, doorkeeper=door, journal=journal, names=["api"]
     )
-    return gate, control, token
+    return gate, control, {role: token for role, (_row, token) in made.items()}
 
 
 def application(control: ControlLink, door: Doorkeeper, journal: Journal) -> FastAPI:
@@ -128,8 +135,9 @@ def application(control: ControlLink, door: Doorkeeper, journal: Journal) -> Fas
 
 
 def ordered(method: str, target: str, body: Any, tag: str = "*") -> list[messages.RequestMade]:
-    """What an honest api asks of control for a request of an admin."""
-    gate, control, token = api()
+    """What an honest api asks of control for a request of whoever may make it."""
+    gate, control, tokens = api()
+    token = tokens["investigator" if target == "/v1/recordings/memory" else "admin"]
     control.orders.clear()
     headers = {"Authorization": f"Bearer {token}", "If-Match": tag}
     given = {"content": body} if isinstance(body, str) else {"json": body}

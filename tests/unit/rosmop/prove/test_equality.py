@@ -9,7 +9,7 @@ import pytest
 
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
-from appliance.rosmop.prove.equality import EQUAL, findings_of
+from appliance.rosmop.prove.equality import EQUAL, IN_PYTHON, findings_of
 from tests.support.module_mutants import FAULTY, compiled, event, faulty
 
 MONITORS = Path(__file__).parents[4] / "monitors"
@@ -20,17 +20,18 @@ def answers(text: str, known: Definitions | None = None) -> dict[str, str]:
     return {one.event: one.answer for one in findings_of(compiled(text, known), time.monotonic, patience=60)}
 
 
-PYTHON = "no module: messages of this topic are judged in Python"
 SHIPPED = {
+    "goals": {"goals.goal": IN_PYTHON, "goals.cancel": IN_PYTHON, "goals.result": IN_PYTHON},
     "logging": {
         "logging.batteryState": EQUAL, "logging.position": EQUAL, "logging.turretMovement": "not loop-free",
-        "logging.shot": PYTHON,
+        "logging.shot": IN_PYTHON,
     },
     "obstacle_avoidance": {
-        "obstacleAvoidance.speed": EQUAL, "obstacleAvoidance.scan": "not loop-free", "obstacleAvoidance.drive": PYTHON,
+        "obstacleAvoidance.speed": EQUAL, "obstacleAvoidance.scan": "not loop-free",
+        "obstacleAvoidance.drive": IN_PYTHON,
     },
     "safe_triggering": {"safeTrigger.checkPosition": "not loop-free", "safeTrigger.safeTrigger": EQUAL},
-    "safe_zone": {"safeZone.odometry": PYTHON, "safeZone.gps": PYTHON, "safeZone.drive": EQUAL},
+    "safe_zone": {"safeZone.odometry": IN_PYTHON, "safeZone.gps": IN_PYTHON, "safeZone.drive": EQUAL},
 }  # fmt: skip
 
 
@@ -86,7 +87,7 @@ UNPROVED = {
     "not loop-free": event("for (int i = 0; i < x; i++) { x += i; }", "int x", "count:x"),
     "uses seconds": event("d = t.toSec();", "ros::Time t", "when:t", "double d = 0;"),
     "uses the instruction f64.copysign": event("y = copysign(y, 1.0);", "double y", "x:y"),
-    PYTHON: event("y = sin(y);", "double y", "x:y"),
+    IN_PYTHON: event("y = sin(y);", "double y", "x:y"),
 }
 
 
