@@ -33,7 +33,7 @@ unit:
 	$(PYTEST) tests/unit -n auto --quiet
 
 test: check ## check, and the tests with real ROS nodes (root: they make network namespaces)
-	$(PYTEST) tests/integration tests/proofs/test_insertion.py -n auto --dist loadfile --quiet --durations=10
+	$(PYTEST) tests/integration tests/proofs/test_insertion.py tests/proofs/test_histories.py -n auto --dist loadfile --quiet --durations=10
 
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
