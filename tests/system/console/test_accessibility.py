@@ -49,7 +49,7 @@ def test_axe_finds_nothing(theme: str, width: int, opened: Callable[..., Reader]
             expect(page.locator(".finding").first).to_be_visible()
         found[view] = reader.axe()
         assert page.evaluate("document.documentElement.scrollWidth") <= width, view
-    reader.page.get_by_role("button", name="Enrol a host").click()
+    reader.go("hosts").get_by_role("button", name="Enrol a host").click()
     found["a dialog"] = reader.axe()
     assert {view: rows for view, rows in found.items() if rows} == {}
 
@@ -78,6 +78,7 @@ def test_it_goes_by_keys(opened: Callable[..., Reader]) -> None:
         ("4", "Policy"),
         ("5", "Monitors"),
         ("6", "Hosts"),
+        ("7", "Recordings"),
         ("1", "Now"),
     ):
         page.keyboard.press(key)

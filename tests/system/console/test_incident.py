@@ -93,7 +93,8 @@ def come_in(page: Page, token: str) -> None:
     expect(page.get_by_label("Access token")).to_be_focused()
     page.keyboard.insert_text(token)
     page.keyboard.press("Enter")
-    expect(page.get_by_role("navigation", name="Views")).to_be_visible()
+    expect(page.locator("[data-standing=live]")).to_be_visible()
+    expect(page.get_by_role("heading", level=1)).to_be_visible()
 
 
 def test_an_incident_by_keys(
@@ -168,7 +169,7 @@ def test_a_monitor_on_trial_says_what_it_would_drop_and_is_promoted(
     appliance.rosrv("monitor", "disable", "hush")
     page = opened().go("monitors/hush", heading="hush")
     press(page.get_by_role("button", name="Try"))
-    expect(page.get_by_text("on trial", exact=True)).to_be_visible()
+    expect(page.get_by_text("on trial", exact=True).first).to_be_visible()
     with RosSession(appliance.master_uri, tmp_path) as ros:
         ear = ros.listener("rospy", "/loud", name="neighbour")
         ros.talker("rospy", "/loud", name="shouter")
