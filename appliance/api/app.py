@@ -118,9 +118,12 @@ async def _of_http(request: Request, error: Exception) -> Response:
 
 def _methods(request: Request) -> set[str]:
     """What can be done at a path, by the contract; pages outside it are only read."""
-    paths = request.app.openapi()["paths"].items()
-    here = [operations for path, operations in paths if compile_path(path)[0].match(request.url.path)]
-    return {method.upper() for operations in here for method in operations} or {"GET"}
+    paths = request.app.openapi()["paths"]
+    matching = [path for path in paths if compile_path(path)[0].match(request.url.path)]
+    if not matching:
+        return {"GET"}
+    here = min(matching, key=lambda path: path.count("{"))  # a path that is written out goes before a name
+    return {method.upper() for method in paths[here]}
 
 
 async def _invalid(request: Request, error: Exception) -> Response:

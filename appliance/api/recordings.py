@@ -12,6 +12,7 @@ from typing import Annotated, Literal, TypeVar
 import msgspec
 from fastapi import Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
+from starlette.exceptions import HTTPException
 
 from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
@@ -118,6 +119,11 @@ def routes(services: Services) -> Routes:
         """What is in memory now, to be fetched as a recording for ten minutes, or until somebody else asks."""
         order = admin.RecordingOfMemory(span.since, span.until)
         return answered(await control.ask(order, bearer, _SLOW_SECONDS))
+
+    @router.api_route("/memory", methods=["GET", "DELETE"], include_in_schema=False)
+    async def no_recording(_bearer: Viewer) -> None:
+        """No recording has this word as its id."""
+        raise HTTPException(405)
 
     @router.get("/{recording_id}", operation_id="recording", responses=_UNKNOWN)
     async def recording(recording_id: OneId, bearer: Viewer) -> Recording:
