@@ -82,11 +82,11 @@ def lock(base: str, build_options: list[str]) -> None:
 def _write_anew(saved: Path, work: Path, moment: int) -> tuple[Path, Path]:
     tree = Tree()
     with tarfile.open(saved) as archive:
-        entry = json.loads(_content(archive, "manifest.json"))[0]
-        config = json.loads(_content(archive, entry["Config"]))
+        entry = json.loads(_opened(archive, "manifest.json").read())[0]
+        config = json.loads(_opened(archive, entry["Config"]).read())
         layers = []
         for number, name in enumerate(entry["Layers"]):
-            with archive.extractfile(name) as layer, tarfile.open(fileobj=layer) as members:  # type: ignore[union-attr]
+            with _opened(archive, name) as layer, tarfile.open(fileobj=layer) as members:
                 layers.append(_layer(work / f"layer{number}", _kept(members, tree, moment)))
     architecture = config["architecture"]
     labels = config["config"]["Labels"]
@@ -214,10 +214,10 @@ def _write_oci(image: Path, config: dict[str, Any], layers: list[Blob], moment: 
                 archive.addfile(member, content)
 
 
-def _content(archive: tarfile.TarFile, name: str) -> bytes:
+def _opened(archive: tarfile.TarFile, name: str) -> IO[bytes]:
     member = archive.extractfile(name)
     assert member is not None, name  # noqa: S101  the engine has written it
-    return member.read()
+    return member
 
 
 def _docker(*arguments: str) -> str:

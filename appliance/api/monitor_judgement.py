@@ -35,7 +35,7 @@ class Draft:
 
 def judge(before: Monitors, order: MonitorLoad) -> Draft:
     """What loading these would do to what is in force. Raises `ProblemError` with every finding."""
-    from appliance.specifications.files import Sources, SpecificationsRefusedError, check  # noqa: PLC0415  when needed
+    from appliance.specifications.files import Sources, SpecificationsRefusedError, check  # noqa: PLC0415  the compiler: see the head
 
     present = Sources(before.files or {}, before.definitions or {}, before.signatures or {})
     following = present.with_files(Sources(order.files, order.definitions, order.signatures))
@@ -90,9 +90,9 @@ class Compiler:
 
 
 def _compiled(files: dict[str, str], definitions: dict[str, str]) -> MonitorSet:
-    from appliance.ros.definitions import Definitions  # noqa: PLC0415  when needed
-    from appliance.ros.standard import standard_definitions  # noqa: PLC0415  when needed
-    from appliance.rosmop.engine import MonitorSet  # noqa: PLC0415  when needed
+    from appliance.ros.definitions import Definitions  # noqa: PLC0415  the compiler: see the head
+    from appliance.ros.standard import standard_definitions  # noqa: PLC0415  the compiler: see the head
+    from appliance.rosmop.engine import MonitorSet  # noqa: PLC0415  the compiler: see the head
 
     return MonitorSet.load(files, standard_definitions().extended(Definitions.from_files(definitions)))
 
@@ -114,7 +114,7 @@ def events_of(monitor: Monitor) -> list[EventShown]:
 
 def properties_of(monitor: Monitor) -> list[PropertyShown]:
     """The properties of a monitor."""
-    from appliance.rosmop.logics.picture import dot_of  # noqa: PLC0415  when needed
+    from appliance.rosmop.logics.picture import dot_of  # noqa: PLC0415  the compiler: see the head
 
     return [
         PropertyShown(
@@ -130,6 +130,6 @@ def properties_of(monitor: Monitor) -> list[PropertyShown]:
 
 def picture_of(monitor: Monitor) -> str | None:
     """The automata of a monitor's properties (SVG); None when none is finite."""
-    from appliance.rosmop.logics.picture import svg_of  # noqa: PLC0415  when needed
+    from appliance.rosmop.logics.picture import svg_of  # noqa: PLC0415  the compiler: see the head
 
     return svg_of([each.property for each in monitor.code.properties])

@@ -140,7 +140,7 @@ def routes(services: Services) -> Routes:
         recording_id: OneId,
         request: Request,
         bearer: Investigator,
-        format: Annotated[Literal["bag", "mcap"], Query(description="mcap: made of the bag")] = "bag",  # noqa: A002
+        format: Annotated[Literal["bag", "mcap"], Query(description="mcap: made of the bag")] = "bag",  # noqa: A002  its name in the contract
     ) -> Response:
         """The messages of a recording, for investigators; it is recorded who fetched them."""
         give_back = services.exports.take(bearer, peer_of(request), "exports")

@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
+from typing import get_args
 
 import msgspec
 
@@ -108,7 +109,7 @@ def timeline(
         end,
         sorted(kept, key=lambda flow: flow.topic),
         len(flows) - len(kept),
-        [EventMarks(kind, counts[kind]) for kind in EventKind.__args__ if kind in counts],  # type: ignore[attr-defined]
+        [EventMarks(kind, counts[kind]) for kind in get_args(EventKind) if kind in counts],
         events,
         happened - len(events),
     )

@@ -6,6 +6,20 @@ from typing import Any
 
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Record, RuleReference
+from appliance.audit_trail import AuditTrail
+
+
+class HeardTrail(AuditTrail):
+    """A trail that keeps what happened where a test finds it: (event, its reason and other fields)."""
+
+    def __init__(self, log: AuditLog) -> None:
+        super().__init__(log, strict=False, deny_when_failed=False)
+        self.heard: list[tuple[str, dict[str, Any]]] = []
+
+    def happened(self, event: str, reason: str, **fields: Any) -> str:
+        """As `AuditTrail`."""
+        self.heard.append((event, {"reason": reason, **fields}))
+        return super().happened(event, reason, **fields)
 
 
 def decision(log: AuditLog, number: int = 0, **changes: Any) -> Record:

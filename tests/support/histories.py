@@ -364,7 +364,9 @@ class Control(ControlParts):
 class World:
     """Everything in one history."""
 
-    def __init__(self, seed: int, loop: VirtualLoop, say: Callable[[str], None] = lambda _line: None) -> None:
+    def __init__(
+        self, seed: int, loop: VirtualLoop, say: Callable[[str], object] = lambda _line: None
+    ) -> None:
         self.rng = Random(seed)  # noqa: S311  histories, no secrets
         self.loop = loop
         self._say = say
@@ -724,7 +726,7 @@ def instead_of(place: Any, name: str, other: object) -> Iterator[None]:
         setattr(place, name, before)
 
 
-async def _history(seed: int, loop: VirtualLoop, say: Callable[[str], None]) -> None:
+async def _history(seed: int, loop: VirtualLoop, say: Callable[[str], object]) -> None:
     world = World(seed, loop, say)
     try:
         await _run(world)
@@ -754,7 +756,7 @@ async def _run(world: World) -> None:
     world.check_connected()
 
 
-def run(seed: int, say: Callable[[str], None] = lambda _line: None) -> None:
+def run(seed: int, say: Callable[[str], object] = lambda _line: None) -> None:
     """One history. Raises `BrokenPromiseError`."""
     loop = VirtualLoop()
     clock = SimpleNamespace(time=loop.time, monotonic=loop.time)
@@ -837,7 +839,7 @@ def main(arguments: list[str]) -> None:
             for mutant in MUTANTS:
                 write(f"{mutant}: {first_broken(mutant, int(number))}\n")
         case [seed]:
-            run(int(seed), lambda line: print(line))  # noqa: T201, PLW0108
+            run(int(seed), lambda line: write(f"{line}\n"))
 
 
 if __name__ == "__main__":

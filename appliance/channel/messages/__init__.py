@@ -9,7 +9,7 @@ Strings from strangers (names, header values) are carried as values and never in
 A message that is written in one of these files is one of `messages`: nothing else is to be listed.
 """
 
-# ruff: noqa: F403
+# ruff: noqa: F403  a new message is listed by being written
 from appliance.channel.answers.status import ProcessInfo as ProcessInfo
 from appliance.channel.messages.api import *
 from appliance.channel.messages.forwarding import *

@@ -19,6 +19,7 @@ address of a table that says where each begins.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import inf
 from types import MappingProxyType
 from typing import Any
@@ -600,7 +601,7 @@ class _Body:
                 code += self._if(self._get(write.flag), self._elsewhere)
                 continue
             self._writes += 1
-            code += self._if(self._get(write.flag), lambda write=write: self._put_field(write))  # type: ignore[misc]
+            code += self._if(self._get(write.flag), partial(self._put_field, write))
         return code
 
     def _put_field(self, write: form.Write) -> bytes:

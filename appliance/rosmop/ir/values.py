@@ -5,6 +5,7 @@ A message is the list of its fields.
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import groupby
 from typing import Any
 
@@ -179,12 +180,11 @@ class Values:
         code, least, element = struct_code(kind.element), self.least(kind.element), kind.element
         decode: Callable[[wire.Buffer, int, int], tuple[Any, int]]
         if code is None:
-            one = self.decoder(element)
-            decode = lambda buffer, start, number: wire.elements(buffer, start, number, one)  # noqa: E731
+            decode = partial(wire.elements, decode=self.decoder(element))
         elif len(code) == 2:
-            decode = lambda buffer, start, number: wire.moments(buffer, start, number, code[0])  # noqa: E731
+            decode = partial(wire.moments, code=code[0])
         else:
-            decode = lambda buffer, start, number: wire.numbers(buffer, start, number, code, least)  # noqa: E731
+            decode = partial(wire.numbers, code=code, size=least)
         length = kind.length
         if length is not None:
             return lambda buffer, start: decode(buffer, start, length)

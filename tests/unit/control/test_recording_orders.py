@@ -99,7 +99,12 @@ def test_what_is_closed_is_recorded_noted_and_listed() -> None:
 
     async def story() -> None:
         scene = Scene()
-        recorder = scene.attach(lambda message: heard.append(message) or [])  # type: ignore[func-returns-value]
+
+        def hear(message: Any) -> list[messages.Message]:
+            heard.append(message)
+            return []
+
+        recorder = scene.attach(hear)
         recorder.send(messages.RevisionsWanted())
         recorder.send(messages.RecordingClosed(KEPT))
         await told(scene, lambda: len(heard) == 2)

@@ -1,5 +1,6 @@
 """A bundle has what happened and what was in force, and proves itself with Python and openssl alone."""
 
+import ast
 import hashlib
 import itertools
 import json
@@ -520,8 +521,6 @@ def test_columns_are_packed_as_the_log_packs_them() -> None:
 
 def test_the_verifier_is_a_program_for_python_3_8() -> None:
     """It imports nothing but the standard library, and has no syntax that came later."""
-    import ast  # noqa: PLC0415
-
     tree = ast.parse(VERIFIER.read_text(), feature_version=(3, 8))
     imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
     imported |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}

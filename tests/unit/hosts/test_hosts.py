@@ -15,7 +15,6 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from appliance.audit.log import AuditLog
-from appliance.audit_trail import AuditTrail
 from appliance.channel.answers.hosts import Endpoint, EnrolmentToken, KitParts, PortsSeen
 from appliance.channel.messages import CertificateMade, Message, TunnelsEnclosed, TunnelsWanted
 from appliance.hosts.authority import Authority, AuthorityError
@@ -35,6 +34,7 @@ from appliance.ipsec.proof import RequestRefusedError
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.policy.model import Address
 from appliance.store.state import StateStore
+from tests.support.audit import HeardTrail
 
 
 class NearAuthority(Authority):
@@ -80,20 +80,12 @@ class Bench:
         self.log = AuditLog(directory / "audit.db")
         self.declared = directory / "hosts.yaml"
         self.authority = NearAuthority(directory)
-        trail = AuditTrail(self.log, strict=False, deny_when_failed=False)
-        self.records: list[tuple[str, str]] = []
-        happened = trail.happened
-
-        def noted(event: str, reason: str, **fields: Any) -> str:
-            self.records.append((event, reason))
-            return str(happened(event, reason, **fields))
-
-        trail.happened = noted  # type: ignore[method-assign]  # beside what it does
+        self.trail = HeardTrail(self.log)
         self.table = HostTable(self.store, ipaddress.IPv4Network(pool), Declared(self.declared))
-        self.tunnels = Tunnels(self.table, trail, self.authority, listen=(listen, 11311), say=self._said)
+        self.tunnels = Tunnels(self.table, self.trail, self.authority, listen=(listen, 11311), say=self._said)
         certification = Certification(
             self.store,
-            trail,
+            self.trail,
             self.authority,
             self.table,
             self.tunnels,
@@ -308,7 +300,7 @@ def token(
 
 def recorded(bench: Bench, event: str) -> list[str]:
     """The reasons of all records of an event."""
-    return [reason for name, reason in bench.records if name == event]
+    return [fields["reason"] for name, fields in bench.trail.heard if name == event]
 
 
 def test_a_one_time_token_enrols_once(tmp_path: Path) -> None:

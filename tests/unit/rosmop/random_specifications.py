@@ -171,7 +171,7 @@ class Messages:
     """Random messages of the two topics."""
 
     def __init__(self, seed: int) -> None:
-        self._random = Random(seed)  # noqa: S311
+        self._random = Random(seed)  # noqa: S311  draws examples, not keys
 
     def traffic(self) -> Traffic:
         """Some messages of one topic; mostly equally long, now and then not even of their type."""

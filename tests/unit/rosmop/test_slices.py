@@ -146,7 +146,7 @@ def naive(one: Made, trace: Trace) -> list[Told]:
 @pytest.mark.parametrize("seed", range(60))
 def test_slices_are_what_the_specification_says_of_each_binding(seed: int) -> None:
     """Random specifications and traces: verdicts, output and variables as by definition; so does the interpreter."""
-    random = Random(seed)  # noqa: S311  a test
+    random = Random(seed)  # noqa: S311  draws examples, not keys
     one = made(random)
     monitors = load(one.text(binding=True))
     interpreter = beside(monitors)

@@ -173,7 +173,7 @@ def test_one_by_one_they_are_told_as_the_interpreter_tells_them(seed: int, wild:
     assert fed.state() == _state(fed.interpreter)
 
 
-def test_a_message_that_needs_no_record_is_not_for_the_engine() -> None:
+def test_a_message_that_needs_no_record_is_not_for_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     """`judge` asks the engine for a change and a fault, and for what the module has no room for."""
     fed = Fed("""s() { int n = 0; int m = 0;
         event a(int c) /plain own/Plain '{count:c}' { n++; if (c == 3) { c = 4; } }
@@ -185,7 +185,7 @@ def test_a_message_that_needs_no_record_is_not_for_the_engine() -> None:
         asked.append(bytes(buffer))
         return process(topic, buffer, time_ns, sender)
 
-    fed.monitors.process = counted  # type: ignore[method-assign, assignment]
+    monkeypatch.setattr(fed.monitors, "process", counted)
     told, engine = (
         [plain(1), plain(4), plain(6, kind=1)],
         [plain(3), plain(5, kind=1), plain(rest=bytes(AREA))],

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from appliance.audit.log import AuditLog
-from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.specifications.allocation import Allocation, Move, Resource
 from appliance.specifications.files import Sources, SpecificationsRefusedError
 from appliance.specifications.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
 from appliance.store.state import StateStore
+from tests.support.audit import HeardTrail
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
 
 A = "a() { int shared; event said() /chatter std_msgs/String '{}' { } }"
@@ -32,15 +32,7 @@ class Desk:
         self.folder.mkdir()
         (self.folder / "a.rv").write_text(A)
         self.log = AuditLog(home / "audit.db")
-        self.trail = AuditTrail(self.log, strict=False, deny_when_failed=False)
-        self.events: list[tuple[str, dict[str, Any]]] = []
-        happened = self.trail.happened
-
-        def noted(event: str, reason: str, **fields: Any) -> str:
-            self.events.append((event, fields))
-            return happened(event, reason, **fields)
-
-        self.trail.happened = noted  # type: ignore[method-assign]
+        self.trail = HeardTrail(self.log)
         self.store = StateStore(home, failed=pytest.fail)
         self.sent: list[messages.Message] = []
         self.findings: list[str] = []
@@ -138,7 +130,7 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
     assert (restarted.names(), restarted.who, restarted.differs_from_folder) == (["a", "b"], "eve", True)
     back = await restarted.reload(who="operator", prune=True)
     assert (back.removed, restarted.names(), restarted.differs_from_folder) == (["b.rv"], ["a"], False)
-    loaded = [fields for event, fields in desk.events if event == "specifications loaded"]
+    loaded = [fields for event, fields in desk.trail.heard if event == "specifications loaded"]
     assert [fields["began"] for fields in loaded][:2] == [[], ["b"]]
     assert [fields["who"] for fields in loaded] == ["disk", "eve", "operator"]
     (desk.folder / "b.rv").write_text(B)
@@ -242,7 +234,9 @@ async def test_what_is_not_confirmed_goes_back(desk: Desk) -> None:
     assert not await restarted.confirm(who="eve")
     again = desk.monitors(enable="none", restarted=True)
     assert (again.names(), again.confirm_by) == ([], None)
-    assert [fields["who"] for event, fields in desk.events if event == "specifications confirmed"] == ["eve"]
+    assert [fields["who"] for event, fields in desk.trail.heard if event == "specifications confirmed"] == [
+        "eve"
+    ]
 
 
 async def test_the_first_load_goes_back_to_nothing(tmp_path: Path) -> None:
@@ -280,7 +274,7 @@ async def test_a_bad_specification_changes_nothing(desk: Desk) -> None:
     with pytest.raises(SpecificationsRefusedError, match="something"):
         await monitors.load(Sources({"b.rv": B}), who="eve", note="")
     assert (monitors.revision, monitors.names()) == (1, ["a"])
-    assert [event for event, _ in desk.events].count("specifications refused") == 3
+    assert [event for event, _ in desk.trail.heard].count("specifications refused") == 3
     desk.findings = []
     (desk.folder / "a.rv").write_text("nonsense")
     with pytest.raises(SpecificationsRefusedError):
@@ -303,7 +297,7 @@ async def test_switches_are_kept_and_recorded(desk: Desk) -> None:
         await monitors.switch(["nobody"], True, who="eve")
     with pytest.raises(SpecificationsRefusedError, match="--enable"):
         desk.monitors("a,nobody")
-    assert [fields["who"] for event, fields in desk.events if event == "monitor enabled"] == ["eve"]
+    assert [fields["who"] for event, fields in desk.trail.heard if event == "monitor enabled"] == ["eve"]
 
 
 async def test_a_monitor_that_was_removed_while_the_robot_ran_does_not_keep_it_from_starting(
@@ -322,10 +316,10 @@ async def test_a_relay_that_follows_another_is_an_alarm_and_holds(desk: Desk) ->
     monitors = desk.monitors()
     assert monitors.statement().restarted is False
     monitors.received(messages.SpecificationsTaken(1, ["a", "b"], []))
-    assert "monitors restarted" not in [event for event, _ in desk.events]
+    assert "monitors restarted" not in [event for event, _ in desk.trail.heard]
     assert monitors.statement().restarted is True
     monitors.received(messages.SpecificationsTaken(1, ["a", "b"], ["b"]))
-    assert [fields["held"] for event, fields in desk.events if event == "monitors restarted"] == [["b"]]
+    assert [fields["held"] for event, fields in desk.trail.heard if event == "monitors restarted"] == [["b"]]
     assert monitors.held == {"b"}
     assert await monitors.resume(["a", "b"], who="eve") == ["b"]
     assert desk.sent[-1] == messages.MonitorResumed("b")
@@ -333,7 +327,7 @@ async def test_a_relay_that_follows_another_is_an_alarm_and_holds(desk: Desk) ->
     control = desk.monitors(restarted=True)
     assert control.statement().restarted is True
     control.received(messages.SpecificationsTaken(1, [], []))
-    assert [event for event, _ in desk.events].count("monitors restarted") == 1
+    assert [event for event, _ in desk.trail.heard].count("monitors restarted") == 1
 
 
 async def test_what_others_use_is_not_removed_alone(desk: Desk) -> None:
@@ -398,7 +392,7 @@ async def test_a_monitor_is_not_resumed_while_its_relay_is_away(desk: Desk) -> N
     desk.away = True
     with pytest.raises(SpecificationsRefusedError, match="b not resumed: the relay process is away"):
         await monitors.resume(["b"], who="eve")
-    assert "monitor resumed" not in [event for event, _ in desk.events]
+    assert "monitor resumed" not in [event for event, _ in desk.trail.heard]
     assert monitors.held == {"b"}
 
 
@@ -452,12 +446,12 @@ async def test_what_monitors_did_is_recorded_with_its_count(desk: Desk) -> None:
         messages.MonitorEvent("change", "b", "k", "/cmd", 5, "a.e, b.e, b.f", together, count=9),
     ]
     monitors.received(messages.MonitorsReported(told, 5))
-    changed = [fields for event, fields in desk.events if event == "message changed"]
+    changed = [fields for event, fields in desk.trail.heard if event == "message changed"]
     assert (changed[0]["before"], changed[0]["after"], changed[1]["count"]) == ("01", "02", 41)
     assert changed[3]["more"] == together
     assert (monitors.records.counts["change", "a"], monitors.records.counts["change", "b"]) == (52, 10)
     assert (monitors.records.at["change", "/chatter"], monitors.records.at["change", "/cmd"]) == (42, 10)
-    assert [fields["lost"] for event, fields in desk.events if event == "records lost"] == [5]
+    assert [fields["lost"] for event, fields in desk.trail.heard if event == "records lost"] == [5]
 
 
 def sources(**texts: str) -> Sources:
@@ -504,7 +498,7 @@ async def test_where_the_site_signs_nothing_else_comes_into_force(desk: Desk) ->
     assert desk.monitors(restarted=True, site_keys=[LINE]).sources == sources(a=A + " ", b=B)
     with pytest.raises(SpecificationsRefusedError, match="rosrv monitor reset"):
         desk.monitors(restarted=True, site_keys=[OTHER_LINE])
-    loaded = [fields["signed_by"] for event, fields in desk.events if event == "specifications loaded"]
+    loaded = [fields["signed_by"] for event, fields in desk.trail.heard if event == "specifications loaded"]
     assert loaded == [[], *([[NAME]] * 5)]
 
 
@@ -547,7 +541,7 @@ async def test_a_trial_is_told_kept_and_promoted(desk: Desk) -> None:
     await monitors.switch(["a"], False, who="eve")
     with pytest.raises(SpecificationsRefusedError, match="a is disabled, not on trial"):
         await monitors.promote(["a"], who="eve")
-    said = [(event, fields["who"]) for event, fields in desk.events if event.startswith("monitor ")]
+    said = [(event, fields["who"]) for event, fields in desk.trail.heard if event.startswith("monitor ")]
     assert said == [("monitor on trial", "eve"), ("monitor enabled", "adam"), ("monitor disabled", "eve")]
 
 
@@ -627,10 +621,10 @@ async def test_what_a_trial_would_have_done_is_no_drop(desk: Desk) -> None:
         ),
     ]
     monitors.received(messages.MonitorsReported(told, 0))
-    observed = [fields for event, fields in desk.events if event == "trial observed"]
+    observed = [fields for event, fields in desk.trail.heard if event == "trial observed"]
     assert [(fields["trial"], fields["would"]) for fields in observed] == [(True, "drop"), (True, "fault")]
     assert {str(fields["severity"]) for fields in observed} == {str(observed[0]["severity"])}
-    assert not {"message dropped", "monitor fault"} & {event for event, _ in desk.events}
+    assert not {"message dropped", "monitor fault"} & {event for event, _ in desk.trail.heard}
     assert monitors.records.counts["trial drop", "a"] == 1
     assert not monitors.records.counts["drop", "a"]
     assert not monitors.records.at

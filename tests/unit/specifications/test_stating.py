@@ -13,6 +13,7 @@ from appliance.channel import messages
 from appliance.specifications.allocation import TOPIC, Allocation, Move, Resource
 from appliance.specifications.files import Sources, SpecificationsRefusedError, check
 from appliance.specifications.stating import Revision, Stating
+from tests.support.audit import HeardTrail
 
 pytestmark = pytest.mark.anyio
 
@@ -92,15 +93,7 @@ class World:
 
     def __init__(self, home: Path) -> None:
         self.log = AuditLog(home / "audit.db")
-        self.trail = AuditTrail(self.log, strict=False, deny_when_failed=False)
-        self.records: list[tuple[str, str]] = []
-        happened = self.trail.happened
-
-        def noted(event: str, reason: str, **fields: Any) -> str:
-            self.records.append((event, reason))
-            return happened(event, reason, **fields)
-
-        self.trail.happened = noted  # type: ignore[method-assign]  # listens in
+        self.trail = HeardTrail(self.log)
         self.fleet = Fleet(self.trail)
         self.stating = self.fleet.stating
         self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
@@ -168,7 +161,7 @@ async def test_a_topic_moves_only_between_monitors(world: World) -> None:
         ("stated", 1, 2, [], ()),
         ("placed", "/b", 0),
     ]
-    assert [reason for event, reason in world.records if event == "topics moved"] == [
+    assert [fields["reason"] for event, fields in world.trail.heard if event == "topics moved"] == [
         "/b is carried by another relay process; b began in the initial state there"
     ]
 

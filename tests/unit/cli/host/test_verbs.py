@@ -47,7 +47,7 @@ def token(request: HostToken) -> EnrolmentToken:
     """What the appliance makes of it; it finds its own address where none is given."""
     endpoint, reason = (request.endpoint, "") if request.endpoint else FOUND
     return example(
-        EnrolmentToken, name="laptop", address="10.113.11.2", token="rosrv-enrol_x", expires=1795164925.0,  # noqa: S106
+        EnrolmentToken, name="laptop", address="10.113.11.2", token="rosrv-enrol_x", expires=1795164925.0,  # noqa: S106  of nobody
         endpoint=endpoint, endpoint_reason=reason, script="#!/bin/sh\n# join",
     )  # fmt: skip
 

@@ -149,13 +149,13 @@ def test_a_port_of_another_range_is_not_given_out(first: int) -> None:
     after.close_unclaimed(set())
 
 
-def test_no_host_takes_all_ports() -> None:
+def test_no_host_takes_all_ports(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hosts that take all they can, one after the other, leave some for the next; what is given back counts no more."""
     ports = range(20_000, 20_800)
     here = Places(
         "127.0.0.1", ports, keep=lambda *_: None, drop=lambda _: None, named_as=NAMING.named_as, relays=4
     )
-    here.listen = lambda: Listening(here.unused.popleft())  # type: ignore[method-assign,assignment,return-value]
+    monkeypatch.setattr(here, "listen", lambda: Listening(here.unused.popleft()))
     for host in HOSTS[:3]:
         taken = []
         with pytest.raises(NoPortError, match=r"3 times as many as are left; widen \[Ports\] range"):
@@ -169,13 +169,13 @@ def test_no_host_takes_all_ports() -> None:
     assert here.open(HOSTS[3])
 
 
-def test_many_addresses_of_one_network_are_one_host() -> None:
+def test_many_addresses_of_one_network_are_one_host(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two hundred guests whom one network of the policy names have three quarters of the ports together."""
     here = Places(
         "127.0.0.1", range(20_000, 20_800), keep=lambda *_: None, drop=lambda _: None,
         named_as=NAMING.named_as, relays=4,
     )  # fmt: skip
-    here.listen = lambda: Listening(here.unused.popleft())  # type: ignore[method-assign,assignment,return-value]
+    monkeypatch.setattr(here, "listen", lambda: Listening(here.unused.popleft()))
     refused = ""
     for number in range(200):
         try:

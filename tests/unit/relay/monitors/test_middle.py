@@ -386,16 +386,18 @@ def test_bytes_that_are_no_message_of_the_type_are_dropped(world: Monitored) -> 
     assert "not a message of this type" in world.event("fault").text
 
 
-def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(world: Monitored) -> None:
+def test_a_defect_of_the_monitors_drops_the_message_and_nothing_else(
+    world: Monitored, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Even one that is ours."""
     world.load(GUARD)
     publisher, subscriber = world.typed()
     monitors = world.engine.middle.monitors
     assert monitors is not None
-    process, monitors.process = monitors.process, lambda *_args: 1 / 0  # type: ignore[method-assign, assignment]  # a defect, put there
+    monkeypatch.setattr(monitors, "process", lambda *_args: 1 / 0)
     publisher.send(string("a"))
     assert "a defect of rosrv" in world.event("fault").text
-    monitors.process = process  # type: ignore[method-assign]  # and taken away
+    monkeypatch.undo()
     publisher.send(string("b"))
     world.gets(subscriber, string("b"))
 

@@ -62,7 +62,7 @@ class Monitored:
             publish=lambda _published: None,
             changed=lambda _topics: None,
         )
-        self.middle.now = lambda: self.time  # type: ignore[method-assign]
+        self.middle.now = lambda: self.time  # type: ignore[method-assign]  # the test sets the time
         self._lanes: dict[str, Lane] = {}
         self.set = MonitorSet.load(texts, known, on_fault)
         if together:
@@ -269,7 +269,7 @@ def test_shipped_monitors_do_the_same_together() -> None:
         agree(texts, known, _shipped_traffic(seed))
 
 
-def test_most_messages_are_taken_together() -> None:
+def test_most_messages_are_taken_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """A monitor that reads, writes and steps looks at no message of a batch singly, but for the first of a second."""
     text = """s() { event e(int count, double x) /plain own/Plain '{count:count, x:x}' { x = count + 0.5; }
                   fsm: a [ e -> b ] b [ e -> a ] @fail { } }"""
@@ -282,7 +282,7 @@ def test_most_messages_are_taken_together() -> None:
         single += 1
         return process(*arguments)
 
-    monitored.set.process = counted  # type: ignore[method-assign, assignment]
+    monkeypatch.setattr(monitored.set, "process", counted)
     body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
     frame = struct.pack("<I", len(body)) + body
     for _ in range(5):
@@ -307,7 +307,7 @@ def test_what_several_change_is_counted_for_each_of_them() -> None:
     assert {row.name: row.changes for row in monitored.rows()} == {"one": 100, "two": 200, "three": 0}
 
 
-def test_a_defect_of_the_walk_is_told_once_and_the_engine_goes_on() -> None:
+def test_a_defect_of_the_walk_is_told_once_and_the_engine_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """Messages go on, one by one; the walk of this topic is not tried again."""
     monitored = Monitored(
         {"x.rv": "s() { event e(int count) /plain own/Plain '{count:count}' { count = 3; } }"},
@@ -322,7 +322,7 @@ def test_a_defect_of_the_walk_is_told_once_and_the_engine_goes_on() -> None:
 
     walker = monitored.set.walker("/plain")
     assert walker is not None
-    walker.walk = defect  # type: ignore[method-assign, assignment]
+    monkeypatch.setattr(walker, "walk", defect)
     body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
     frame = struct.pack("<I", len(body)) + body
     changed = frame[:5] + struct.pack("<i", 3) + frame[9:]

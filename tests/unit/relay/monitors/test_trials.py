@@ -103,17 +103,18 @@ def test_it_is_promoted_between_two_messages_with_its_state_and_goes_back_on_tri
     world.gets(subscriber, string("6"))
 
 
-def test_messages_that_wait_are_given_before_it_is_promoted(world: Trying) -> None:
+def test_messages_that_wait_are_given_before_it_is_promoted(
+    world: Trying, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """So what it has seen is complete."""
     world.state_trials(GUARD, tried=("guard",))
     publisher, subscriber = world.typed()
     middle = world.engine.middle
-    have_turn = middle.trials.have_turn
-    middle.trials.have_turn = lambda: None  # type: ignore[method-assign]  # it never has its turn
+    monkeypatch.setattr(middle.trials, "have_turn", lambda: None)  # it never has its turn
     publisher.send(string("a") * 3)
     world.gets(subscriber, string("a") * 3)
     assert len(middle.trials.waiting) == 3
-    middle.trials.have_turn = have_turn  # type: ignore[method-assign]
+    monkeypatch.undo()
     assert world.state_trials(GUARD, revision=2) == []
     publisher.send(string("count"))
     world.gets(subscriber, string("4"))
@@ -195,7 +196,7 @@ def test_a_defect_in_it_ends_no_message(world: Trying) -> None:
     publisher, subscriber = world.typed()
     assert world.engine.middle.monitors is not None
     (trial,) = world.engine.middle.monitors.trials
-    trial.steps = {"/chatter": (None,)}  # type: ignore[dict-item]
+    trial.steps = {"/chatter": (None,)}  # type: ignore[dict-item]  # the defect
     publisher.send(string("a"))
     world.gets(subscriber, string("a"))
     assert "a defect of rosrv" in world.event("trial fault").text
