@@ -37,7 +37,7 @@ test: check ## check, and the tests with real ROS nodes (root: they make network
 
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
-	$(PYTEST) tests/system tests/proofs/test_insertion_at_large.py tests/proofs/test_past.py tests/proofs/test_events.py --quiet --durations=15
+	$(PYTEST) tests/system tests/proofs/test_insertion_at_large.py tests/proofs/test_certifier.py tests/proofs/test_events.py --quiet --durations=15
 
 test-package: ## what is installed: the package's life in a virtual machine, image and archive built, the wheel
 	@scripts/setup --system

@@ -1,0 +1,147 @@
+"""Parametric specifications beside DejaVu's, on the traces of its own tests: `python -m benchmarks.dejavu CHECKOUT`.
+
+CHECKOUT is DejaVu's repository (github.com/havelund/dejavu): its tests name the events of each trace at which a
+property fails, those of the traces that it was entered with at the CRV benchmark challenge of 2018 among them. For
+each the same events have to be said here; the exit status is 1 where they are not. The time is that of one event, all
+specifications together, in microseconds of processor time. A trace that is not in the checkout is said, and left out.
+
+DejaVu quantifies over all values; a slice has one binding. So a formula over two parameters that is the conjunction
+of formulas over one is two specifications here (every user with every file would be a slice each), and `exists` over
+what no event binds together is not among the properties.
+"""
+
+import csv
+import struct
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from appliance.ros.standard import standard_definitions
+from appliance.rosmop.engine import MonitorSet
+
+SLICES = 100_000
+TESTS = Path("src/test/scala")
+_FIELDS = ("key", "value")
+
+
+def specification(name: str, events: Mapping[str, Sequence[str]], over: Sequence[str], formula: str) -> str:
+    """A parametric `ptltl` property. Each event has the names of its values, in their order; `over` are parameters."""
+    lines = [
+        f"event {event}({', '.join(f'std::string {one}' for one in values if one in over)}) /{event} "
+        f"diagnostic_msgs/KeyValue "
+        f"'{{{', '.join(f'{_FIELDS[values.index(one)]}:{one}' for one in values if one in over)}}}' {{ }}"
+        for event, values in events.items()
+        if any(one in over for one in values)
+    ]
+    head = f"{name}({', '.join(f'std::string {one}' for one in over)}) {{"
+    return "\n".join([head, *lines, f"ptltl: {formula}", "@violation { }", "}"])
+
+
+def of(events: Mapping[str, Sequence[str]], *properties: tuple[Sequence[str], str]) -> tuple[str, ...]:
+    """A specification for each property: its parameters and its formula."""
+    return tuple(
+        specification(f"s{number}", events, over, formula)
+        for number, (over, formula) in enumerate(properties)
+    )
+
+
+@dataclass(frozen=True)
+class Case:
+    """A trace, the specifications, and the events at which DejaVu says that they fail, counted from 1."""
+
+    trace: str
+    specifications: tuple[str, ...]
+    fails: tuple[int, ...]
+
+
+OPEN = "access => (!close S open)"
+ACCESS = of(
+    {"login": ("u",), "logout": ("u",), "open": ("f",), "close": ("f",), "access": ("u", "f")},
+    (("u",), "access => (!logout S login)"),
+    (("f",), OPEN),
+)
+SECURE = of(
+    {"login": ("u",), "logout": ("u",), "open": ("f",), "close": ("f",), "access": ("u", "f")},
+    (("u",), "access => (!logout S login)"),
+    (("f",), f"({OPEN}) and (close => <*> open)"),
+)
+FILE = of({"open": ("f", "m"), "close": ("f",)}, (("f",), "close => (*)(!close S open)"))
+LOCKS = of(
+    {"acq": ("t", "l"), "rel": ("t", "l"), "sleep": ("t",)},
+    (("t", "l"), "(sleep => !(!rel S acq)) and (rel => (*)(!rel S acq))"),
+    # whoever acquired it: the same until the first failure, for before it only who has a lock releases it
+    (("l",), "acq => !(*)(!rel S acq)"),
+)
+COMMANDS = of({"dis": ("c", "n"), "suc": ("c", "n"), "err": ("n",)}, (("c", "n"), "suc => (!err S dis)"))
+TWO = of({"p": ("z",), "q": ("y",), "r": ("y", "z")}, (("y", "z"), "r => (!q S p)"))
+_FMSD = "tests_fmsd/property"
+CASES = (
+    *(Case(f"tests/test{number}/log1.csv", TWO, ()) for number in (6, 10)),
+    *(Case(f"tests/test{number}/log2.csv", TWO, ()) for number in (6, 10)),
+    *(Case(f"tests/test{number}/log3.csv", TWO, (5,)) for number in (6, 10)),
+    Case("tests/test7/log1.csv", SECURE, (7, 9)),
+    Case("tests/test7/log2.csv", SECURE, ()),
+    Case("tests/test8/log1.csv", COMMANDS, ()),
+    Case("tests/test8/log2.csv", COMMANDS, (7,)),
+    Case("tests/test8/log3.csv", COMMANDS, (7, 8)),
+    Case(f"{_FMSD}1-access/10,000/log-dejavu.txt", ACCESS, (11_006,)),
+    Case(f"{_FMSD}1-access/100,000/log-dejavu.txt", ACCESS, (110_006,)),
+    Case(f"{_FMSD}1-access/1,000,000/log-dejavu.txt", ACCESS, (1_100_006,)),
+    Case(f"{_FMSD}2-file/10,000/log-dejavu.txt", FILE, (11_004,)),
+    Case(f"{_FMSD}2-file/100,000/log-dejavu.txt", FILE, (110_004,)),
+    Case(f"{_FMSD}2-file/1,000,000/log-dejavu.txt", FILE, (1_100_004,)),
+    Case(f"{_FMSD}4-locks-basic/10,000/log-dejavu.txt", LOCKS, (10_401,)),
+    Case(f"{_FMSD}4-locks-basic/100,000/log-dejavu.txt", LOCKS, (105_001,)),
+    Case(f"{_FMSD}4-locks-basic/1,000,000/log-dejavu.txt", LOCKS, (1_050_126,)),
+)
+
+
+def messages(trace: Path) -> list[tuple[str, bytes]]:
+    """Topics, and `diagnostic_msgs/KeyValue` of the first two values; a third one no property asks for."""
+    found = []
+    with trace.open(newline="") as rows:
+        for name, *values in (row for row in csv.reader(rows) if row):
+            texts = [one.strip().encode() for one in (*values, "", "")[:2]]
+            found.append((f"/{name.strip()}", b"".join(struct.pack("<I", len(one)) + one for one in texts)))
+    return found
+
+
+def failing(specifications: Sequence[str], trace: Sequence[tuple[str, bytes]]) -> tuple[list[int], float]:
+    """The events at which one of them is violated, counted from 1, and the microseconds of an event."""
+    sources = {f"{number}.rv": text for number, text in enumerate(specifications)}
+    monitors = MonitorSet.load(sources, standard_definitions(), slices=SLICES)
+    monitors.start(0)
+    found = []
+    started = time.process_time()
+    for place, (topic, message) in enumerate(trace, 1):
+        outcome = monitors.process(topic, message, place)
+        if outcome.faults:
+            raise SystemExit(f"event {place}: {outcome.faults[0].text}")
+        if outcome.verdicts:
+            found.append(place)
+    return found, (time.process_time() - started) / len(trace) * 1e6
+
+
+def main(checkout: Path) -> int:
+    """Print what is found; whether all is as DejaVu says (0) or not (1)."""
+    wrong = 0
+    for case in CASES:
+        path = checkout / TESTS / case.trace
+        if not path.is_file():
+            print(f"{case.trace}: not in {checkout}")
+            continue
+        trace = messages(path)
+        found, cost = failing(case.specifications, trace)
+        same = found == list(case.fails)
+        wrong += not same
+        said = "as DejaVu" if same else f"DejaVu says {list(case.fails)}"
+        print(f"{case.trace}: {len(trace)} events, fails at {found}: {said}; {cost:.1f} µs an event")
+    return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        raise SystemExit(__doc__)
+    sys.exit(main(Path(sys.argv[1])))
