@@ -21,12 +21,11 @@ class Counts:
         self.walker = walker
         self.place = place
         self.begun = False
-        """Whether something is counted."""
+        """Whether somebody has been told that something is counted."""
         self._clear()
 
     def add(self, walked: Walked, time: int) -> int:
         """Count a walk; how many messages it dropped."""
-        self.begun = True
         for who, count in walked.changed:
             self._changed[who] = self._changed.get(who, 0) + count
         for number, count in enumerate(walked.dropped):

@@ -2,11 +2,11 @@
 
 Theory of operation:
 
-- Work is bounded by *fuel*, given with each call and used up by what the module does (about one for an instruction or
-  a byte that is copied), the same on every machine. Memory is bounded by a limit. What goes beyond is a `MachineTrap`.
+- Work is bounded by *fuel*, which is used up by what the module does (about one for an instruction or a byte that is
+  copied), the same on every machine. Memory is bounded by a limit. What goes beyond is a `MachineTrap`.
 - The addresses of the whole limit are reserved at the start and the memory grows in place: a view of it is never
   wrong, an older one is only shorter. A view keeps the memory when the machine is closed.
-- The library of the package `wasmtime` is called by its C functions (0.6 µs a call, 20 by its Python) under Python's
+- The library of the package `wasmtime` is called by its C functions (0.4 µs a call, 20 by its Python) under Python's
   lock: no other thread is ever within a machine. Its Python could not be loaded in the relay: it has functions that
   C calls, for which libffi wants memory that is writable and executable at once. So a module has no imports, either.
 - Traps come without signals: a handler of SIGSEGV (`faulthandler`) is not in the way.
@@ -39,7 +39,8 @@ _REASONS = ("stack overflow", "memory out of bounds", "misaligned access", "tabl
 _OFF = ("component_model", "custom_page_sizes", "exceptions", "function_references", "gc", "memory64", "multi_memory",
         "relaxed_simd", "simd", "stack_switching", "tail_call", "threads", "wide_arithmetic")  # fmt: skip
 
-_Call = Callable[[tuple[int, ...], int], int | None]
+Call = Callable[..., int | None]
+"""A function of integers, which takes them in order and goes on with the fuel that there is (`Machine.refuel`)."""
 
 
 class MachineError(Exception):
@@ -70,7 +71,7 @@ class Machine:
         engine = _engine(max(limit - 1, PAGE - 1).bit_length())
         store = _Store(engine, limit)
         self._store: _Store | None = store
-        self._functions: dict[str | int, _Call] = {}
+        self._functions: dict[str | int, Call] = {}
         self._memory: _Export | None = None
         self._view = memoryview(b"")
         module, instance, trap = ctypes.c_void_p(), (ctypes.c_uint64 * 2)(), ctypes.c_void_p()
@@ -124,12 +125,21 @@ class Machine:
         `MachineTrap`; `MachineError` where there is no such function or the machine is closed; `struct.error` where
         the arguments are not as many as it takes or too large.
         """
+        function = self.function(name)
+        self.refuel(fuel)
+        return function(*arguments)
+
+    def function(self, name: str | int) -> Call:
+        """An exported function of integers, for who calls it often; see `call`."""
         try:
-            function = self._functions[name]
+            return self._functions[name]
         except KeyError:
             self._asked()
             raise MachineError(f"the module has no function {name!r} of integers") from None
-        return function(arguments, fuel)
+
+    def refuel(self, fuel: int) -> None:
+        """Say how much fuel there is from now on. Raises `MachineError` when closed."""
+        _check(load().wasmtime_context_set_fuel(self._asked()[0], fuel))
 
     def close(self) -> None:
         """Give the module back, and the memory when the last view of it is gone."""
@@ -230,7 +240,7 @@ def _engine(bits: int) -> int:
     return engine
 
 
-def _bound(store: _Store, export: _Export) -> _Call | None:
+def _bound(store: _Store, export: _Export) -> Call | None:
     """A function as it is called from Python; None if it has others than integers.
 
     Arguments and result stand in slots of 16 bytes; a trap or error that comes back is ours to free.
@@ -244,20 +254,27 @@ def _bound(store: _Store, export: _Export) -> _Call | None:
     if len(gives) > 1 or None in (*takes, *gives):
         return None
     # Without the types of their arguments, which would be looked at in each call.
-    invoke, refuel = c["wasmtime_func_call_unchecked"], c["wasmtime_context_set_fuel"]
-    invoke.restype = refuel.restype = ctypes.c_void_p
+    invoke = c["wasmtime_func_call_unchecked"]
+    invoke.restype = ctypes.c_void_p
     slots = (ctypes.c_uint64 * (2 * max(len(takes), 1)))()
     slots.keeps = store, native  # type: ignore[attr-defined]  # until the call is over, whoever closes the machine
+    room = memoryview(slots).cast("B")
     fill = struct.Struct("<" + "q8x" * len(takes)).pack_into
-    read = memoryview(slots).cast("B").cast(gives[0]) if gives else (None,)
-    trap, tank, context = ctypes.c_void_p(), ctypes.c_uint64(), ctypes.c_void_p(store.context)
-    given = (context, function, slots, ctypes.c_size_t(len(slots) // 2), ctypes.byref(trap))
+    read = room.cast(gives[0]) if gives else (None,)
+    trap = ctypes.c_void_p()
+    given = (
+        ctypes.c_void_p(store.context),
+        function,
+        slots,
+        ctypes.c_size_t(len(slots) // 2),
+        ctypes.byref(trap),
+    )
 
-    def call(arguments: tuple[int, ...], fuel: int) -> int | None:
-        fill(slots, 0, *arguments)
-        tank.value = fuel
-        refuel(context, tank)
-        _check(invoke(*given))
+    def call(*arguments: int) -> int | None:
+        fill(room, 0, *arguments)
+        error = invoke(*given)
+        if error is not None:
+            _check(error)
         if trap:
             raise _trapped(trap)
         return read[0]

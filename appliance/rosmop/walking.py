@@ -30,7 +30,9 @@ from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.why import Exits
 
 FUEL = 50_000_000
-"""Instructions of one call: some hundredths of a second."""
+"""Instructions of one call at most: some hundredths of a second. What a call leaves is for the next ones: setting it
+costs a quarter of a call. Where it ends the message at hand is left, and there is so much again.
+"""
 
 BEGINNING = 8192
 """Bytes that are looked at of a frame that was not received into the module's memory."""
@@ -40,6 +42,7 @@ _LENGTH = struct.Struct("<I")
 _POSITION = struct.Struct("<II")
 _EFFECT = struct.Struct("<qq")
 _LOG = struct.Struct("<II8s")
+_PREPARED = struct.Struct("<qqq")
 _TIME = struct.Struct("<q")
 _NEVER = (1 << 63) - 1  # comes after every time, so that output is due
 
@@ -59,12 +62,13 @@ class Walked(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """What holds for all walks of a topic until the engine, or somebody else, has done something: bits of `told` (and
-    whether no message may be changed) and of `enabled`, as the module takes them; and who sends the messages.
+    """What holds for all walks of a topic until the engine, or somebody else, has done something: who sends the
+    messages; bits of `told` (and whether no message may be changed) and of `enabled`, as the module takes them.
     """
 
-    bits: tuple[int, int]
     source: int
+    told: int
+    enabled: int
 
 
 class Home:
@@ -90,30 +94,33 @@ class Home:
             "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in cells.variables.values())
         )
         self._source = cells.source
-        self.inside = False
-        """It is in the module's memory."""
+        self._inside = False
         self.prepared: Prepared | None = None
-        """For whom the module was prepared last."""
+        """For whom the module was prepared last, with the state in its memory; None where that is with Python."""
 
-    def enter(self) -> None:
-        """Take the state into the module."""
+    def prepare(self, prepared: Prepared) -> None:
+        """Take the state into the module, and say who sends what comes now."""
+        if not self._inside:
+            self._enter()
+        self.prepared = prepared
+        self.machine.refuel(FUEL)
+        _PREPARED.pack_into(
+            self._memory, self._source, prepared.source << 32, prepared.told, prepared.enabled
+        )
+
+    def _enter(self) -> None:
         states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
         values = (self._namespace[name] for name in self._names)
         self._cells.pack_into(self._memory, self._base, *states, *values)
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
-        self.inside = True
-
-    def prepare(self, prepared: Prepared) -> None:
-        """Say who sends what comes now."""
-        self.prepared = prepared
-        _TIME.pack_into(self._memory, self._source, prepared.source << 32)
+        self._inside = True
 
     def leave(self) -> None:
         """Give it back to Python."""
-        if not self.inside:
+        if not self._inside:
             return
-        self.inside = False
+        self._inside, self.prepared = False, None
         values = self._cells.unpack_from(self._memory, self._base)
         for running, state in zip(self._running, values, strict=False):
             running.run.state = state  # type: ignore[attr-defined]  # of tables
@@ -153,13 +160,14 @@ class Walker:
         """Whether the time that a message takes is little enough not to be counted."""
         self._monitors = tuple(dict.fromkeys(monitors))
         self._memory = home.machine.memory  # it does not grow
+        self._owner = self._memory.obj
         self._feed = feed
         self._frames = module.frames
         self._effects = module.effects + _EFFECT.size
         self._home = home
         self._counts = struct.Struct(f"<{len(events)}q")
         self._drops_before: Sequence[int] = (0,) * len(events)
-        self._call, self._name = home.machine.call, feed.name
+        self._call = home.machine.function(feed.name)
 
     def writers(self, who: int) -> tuple[str, ...]:
         """What outcomes have as `changed_by`, from a set of events: bit N stands for event N."""
@@ -184,45 +192,40 @@ class Walker:
         """
         bits = sum(1 << number for number, one in enumerate(told) if one) - (LOUD if loud else 0)
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
-        return Prepared((bits, enabled), source)
+        return Prepared(source, bits, enabled)
 
     def walk(  # noqa: PLR0917  called for every batch: keywords would cost a tenth of it
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
-    ) -> Walked:
-        """Take messages from `position` on, as many as need nothing special.
+    ) -> Walked | None:
+        """Take messages from `position` on, as many as need nothing special. None: all, and they go on as they came.
 
         Only while the walker is `ready` and nothing of the set is due. `view` has whole frames and can be written: the
         beginning of `Walks.area`, or others. What goes on before a dropped message is appended to `pieces`.
         """
-        if view.obj is not self._memory.obj:
+        if view.obj is not self._owner:
             return self._walk_elsewhere(view, position, run, pieces, time_ns, prepared)
-        if not self._home.inside:
-            self._home.enter()
         if self._home.prepared is not prepared:
             self._home.prepare(prepared)
-        frames, end, begun = self._frames, len(view), run
+        frames = self._frames
+        end = frames + len(view)
+        begun = run
         changed: list[tuple[int, int]] = []
-        while position < end:
+        while True:
             try:
-                answer = (
-                    self._call(
-                        self._name, frames + position, frames + end, time_ns, *prepared.bits, fuel=FUEL
-                    )
-                    or 0
-                )
+                answer = self._call(frames + position, end, time_ns) or 0
             except MachineTrap:
                 answer = self._stopped()
+            if answer == end and run == begun and not changed:
+                return None
             position = (answer & _ADDRESS) - frames
-            if answer > _ADDRESS:
-                if answer >= LEFT:
-                    self._undo()
-                for first, following in self._carry_out(answer >> 32 & 0xFFFFFF, changed):
-                    if first > run:
-                        pieces.append(view[run:first])
-                    run = following
-                if answer >= LEFT:
-                    break
-        return Walked(position, run, self._dropped() if run != begun else (), changed)
+            if answer >= LEFT:
+                self._undo()
+            for first, following in self._carry_out(answer >> 32 & 0xFFFFFF, changed):
+                if first > run:
+                    pieces.append(view[run:first])
+                run = following
+            if answer >= LEFT or position == len(view):
+                return Walked(position, run, self._dropped() if run != begun else (), changed)
 
     def take(self, message: Buffer, time_ns: int, source: int = 0) -> Sequence[str] | None:
         """Take a message of which nothing is to be told but which events happened: they. None if it is left.
@@ -236,7 +239,8 @@ class Walker:
         _LENGTH.pack_into(frame, 0, len(message))
         frame[4:] = message
         prepared = self.prepare(loud=True, told=[True] * len(self.events), source=source)
-        if not self.walk(frame, 0, 0, [], time_ns, prepared).position:
+        walked = self.walk(frame, 0, 0, [], time_ns, prepared)
+        if walked is not None and not walked.position:
             return None
         return tuple(name for (name,), count in zip(self.events, self.happened(), strict=True) if count)
 
@@ -252,6 +256,9 @@ class Walker:
             area[:size] = view[position : position + size]
             _LENGTH.pack_into(area, 0, size - 4)
             walked = self.walk(area[:size], 0, 0, [], time_ns, prepared)
+            if walked is None:
+                position = following
+                continue
             if not walked.position:
                 break
             if walked.changed:
@@ -278,6 +285,7 @@ class Walker:
 
     def _stopped(self) -> int:
         """What the module would have answered where it was stopped: the message that it looked at is left."""
+        self._home.machine.refuel(FUEL)
         at, effect = _POSITION.unpack_from(self._memory, POSITION)
         return int(at | (effect + _EFFECT.size - self._effects) // _EFFECT.size << 32 | LEFT)
 

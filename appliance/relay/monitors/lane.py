@@ -102,6 +102,8 @@ class Lane:
             return self._through(batch, Passage(batch, now))
         if not self._counts.begun:
             middle.telling.owe(self._counts)
+        if walked is None:
+            return batch
         gone = self._counts.add(walked, now)
         if walked.position == len(batch.view) and not gone:
             return batch
@@ -153,6 +155,9 @@ class Lane:
             middle.spent += time.thread_time() - began
         if not counts.begun:
             middle.telling.owe(counts)
+        if walked is None:
+            passage.walked(passage.end, passage.run, 0)
+            return True
         passage.walked(walked.position, walked.run, counts.add(walked, passage.time))
         return passage.position == passage.end
 

@@ -82,6 +82,7 @@ class Telling:
 
     def owe(self, counts: Counts) -> None:
         """There are counts to be taken when the second is over."""
+        counts.begun = True
         self._owed.append(counts)
 
     def told(self, outcome: Outcome, place: Place, sighting: Sighting | None = None) -> None:

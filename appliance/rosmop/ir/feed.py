@@ -1,14 +1,14 @@
 """The walk over a read, as WebAssembly: frame by frame, the events of every message in order, patches in place.
 
-`module_of` writes one module for a set: for each topic an export `feed(at, end, now, told, enabled)` that takes the
-frames (4 bytes of length, little-endian, and the message) from `at` to before `end` in the memory, and answers where
-the first one begins that is left (i64: the low 32 bits), how many effects there are (the next 24), and `LEFT` if that
-one is for Python.
+`module_of` writes one module for a set: for each topic an export `feed(at, end, now)` that takes the frames
+(4 bytes of length, little-endian, and the message) from `at` to before `end` in the memory, and answers where the first
+one begins that is left (i64: the low 32 bits), how many effects there are (the next 24), and `LEFT` if that one is for
+Python.
 
 - A message is either done, with all that follows from it, or left, and then `Feed.undo` says how to take back what was
   begun. After a trap the message that is left begins at the number that stands at `POSITION`.
-- `told`: of these events (bit N for the topic's event N) a drop is left; with `LOUD` a change is. `enabled`: bits of
-  the topic's specifications.
+- What holds for all messages stands at `Cells.source`: who sends them; of which events (bit N for the topic's event N)
+  a drop is left, and with `LOUD` a change is (*told*); bits of the topic's specifications (*enabled*).
 - An effect is 16 bytes: a set of events (i64) that changed so many (i64) messages on end, or -1 and from where to
   where (i32, i32) frames were dropped.
 - An event that happened is counted at `Feed.counters`, its drops behind those of all.
@@ -118,7 +118,7 @@ def module_of(
     for component in components:
         variables = (*component.variables, *component.noted)
         room = component.properties + len(variables)
-        base, source = writer.take(8 * room), writer.take(8)
+        base, source = writer.take(8 * room), writer.take(24)
         cells.append(Cells(base, component.properties, source, frozenset(component.noted)))
         shared |= dict.fromkeys(variables, cells[-1])
     effects = writer.take(16 * (MAX_EFFECTS + 2))
@@ -157,7 +157,7 @@ class _Tables:
 
 _AT, _END, _NOW, _TOLD, _ENABLED = range(5)
 _SIZE, _NEXT, _WHO, _LAST, _FIRST = range(5, 10)
-_PARAMETERS = (I32, I32, I64, I64, I64)
+_PARAMETERS = (I32, I32, I64)
 
 
 def _get(local: int) -> bytes:
@@ -229,6 +229,8 @@ class _Walk:
         body = [
             store(I64, NOW, _get(_NOW)),
             store(I32, EFFECT, constant(I32, self._effects)),
+            _set(_TOLD, load(I64, self._cells.source + 8)),
+            _set(_ENABLED, load(I64, self._cells.source + 16)),
             *(_set(local, load(I32, self._state(number))) for number, local in self._states.items()),
             self._begin(), _BLOCK, _BLOCK, _LOOP,
             self._frame(),
@@ -242,7 +244,8 @@ class _Walk:
             here, RETURN, END,
             here, constant(I64, LEFT), _OR64, END,
         ]  # fmt: skip
-        made = [I32, I32, I64, I32, *[I32] * len(self._events), *[I32] * len(self._states), I32, I32]
+        numbered = [I32] * (len(self._events) + len(self._states) + 2)
+        made = [I64, I64, I32, I32, I64, I32, *numbered]
         whole = row([b"\x01" + bytes((machine,)) for machine in made]) + b"".join(body)
         return unsigned(len(whole)) + whole
 

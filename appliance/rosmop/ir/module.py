@@ -95,7 +95,9 @@ class Cells:
     base: int
     properties: int
     source: int = 0
-    """Where it stands (i64) who sends what is looked at: `Sender.source` from bit 32 on."""
+    """Where it stands who sends what is looked at (`Sender.source` from bit 32 on), what is told, who is enabled: three
+    i64 (see `feed.py`).
+    """
     noted: frozenset[str] = frozenset()
     exits: dict[int, int] = field(default_factory=dict)
     """Where it is kept how the states of a property were left (`why.Exits`), by its number."""

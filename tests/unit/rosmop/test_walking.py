@@ -88,7 +88,7 @@ class Fed:
             if walker is not None and self.monitors.walks(walker, time):
                 before = position
                 walked = walker.walk(view, position, run, pieces, time, walker.prepare(loud=False, told=()))
-                position, run = walked.position, walked.run
+                position, run = (len(view), run) if walked is None else (walked.position, walked.run)
                 self.came["together"] += position > before
                 if position == len(view):
                     break
@@ -427,6 +427,23 @@ def test_without_fuel_the_message_at_hand_is_left(monkeypatch: pytest.MonkeyPatc
         Fed(text).check([plain(number) for number in range(20)])
 
 
+def test_fuel_lasts_for_many_calls_and_where_it_ends_one_message_is_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As if it had not been looked at; the next ones have fuel again."""
+    monkeypatch.setattr(walking, "FUEL", 1000)
+    fed = Fed(event("n++;"))
+    walker, one = fed.walker(), frames([plain()])
+    assert fed.monitors.area is not None
+    view = fed.monitors.area[: len(one)]
+    view[:] = one
+    prepared = walker.prepare(loud=False, told=())
+    left = [left for _ in range(200) if (left := walker.walk(view, 0, 0, [], 1, prepared))]
+    assert 2 < len(left) < 100
+    assert {walked.position for walked in left} == {0}
+    assert fed.state() == [f"n {200 - len(left)}"]
+
+
 def test_a_long_message_is_looked_at_where_it_begins() -> None:
     """Changed and dropped there; a field that is further behind is left, and so is the bytes' number.
 
@@ -485,6 +502,7 @@ def test_what_happened_and_what_was_dropped_is_counted() -> None:
     pieces: list[memoryview] = []
     walked = walker.walk(view, 0, 0, pieces, 1, walker.prepare(loud=False, told=()))
     size = len(plain()) + 4
+    assert walked is not None
     assert (walked.position, walked.run, [*walked.dropped]) == (6 * size, 6 * size, [0, 3])
     assert [bytes(piece) for piece in pieces] == [bytes(view[: 2 * size]), bytes(view[4 * size : 5 * size])]
     assert [[*walker.happened()] for _ in range(2)] == [[6, 4], [0, 0]]
@@ -562,8 +580,10 @@ def test_a_walk_stops_before_what_is_to_be_told() -> None:
     view, size = fed.monitors.area[: len(given)], len(plain()) + 4
     view[:] = given
     walked = walker.walk(view, 0, 0, [], 5, walker.prepare(loud=True, told=[False]))
+    assert walked is not None
     assert (bytes(view), walked.position) == (given, 0)
     walked = walker.walk(view, 0, 0, [], 5, walker.prepare(loud=False, told=[True]))
+    assert walked is not None
     assert bytes(view) == frames([plain(7)] * 3 + [plain()] * 3)
     assert (walked.position, [*walked.changed]) == (3 * size, [(1, 3)])
     assert fed.state() == ["n 3"]
