@@ -42,6 +42,7 @@ from appliance.master.parameter_mirror import ParameterMirror
 from appliance.master.reach.carried import Carried
 from appliance.master.reach.delivery import Delivery
 from appliance.master.reach.faces import Faces, InnerFace
+from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Addresses, Places
 from appliance.master.reach.relays import RelayControl
 from appliance.master.rosmaster import RosMaster, limits_of_answers, own_parameters
@@ -141,9 +142,10 @@ class Parts:
             base.sockets[RVMASTER].getsockname()[0],
         )
         self._watchlist = Watchlist()
+        seconds = settings.limits.node_call_seconds
+        self._nodes = NodeApi(self.registry, timeout=seconds, limits=self._limits)
         self.delivery = Delivery(
-            timeout=settings.limits.node_call_seconds,
-            limits=self._limits,
+            self._nodes,
             troubled=self._watchlist.could_not_tell,
             standing=base.standing,
         )
@@ -152,7 +154,7 @@ class Parts:
             self.registry,
             self.grants,
             self.places,
-            self.delivery,
+            self._nodes,
             self._carried,
             allocation=self._allocation,
             policy=self._policy,
@@ -197,13 +199,10 @@ class Parts:
             self.revocation,
             self.enactor,
             self._watchlist,
+            nodes=self._nodes,
             settings=LivenessSettings(
-                settings.liveness.interval,
-                settings.liveness.silent,
-                settings.liveness.shadow,
-                settings.limits.node_call_seconds,
+                settings.liveness.interval, settings.liveness.silent, settings.liveness.shadow
             ),
-            limits=self._limits,
             standing=self._base.standing,
         )
         self.reconciler = Reconciler(
@@ -300,6 +299,7 @@ class Parts:
             self.relay,
             self.mediation,
             self._addresses,
+            self._nodes,
             self.liveness,
             self._gate,
             port,

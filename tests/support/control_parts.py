@@ -19,6 +19,7 @@ from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
 from appliance.master.graph.revocation import Revocation, revoked
 from appliance.master.reach.carried import Carried
+from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Places
 from appliance.master.reach.relays import RelayControl
 from appliance.master.rosmaster import RosMaster
@@ -219,7 +220,7 @@ class Clients:
         self.gone: set[str] = set()
 
     def client(self, incarnation: Incarnation) -> "Clients":
-        """As `Liveness.client`."""
+        """As `NodeApi.client`."""
         self._asked = incarnation.name
         return self
 
@@ -284,6 +285,8 @@ class ControlParts:
         self.hidden, self.clients = HiddenMaster(), Clients()
         self.deliveries, self.relay, self.store = Deliveries(), Relays(), idle(StateStore)
         self.faces = Inner(self.registry)
+        self.nodes = NodeApi(self.registry, timeout=3.0, limits=Limits())
+        cast(Any, self.nodes).client = self.clients.client
         self.surround()
         self.mediation, self.addresses, self.parameters = (
             Modes(),
@@ -329,11 +332,10 @@ class ControlParts:
             self.revocation,
             self.enactor,
             self.watchlist,
+            nodes=self.nodes,
             settings=LivenessSettings(silent=silent),
-            limits=Limits(),
             standing=lambda _host: Standing.REGISTERED,
         )
-        cast(Any, self.liveness).client = self.clients.client
         self._serving = functools.partial(
             serving,
             policy=lambda: self.current,
@@ -350,6 +352,7 @@ class ControlParts:
             mediation=self.mediation,
             addresses=self.addresses,
             liveness=self.liveness,
+            nodes=self.nodes,
             redecide_for=self.redecide_for,
         )
         self._serve = self._serving()

@@ -37,7 +37,7 @@ from appliance.master.graph.effects import (
 )
 from appliance.master.graph.registry import Incarnation
 from appliance.master.reach.carried import Carried
-from appliance.master.reach.delivery import Delivery
+from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.relays import RelayControl
 from appliance.ros.xmlrpc import Value
 from appliance.specifications.allocation import Allocation
@@ -144,7 +144,7 @@ class Conversation:
             parts.registry,
             parts.grants,
             cast(Any, _Ports()),
-            idle(Delivery),
+            idle(NodeApi),
             idle(Carried),
             allocation=Allocation(1),
             policy=lambda: parts.current,

@@ -47,7 +47,7 @@ from appliance.master.upkeep.arrivals import Arrivals
 from appliance.master.upkeep.enactor import Enactor, restore
 from appliance.master.upkeep.reminders import Reminders
 from appliance.policy import Policy, compile_policy
-from appliance.ros.xmlrpc import Limits, Value
+from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import BrokenOffError, RefusedError, UnansweredError
 from appliance.shares.pool import Standing
 from appliance.specifications.allocation import Allocation
@@ -296,23 +296,12 @@ class _Faces(Inner):
         """As `Faces`."""
 
 
-class Deliveries(Delivery):
-    """The queues of calls to nodes, over `Reach`."""
-
-    world: "World"
-
-    def client(self, incarnation: Incarnation) -> Any:
-        """As `Delivery`."""
-        return Reach(self.world, incarnation)
-
-
 class Control(ControlParts):
     """One life of control."""
 
     def __init__(self, world: "World") -> None:
         self.world = world
         super().__init__(silent=20.0)
-        cast(Any, self.liveness).client = lambda incarnation: Reach(world, incarnation)
         self.reminders = Reminders(self.registry, self.relay, self.graph, self.enactor)
 
     def surround(self) -> None:
@@ -320,19 +309,18 @@ class Control(ControlParts):
         world = self.world
         self.current = world.policy_in_force
         self.hidden, self.store = world.master, cast(Any, world.kept)
-        delivery = Deliveries(
-            timeout=3.0,
-            limits=Limits(),
+        cast(Any, self.nodes).client = lambda incarnation: Reach(world, incarnation)
+        delivery = Delivery(
+            self.nodes,
             troubled=self.watchlist.could_not_tell,
             standing=lambda _host: Standing.REGISTERED,
         )
-        delivery.world = world
         self.deliveries = cast(Any, delivery)
         self.faces = _Faces(self.registry)
         self.relay = cast(
             Any,
             RelayControl(
-                self.registry, self.grants, cast(Any, _Ports()), delivery, idle(Carried), allocation=Allocation(1),
+                self.registry, self.grants, cast(Any, _Ports()), self.nodes, idle(Carried), allocation=Allocation(1),
                 policy=lambda: self.current, broken=self.watchlist.look_at, own_header=None,
             ),
         )  # fmt: skip

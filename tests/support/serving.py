@@ -39,6 +39,7 @@ def serving(
     relay: Any = None,
     mediation: Any = None,
     liveness: Any = None,
+    nodes: Any = None,
     redecide_for: Any = None,
     offload: int = 1 << 20,
     own: bool = False,
@@ -70,7 +71,9 @@ def serving(
     )
     monitors: Any = None
     if target is not None:
-        node_calls = NodeCalls(registry, graph, enactor, relay, mediation, addresses, liveness, gate, 11311)
+        node_calls = NodeCalls(
+            registry, graph, enactor, relay, mediation, addresses, nodes, liveness, gate, 11311
+        )
         return pipeline.handler(served(NODE_CALLS.values(), node_calls), target=target)
     return pipeline.handler(
         master_table(

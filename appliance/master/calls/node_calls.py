@@ -16,6 +16,7 @@ from appliance.master.calls.gate import Gate
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Addresses
 from appliance.master.reach.relays import RelayControl, tcpros_port
 from appliance.master.upkeep.enactor import Enactor
@@ -37,6 +38,7 @@ class NodeCalls:
     relay: RelayControl
     mediation: Mediation
     addresses: Addresses
+    nodes: NodeApi
     liveness: Liveness
     gate: Gate
     port: int
@@ -62,9 +64,7 @@ class NodeCalls:
     async def _negotiated_directly(self, target: Incarnation, topic: str, caller: Caller) -> Answer:
         """The node's own TCPROS port at its peer address; the host in its answer is never followed."""
         try:
-            answer = await self.liveness.client(target).call(
-                "requestTopic", caller.caller_id, topic, [["TCPROS"]]
-            )
+            answer = await self.nodes.call(target, "requestTopic", caller.caller_id, topic, [["TCPROS"]])
             port = tcpros_port(answer)
         except CallFailedError:
             self.liveness.look_at(target)
@@ -77,7 +77,7 @@ class NodeCalls:
         if target.of_monitors:
             return [1, "", os.getpid()]
         try:
-            answer = await self.liveness.client(target).call("getPid", caller.caller_id)
+            answer = await self.nodes.call(target, "getPid", caller.caller_id)
         except CallFailedError as error:
             self.liveness.look_at(target)
             raise NoAnswerError from error
@@ -95,7 +95,7 @@ class NodeCalls:
                 0,
             ]
         try:
-            await self.liveness.client(target).call("shutdown", caller.caller_id, message)
+            await self.nodes.call(target, "shutdown", caller.caller_id, message)
         except CallFailedError:
             self.liveness.look_at(target)
         return [1, "shutdown", 0]

@@ -15,9 +15,10 @@ import structlog
 
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
+from appliance.master.reach.node_api import NodeApi
 from appliance.policy.model import Address
-from appliance.ros.xmlrpc import FaultReceived, Limits
-from appliance.rpc.client import CallFailedError, XmlRpcClient
+from appliance.ros.xmlrpc import FaultReceived
+from appliance.rpc.client import CallFailedError
 from appliance.rpc.turns import Turns
 from appliance.shares.pool import Bounds, Pool, Standing
 from appliance.shares.table import NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS
@@ -45,7 +46,7 @@ class _Queue:
 
 
 class Delivery:
-    """The queues. `timeout` is seconds for one call; `troubled(incarnation, call, why)` hears of a call that is lost.
+    """The queues. `troubled(incarnation, call, why)` hears of a call that is lost.
 
     A queue holds at most `bound` calls, those of a host and all together what `queued` says in bytes: beyond, the
     oldest go, of the queue that has most: of the host's own, or of the host that has most where all are too much.
@@ -54,9 +55,8 @@ class Delivery:
 
     def __init__(
         self,
+        nodes: NodeApi,
         *,
-        timeout: float,
-        limits: Limits,
         troubled: Callable[[Incarnation, NodeCall, str], None],
         standing: Callable[[Address], Standing],
         bound: int = 10_000,
@@ -64,8 +64,7 @@ class Delivery:
         at_once: Bounds = NODE_CALLS_UNDER_WAY.bounds,
         tries: int = 4,
     ) -> None:
-        self._timeout = timeout
-        self._limits = limits
+        self._nodes = nodes
         self._troubled = troubled
         self._bound = bound
         self._held: Pool[Address] = Pool(
@@ -128,10 +127,6 @@ class Delivery:
         for worker in self._workers.values():
             worker.cancel()
 
-    def client(self, incarnation: Incarnation) -> XmlRpcClient:
-        """A client that calls the node at its peer address."""
-        return XmlRpcClient(incarnation.call_uri, timeout=self._timeout, limits=self._limits)
-
     async def _work(self, incarnation: Incarnation) -> None:
         try:
             while (queue := self._queues.get(incarnation.key)) is not None and queue.calls:
@@ -145,11 +140,11 @@ class Delivery:
         for attempt in range(self._tries):
             await self._turns.enter(incarnation.host)
             try:
-                await self.client(incarnation).call(call.method, MASTER_NAME, *call.parameters)
+                await self._nodes.call(incarnation, call.method, MASTER_NAME, *call.parameters)
             except CallFailedError as error:
                 failure, heard = str(error), isinstance(error.__cause__, FaultReceived)
                 if call.method == "shutdown":
-                    return  # a node told to shut down often dies before it answers: that is success
+                    return  # a node told to shut down often dies before it answers, or was dead: that is success
             else:
                 return
             finally:

@@ -18,7 +18,7 @@ from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.carried import Carried, Connection, Traffic
-from appliance.master.reach.delivery import Delivery
+from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Places
 from appliance.master.reach.topic_looks import TopicLooks
 from appliance.policy import Policy
@@ -117,7 +117,7 @@ class RelayControl:
         registry: Registry,
         grants: Grants,
         places: Places,
-        delivery: Delivery,
+        nodes: NodeApi,
         carried: Carried,
         *,
         allocation: Allocation,
@@ -129,7 +129,7 @@ class RelayControl:
         self._grants = grants
         self._places = places
         self.carried = carried
-        self._delivery = delivery
+        self._nodes = nodes
         self._broken = broken
         self._allocation = allocation
         self._policy = policy
@@ -383,9 +383,7 @@ class RelayControl:
             post.send(messages.UpstreamRefused(key, topic, "the node does not publish this topic any more"))
             return
         try:
-            answer = await self._delivery.client(incarnation).call(
-                "requestTopic", RELAY_NAME, topic, [["TCPROS"]]
-            )
+            answer = await self._nodes.call(incarnation, "requestTopic", RELAY_NAME, topic, [["TCPROS"]])
             port = tcpros_port(answer)
         except CallFailedError as error:
             post.send(messages.UpstreamRefused(key, topic, str(error)))

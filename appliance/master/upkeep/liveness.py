@@ -1,8 +1,8 @@
 """Which nodes are still there: looked at every few seconds, and at once when something of a node breaks.
 
-A node whose API refuses connections (twice in a row), cannot be reached or does not answer for `silent` seconds is
-*lost*: unregistered at ROSMaster as `rosnode cleanup` would, its registrations kept as a shadow. A shadow whose API
-answers again gets them back, because a ROS 1 node never registers twice.
+A node whose API refuses connections (twice in a row) or has become another node's, cannot be reached or does not answer
+for `silent` seconds is *lost*: unregistered at ROSMaster as `rosnode cleanup` would, its registrations kept as a
+shadow. A shadow whose API answers again gets them back, because a ROS 1 node never registers twice.
 """
 
 import asyncio
@@ -17,17 +17,16 @@ from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.graph.revocation import Revocation
+from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.relays import RELAY_NAME
 from appliance.master.upkeep.enactor import Enactor
 from appliance.policy.model import Address
-from appliance.ros.xmlrpc import Limits
 from appliance.rpc.client import (
     BrokenOffError,
     CallFailedError,
     RefusedError,
     UnansweredError,
     UnreachedError,
-    XmlRpcClient,
 )
 from appliance.rpc.turns import Turns
 from appliance.shares.pool import Standing
@@ -59,12 +58,11 @@ _LOOK_AGAIN_SECONDS = 0.3
 
 @dataclass(frozen=True, slots=True)
 class LivenessSettings:
-    """Seconds: between looks, without an answer until lost, as a shadow until forgotten, for one call."""
+    """Seconds: between looks, without an answer until lost, as a shadow until forgotten."""
 
     interval: float = 5.0
     silent: float = 20.0
     shadow: float = 600.0
-    call: float = 3.0
 
 
 @dataclass(slots=True)
@@ -132,8 +130,8 @@ class Liveness:
         enactor: Enactor,
         watchlist: Watchlist,
         *,
+        nodes: NodeApi,
         settings: LivenessSettings,
-        limits: Limits,
         standing: Callable[[Address], Standing],
     ) -> None:
         self._registry = registry
@@ -142,14 +140,10 @@ class Liveness:
         self._enactor = enactor
         self._watchlist = watchlist
         self._settings = settings
-        self._limits = limits
+        self._nodes = nodes
         self._answered: dict[str, float] = {}
         self._looks: dict[str, asyncio.Task[None]] = {}
         self._turns = Turns(PROBES.bounds, standing)
-
-    def client(self, incarnation: Incarnation) -> XmlRpcClient:
-        """A client that calls the node at its peer address."""
-        return XmlRpcClient(incarnation.call_uri, timeout=self._settings.call, limits=self._limits)
 
     async def run(self) -> None:
         """Look at every incarnation every `interval` seconds, and at those on the watchlist, until cancelled."""
@@ -195,7 +189,7 @@ class Liveness:
         since = self._answered.setdefault(incarnation.key, now)
         patience = max(0.0, self._settings.silent - (now - since)) + self._settings.interval
         try:
-            await self.client(incarnation).call("getPid", RELAY_NAME)
+            await self._nodes.call(incarnation, "getPid", RELAY_NAME)
         except (RefusedError, UnreachedError):
             presence = Presence.GONE
         except (UnansweredError, BrokenOffError):
@@ -258,7 +252,7 @@ class Liveness:
         """Whether it answers: True, False, or None when it refuses connections; and why."""
         for attempt in (1, 2):
             try:
-                await self.client(incarnation).call("getPid", RELAY_NAME)
+                await self._nodes.call(incarnation, "getPid", RELAY_NAME)
             except RefusedError as error:
                 if attempt == 2:
                     return None, f"{incarnation.name}: {error}"

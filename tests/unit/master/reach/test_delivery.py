@@ -9,7 +9,7 @@ import pytest
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
 from appliance.master.reach.delivery import Delivery
-from appliance.ros.xmlrpc import FaultReceived, Limits, Value
+from appliance.ros.xmlrpc import FaultReceived, Value
 from appliance.rpc.client import CallFailedError
 from appliance.shares.pool import Bounds, Standing
 from appliance.shares.table import NODE_CALLS_UNDER_WAY
@@ -41,15 +41,14 @@ class Post:
 
     def __init__(self, **bounds: Any) -> None:
         self.node, self.lost = Node(), list[tuple[str, Value]]()
+        self.world = ControlParts()
         self.delivery = Delivery(
-            timeout=1.0,
-            limits=Limits(),
+            self.world.nodes,
             troubled=self._troubled,
             standing=lambda _host: Standing.REGISTERED,
             **bounds,
         )
-        cast(Any, self.delivery).client = lambda _incarnation: self.node
-        self.world = ControlParts()
+        cast(Any, self.world.nodes).client = lambda _incarnation: self.node
         self.incarnation = self.world.node("/n")
 
     def _troubled(self, incarnation: Incarnation, call: NodeCall, _why: str) -> None:
@@ -131,7 +130,9 @@ async def test_silent_nodes_of_a_host_delay_no_call_to_anothers() -> None:
     post = Post()
     robot = Node()
     robot.answers.set()
-    cast(Any, post.delivery).client = lambda incarnation: robot if incarnation.name == "/robot" else post.node
+    cast(Any, post.world.nodes).client = lambda incarnation: (
+        robot if incarnation.name == "/robot" else post.node
+    )
     for number in range(2 * NODE_CALLS_UNDER_WAY.bounds.whole):
         guest = post.node_on("10.0.0.66", f"/guest_{number}")
         post.delivery.push(guest, NodeCall("publisherUpdate", ("/t", [])))

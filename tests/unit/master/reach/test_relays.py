@@ -16,6 +16,7 @@ from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.carried import Carried
 from appliance.master.reach.delivery import Delivery
+from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Places
 from appliance.master.reach.relays import RelayControl
 from appliance.master.upkeep.enactor import Enactor
@@ -109,7 +110,7 @@ class World:
             self.registry,
             self.grants,
             cast(Places, self.ports),
-            cast(Delivery, NoDelivery()),
+            cast(NodeApi, NoDelivery()),
             carried,
             allocation=self.allocation,
             policy=lambda: self.policy,

@@ -215,7 +215,7 @@ async def test_silent_nodes_of_a_host_delay_no_look_at_anothers() -> None:
         async def call(self, _method: str, *_params: Value) -> Value:
             raise RefusedError("nobody is there")
 
-    cast(Any, world.liveness).client = lambda node: Gone() if node is robot else Silent()
+    cast(Any, world.nodes).client = lambda node: Gone() if node is robot else Silent()
     for guest in guests:
         world.liveness.look_at(guest)
     for _ in range(5):
