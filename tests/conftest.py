@@ -1,5 +1,6 @@
 """Fixtures that tests with real nodes share, each ends what it started; how many run at once; what is tried again."""
 
+import contextlib
 import os
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -8,6 +9,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from appliance.network import links
+from appliance.network.namespaces import Namespace, has_privileges
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
@@ -93,6 +96,23 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
         for name, said in running.values():
             report.sections.append((f"What {name} said", said.story()[-_LONGEST_STORY:]))
     return report
+
+
+@pytest.hookimpl(trylast=True)  # pytest-rerunfailures has called its other half by then
+def pytest_configure(config: pytest.Config) -> None:
+    """Give each worker of pytest-xdist a loopback of its own, as root.
+
+    A node that a test killed is remembered by its master with a port; on a common loopback the next node that takes
+    this port may be another worker's. It would answer for the dead one, or be told to shut down in its place.
+    """
+    if not hasattr(config, "workerinput") or not has_privileges():
+        return
+    namespace = Namespace(f"rosrv-test-worker.{os.getpid()}").create()
+    inside = contextlib.ExitStack()
+    inside.enter_context(namespace.entered())
+    config.add_cleanup(inside.close)
+    links.set_link(Namespace.own(), "lo", up=True)
+    namespace.delete()  # only the name: it ends with the worker's last process
 
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
