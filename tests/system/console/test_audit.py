@@ -6,7 +6,7 @@ import zipfile
 from collections.abc import Callable
 from typing import Any
 
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 
 from tests.support.appliance import Appliance
 from tests.system.console.reader import Reader
@@ -34,15 +34,25 @@ def test_a_record_leads_to_the_line_that_decided(
 
 
 def test_records_come_while_it_is_followed(
-    opened: Callable[..., Reader], attempt: Callable[..., Any]
+    opened: Callable[..., Reader], attempt: Callable[..., Any], appliance: Appliance
 ) -> None:
     """With `Follow live`, what is recorded from then on appears at the top, and only what the filter lets through."""
     reader = opened()
     page = reader.go("audit?decision=deny&caller_id=/live_*")
     expect(page.get_by_text("No record matches")).to_be_visible()
-    page.get_by_role("button", name="Follow live").click()
+    held: list[Route] = []
+    page.route(
+        "**/v1/audit/stream?*",
+        lambda route: held.append(route),  # noqa: PLW0108  Playwright looks into a function
+        times=1,
+    )
+    with page.expect_request("**/v1/audit/stream?*"):
+        page.get_by_role("button", name="Follow live").click()
     refuse(attempt, "/other")
     refuse(attempt, "/live_1")
+    appliance.recorded("--deny", caller_id="/live_1")  # before the stream begins
+    for route in held:
+        route.continue_()
     expect(page.get_by_role("row", name="/live_1")).to_be_visible()
     refuse(attempt, "/live_2")
     expect(page.locator("tbody tr").first).to_contain_text("/live_2")

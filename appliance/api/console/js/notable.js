@@ -33,7 +33,7 @@ export async function startNotable() {
   if (mine !== generation) return;
   notable.set({ denials, doings, incidents });
   const last = Math.max(0, ...[...denials, ...doings, ...incidents].map((one) => one.sequence));
-  running = follow(() => "/v1/audit/stream?severity=notice", heard, () => {}, last ? String(last) : null);
+  running = follow(() => `/v1/audit/stream?severity=notice&since=${NEAR}`, heard, () => {}, String(last));
 }
 
 export function stopNotable() {

@@ -47,11 +47,11 @@ export function useRecords(filter, following) {
   const ready = state.records !== null && !state.loading;
   useEffect(() => {
     if (!following || !ready) return undefined;
-    const { until, since, ...rest } = askedOf(filter);
-    const newest = state.records?.[0]?.sequence;
+    const { until, ...rest } = askedOf(filter);
+    const newest = state.records?.[0]?.sequence ?? 0; // from the beginning: what was made since the list came is in it
     const running = follow(() => `/v1/audit/stream${queryText(rest)}`, (event, record) => {
       if (event === "record") setState((state) => ({ ...state, ...added(state, record) }));
-    }, setStanding, newest ? String(newest) : null);
+    }, setStanding, String(newest));
     return () => {
       running.stop();
       setStanding(null);
