@@ -2,9 +2,9 @@
 
 from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
+from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
-from starlette.routing import compile_path
 
 import appliance
 from appliance.api import (
@@ -117,13 +117,16 @@ async def _of_http(request: Request, error: Exception) -> Response:
 
 
 def _methods(request: Request) -> set[str]:
-    """What can be done at a path, by the contract; pages outside it are only read."""
-    paths = request.app.openapi()["paths"]
-    matching = [path for path in paths if compile_path(path)[0].match(request.url.path)]
+    """What can be done at a path; pages outside the contract are only read."""
+    path = request.url.path
+    matching = [
+        route for route in request.app.routes if isinstance(route, APIRoute) and route.path_regex.match(path)
+    ]
     if not matching:
         return {"GET"}
-    here = min(matching, key=lambda path: path.count("{"))  # a path that is written out goes before a name
-    return {method.upper() for method in paths[here]}
+    # A path that is written out goes before a name.
+    here = min((route.path for route in matching), key=lambda path: path.count("{"))
+    return {method for route in matching if route.path == here for method in route.methods or ()}
 
 
 async def _invalid(request: Request, error: Exception) -> Response:

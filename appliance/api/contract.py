@@ -7,6 +7,7 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
+from appliance.api import moments
 from appliance.api.audit import RECORD
 from appliance.api.field_words import WORDS
 from appliance.api.problems import MEDIA_TYPE, Problem
@@ -56,6 +57,7 @@ def _made(app: FastAPI) -> dict[str, Any]:
     components["AuditRecord"] = RECORD
     for kind, schema in components.items():
         _described(kind, schema)
+        moments.describe(schema)
         if kind in EXAMPLES:
             schema["examples"] = [EXAMPLES[kind]]
     for path in document["paths"].values():

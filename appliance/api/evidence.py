@@ -1,7 +1,6 @@
 """`/v1/evidence` and `/v1/recordings/{id}/evidence`: what happened, in one file that proves itself elsewhere."""
 
 import asyncio
-import time
 from collections.abc import AsyncIterator, Iterator
 from typing import Annotated, Any
 
@@ -9,6 +8,7 @@ from fastapi import Query, Request, Response
 from starlette.responses import StreamingResponse
 
 from appliance.api.access import Bearer, Role
+from appliance.api.moments import given
 from appliance.api.problems import ProblemError
 from appliance.api.recordings import OneId
 from appliance.api.roles import Investigator, Viewer, problem_of
@@ -16,7 +16,6 @@ from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.api.streams import Held, peer_of
 from appliance.audit.database import LogUnreadableError
-from appliance.audit.moment import MomentError, parse_moment
 from appliance.channel.admin import AdminAnswer, AdminRequest
 from appliance.evidence.bundle import BundleError, Kept, Span, export
 
@@ -45,15 +44,10 @@ def routes(services: Services) -> Routes:
         if bearer.role < Role.INVESTIGATOR:
             text = f"this is for investigators, operators and admins; the token {bearer.name} is a viewer's"
             raise ProblemError(403, "not-for-this-role", text)
-        now = time.time_ns()
-        try:
-            span = Span(parse_moment(since, now), parse_moment(until, now))
-        except (MomentError, OverflowError, ValueError) as error:
-            raise ProblemError(422, "bad-input", str(error)) from error
-        return await _bundle(services, request, bearer, span)
+        return await _bundle(services, request, bearer, Span(given(since), given(until)))
 
     @router.get(
-        "/recordings/{recording_id}/evidence",
+        "/recordings/{recording_id:recording}/evidence",
         operation_id="recording_evidence",
         responses=_ZIP,
         response_class=Response,

@@ -22,6 +22,7 @@ from appliance.api.hosts_models import (
     TokenWishes,
 )
 from appliance.api.kits import Wishes, kit_of
+from appliance.api.moments import given
 from appliance.api.preconditions import IfMatch, etag, expected_revision
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Operator, Viewer, answered, ask
@@ -172,7 +173,8 @@ def _add_changes(router: Routes, services: Services) -> None:
         if_match: IfMatch = None,
     ) -> Tagged[answers.PortsSeen]:
         """Tell whether the ROS ports of a host are closed, as `rosrv protect --check` saw it from outside."""
-        order = admin.HostPorts(name, told.state, told.open, told.checked, _expected(if_match))
+        checked = given(told.checked) / 1e9 if isinstance(told.checked, str) else told.checked
+        order = admin.HostPorts(name, told.state, told.open, checked, _expected(if_match))
         known = await ask(control, order, bearer)
         return Tagged(known.ports, known.revision)
 

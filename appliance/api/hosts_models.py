@@ -23,7 +23,9 @@ Endpoint = Annotated[str, msgspec.Meta(pattern=ENDPOINT + _WHOLE)]
 Service = Annotated[str, msgspec.Meta(pattern=SERVICE + _WHOLE)]
 Address = Annotated[str, msgspec.Meta(max_length=64)]
 Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
-GivenMoment = Annotated[float, told("seconds since the epoch", ge=0, le=4_000_000_000)]
+GivenMoment = (
+    Annotated[float, msgspec.Meta(ge=0, le=4_000_000_000)] | Annotated[str, msgspec.Meta(max_length=64)]
+)
 Days = Annotated[float, told("until the certificate ends", gt=0, le=LONGEST_DAYS)]
 TokenSeconds = Annotated[float, msgspec.Meta(ge=60, le=LONGEST_TOKEN_SECONDS)]
 SigningRequest = Annotated[str, told("PKCS #10, in PEM", min_length=1, max_length=LONGEST_REQUEST)]
@@ -113,4 +115,4 @@ class PortsTold(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     state: PortsState
     open: Annotated[list[Port], msgspec.Meta(max_length=100)] = []
-    checked: Annotated[GivenMoment | None, told("null: now")] = None
+    checked: Annotated[GivenMoment | None, told("RFC 3339, or seconds since the epoch; null: now")] = None

@@ -17,6 +17,7 @@ from appliance.api.access import Bearer
 from appliance.api.alarms import Alarm, open_alarms
 from appliance.api.control import ControlAwayError
 from appliance.api.history import BUSY_SECONDS, Sample, Seen
+from appliance.api.moments import in_full
 from appliance.api.problems import ProblemError
 from appliance.api.roles import VIEWER, Viewer, ask
 from appliance.api.routing import Responses, Routes
@@ -115,12 +116,12 @@ def _told(seen: Seen) -> ServerSentEvent:
     if seen.status is None or seen.sample is None:
         return ServerSentEvent(event="away", data=json.dumps({"reason": seen.away}))
     now = _Now(seen.status, open_alarms(seen.status), seen.sample)
-    return ServerSentEvent(event="now", data=msgspec.json.encode(now).decode())
+    return ServerSentEvent(event="now", data=msgspec.json.encode(in_full(now)).decode())
 
 
 async def _graph(services: Services, bearer: Bearer) -> ServerSentEvent | None:
     try:
         graph = await ask(services.control, GraphWanted(), bearer)
-        return ServerSentEvent(event="graph", data=msgspec.json.encode(graph).decode())
+        return ServerSentEvent(event="graph", data=msgspec.json.encode(in_full(graph)).decode())
     except (ProblemError, ControlAwayError):
         return None  # said by the next `away`

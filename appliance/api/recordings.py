@@ -4,7 +4,6 @@ No change here needs `If-Match`: a recording never changes, it only ends.
 """
 
 import asyncio
-import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path as FilePath
 from typing import Annotated, Literal, TypeVar
@@ -12,15 +11,15 @@ from typing import Annotated, Literal, TypeVar
 import msgspec
 from fastapi import Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
-from starlette.exceptions import HTTPException
+from starlette.convertors import StringConvertor, register_url_convertor
 
 from appliance.api.access import Bearer
+from appliance.api.moments import given
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Investigator, Operator, Viewer, answered, ask
 from appliance.api.routing import Responses, Routes, answer, body, content
 from appliance.api.services import Services
 from appliance.api.streams import Held, peer_of, turn
-from appliance.audit.moment import MomentError, parse_moment
 from appliance.channel import admin
 from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.recordings import (
@@ -55,6 +54,7 @@ _BEGUN: Responses = {201: {"description": "It is being made.", "content": conten
 OneId = Annotated[
     str, Path(pattern="^[0-9a-f]{20}$", description="of a recording", examples=["18ea0bb9b11c1024196c"])
 ]
+
 _Moment = Annotated[
     str | None, Query(max_length=64, description="RFC 3339", examples=["2026-03-01T12:00:00.5Z"])
 ]
@@ -62,9 +62,20 @@ _Topics = Annotated[
     list[Annotated[str, Query(max_length=500)]],
     Query(max_length=20, description="of these alone; none: of all", examples=[["/scan"]]),
 ]
-
-
+_Given = Annotated[
+    int | Annotated[str, msgspec.Meta(max_length=64)] | None,
+    told("RFC 3339, or nanoseconds since the epoch"),
+]
 _Reading = Callable[[Recording, FilePath], _T]
+
+
+class _RecordingId(StringConvertor):
+    """In a path, so that the word `memory` is none."""
+
+    regex = "[0-9a-f]{20}"
+
+
+register_url_convertor("recording", _RecordingId())
 
 
 class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -78,8 +89,8 @@ class NewRecording(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Of which time: from `since` (null: all that there is) to `until` (null: now)."""
 
-    since: Annotated[int | None, told("nanoseconds since the epoch")] = None
-    until: Annotated[int | None, told("nanoseconds since the epoch")] = None
+    since: _Given = None
+    until: _Given = None
 
 
 def routes(services: Services) -> Routes:
@@ -117,21 +128,16 @@ def routes(services: Services) -> Routes:
     @router.post("/memory", operation_id="recording_of_memory", responses=_UNKNOWN)
     async def of_memory(span: Annotated[MemorySpan, body(MemorySpan)], bearer: Investigator) -> Recording:
         """What is in memory now, to be fetched as a recording for ten minutes, or until somebody else asks."""
-        order = admin.RecordingOfMemory(span.since, span.until)
+        order = admin.RecordingOfMemory(_moment(span.since), _moment(span.until))
         return answered(await control.ask(order, bearer, _SLOW_SECONDS))
 
-    @router.api_route("/memory", methods=["GET", "DELETE"], include_in_schema=False)
-    async def no_recording(_bearer: Viewer) -> None:
-        """No recording has this word as its id."""
-        raise HTTPException(405)
-
-    @router.get("/{recording_id}", operation_id="recording", responses=_UNKNOWN)
+    @router.get("/{recording_id:recording}", operation_id="recording", responses=_UNKNOWN)
     async def recording(recording_id: OneId, bearer: Viewer) -> Recording:
         """Why a recording was made, and what it has."""
         return await ask(control, admin.RecordingWanted(recording_id), bearer)
 
     @router.get(
-        "/{recording_id}/bag",
+        "/{recording_id:recording}/bag",
         operation_id="recording_bag",
         responses=_BAG | _UNKNOWN,
         response_class=Response,
@@ -150,7 +156,7 @@ def routes(services: Services) -> Routes:
             give_back()
             raise
 
-    @router.get("/{recording_id}/timeline", operation_id="recording_timeline", responses=_UNKNOWN)
+    @router.get("/{recording_id:recording}/timeline", operation_id="recording_timeline", responses=_UNKNOWN)
     async def recording_timeline(
         recording_id: OneId,
         bearer: Viewer,
@@ -168,7 +174,7 @@ def routes(services: Services) -> Routes:
             lambda row, bag: timeline(row, bag, start, end, columns),
         )
 
-    @router.get("/{recording_id}/messages", operation_id="recording_messages", responses=_UNKNOWN)
+    @router.get("/{recording_id:recording}/messages", operation_id="recording_messages", responses=_UNKNOWN)
     async def recording_messages(
         recording_id: OneId,
         bearer: Investigator,
@@ -194,7 +200,7 @@ def routes(services: Services) -> Routes:
             lambda row, bag: messages_around(row, bag, moment, topic, neighbours),
         )
 
-    @router.delete("/{recording_id}", operation_id="remove_recording", responses=_UNKNOWN)
+    @router.delete("/{recording_id:recording}", operation_id="remove_recording", responses=_UNKNOWN)
     async def remove(recording_id: OneId, bearer: Admin) -> Recording:
         """Remove a recording; it is recorded who removed it. For admins."""
         order = admin.RecordingRemove(recording_id)
@@ -225,11 +231,8 @@ def _gone(recording_id: str) -> ProblemError:
     return ProblemError(503, "not-available", f"the bag of {recording_id} is not there any more")
 
 
-def _moment(text: str | None) -> int | None:
-    try:
-        return None if text is None else parse_moment(text, time.time_ns())
-    except (MomentError, OverflowError, ValueError) as error:
-        raise ProblemError(422, "bad-input", str(error)) from error
+def _moment(moment: str | int | None) -> int | None:
+    return given(moment) if isinstance(moment, str) else moment
 
 
 def _pieces_of(path: FilePath) -> Iterator[bytes]:

@@ -14,6 +14,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import msgspec
 from fastapi import APIRouter, Depends, Request, Response
 
+from appliance.api.moments import in_full
 from appliance.api.preconditions import etag
 from appliance.api.problems import BadInput, ProblemError
 
@@ -35,23 +36,23 @@ class Tagged(NamedTuple, Generic[A]):
 def answer(body: Any, status: int = 200, tag: int | str | None = None) -> Response:
     """A struct as JSON."""
     headers = None if tag is None else {"ETag": etag(tag)}
-    return Response(msgspec.json.encode(body), status, headers, _JSON)
+    return Response(msgspec.json.encode(in_full(body)), status, headers, _JSON)
 
 
 class Contract:
     """The structs that the contract speaks of."""
 
     def __init__(self) -> None:
-        self._kinds: set[Any] = set()
+        self.kinds: set[Any] = set()
 
     def reference(self, kind: Any) -> dict[str, Any]:
         """The schema of a struct, by its name."""
-        self._kinds.add(kind)
+        self.kinds.add(kind)
         return {"$ref": f"#/components/schemas/{kind.__name__}"}
 
     def components(self) -> dict[str, Any]:
         """Their schemas, and those of what is in them."""
-        kinds = sorted(self._kinds, key=lambda kind: str(kind.__name__))
+        kinds = sorted(self.kinds, key=lambda kind: str(kind.__name__))
         return msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")[1]
 
 

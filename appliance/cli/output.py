@@ -15,6 +15,8 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from appliance.api.moments import in_full
+
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 
 
@@ -50,4 +52,4 @@ def say(line: str, style: str = "") -> None:
 
 def say_json(fields: msgspec.Struct | Mapping[str, Any] | tuple[Any, ...]) -> None:
     """Write one object on one line to standard output."""
-    sys.stdout.write(json.dumps(msgspec.to_builtins(fields)) + "\n")
+    sys.stdout.write(json.dumps(msgspec.to_builtins(in_full(fields))) + "\n")

@@ -4,12 +4,12 @@ import time
 from collections.abc import Iterator
 from typing import Annotated
 
-import msgspec
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from appliance.api.moments import in_full
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.hosts import PortsSeen
 from appliance.channel.answers.status import FirewallState, IpsecState, Status
@@ -38,7 +38,7 @@ def status(
     body = appliance.ask_or_exit(StatusWanted(), as_json=as_json)
     troubles = list(troubles_of(body))
     if as_json:
-        say_json({**msgspec.structs.asdict(body), "troubles": troubles})
+        say_json({**in_full(body), "troubles": troubles})
     else:
         show(body, troubles)
     raise typer.Exit(1 if troubles else 0)

@@ -4,9 +4,9 @@ from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
-import msgspec
 import typer
 
+from appliance.api.moments import in_full
 from appliance.channel import admin
 from appliance.channel.answers.graph import Topic, TopicMessage
 from appliance.cli import completion
@@ -83,7 +83,7 @@ def _described(topic: Topic) -> Iterator[str]:
 def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
     value = message.fields if field is None else _part(message.fields, field)
     if as_json:
-        say_json({**msgspec.structs.asdict(message), "fields": value})
+        say_json({**in_full(message), "fields": value})
         return
     at = datetime.fromtimestamp(message.time / 1e9, UTC).isoformat(timespec="milliseconds")
     words = [at, printable(message.node), f"{message.size} bytes", printable(message.why)]

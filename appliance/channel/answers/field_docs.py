@@ -4,11 +4,17 @@ from typing import Annotated, Any
 
 import msgspec
 
+UNIT = "x-epoch"
+"""The key of a moment's unit in its schema."""
+
 
 def told(description: str, **bounds: Any) -> msgspec.Meta:
     """What the contract says of a field, and its bounds."""
     return msgspec.Meta(description=description, **bounds)
 
 
-Moment = Annotated[float, told("seconds since the epoch")]
+Moment = Annotated[float, told("seconds since the epoch", extra_json_schema={UNIT: "seconds"})]
 """A moment, as answers have it."""
+
+NanoMoment = Annotated[int, told("nanoseconds since the epoch", extra_json_schema={UNIT: "nanoseconds"})]
+"""A moment of a message, for whom the digits of a float are too few."""

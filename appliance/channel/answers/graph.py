@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import NanoMoment, told
 
 
 class Node(msgspec.Struct, frozen=True):
@@ -76,7 +76,7 @@ class Graph(msgspec.Struct, frozen=True):
 class TopicMessage(msgspec.Struct, frozen=True):
     """A message of a topic as subscribers get it, after the monitors."""
 
-    time: Annotated[int, told("when the relay passed it on, nanoseconds since 1970")]
+    time: Annotated[NanoMoment, told("when the relay passed it on, nanoseconds since the epoch")]
     node: Annotated[str, told("that published it")]
     size: Annotated[int, told("bytes, without those of its length")]
     fields: Annotated[

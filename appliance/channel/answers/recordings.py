@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from appliance.channel.answers.field_docs import told
+from appliance.channel.answers.field_docs import NanoMoment, told
 
 TriggerKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "order"]
 EventKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "notice"]
@@ -13,7 +13,7 @@ EventKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "no
 class Trigger(msgspec.Struct, frozen=True):
     """Why messages were recorded."""
 
-    time: Annotated[int, told("nanoseconds since the epoch")]
+    time: NanoMoment
     what: TriggerKind
     record: Annotated[str, told("id of the audit record that says it")]
     text: str
@@ -34,8 +34,8 @@ class Recording(msgspec.Struct, frozen=True):
     """One recording; it is also `recording.json` beside its bag."""
 
     id: str
-    began: Annotated[int, told("nanoseconds since the epoch")]
-    ended: Annotated[int, told("nanoseconds since the epoch")]
+    began: NanoMoment
+    ended: NanoMoment
     triggers: list[Trigger]
     topics: list[RecordedTopic]
     policy: Annotated[int, told("revision of the policy in force at the end")]
@@ -50,7 +50,7 @@ class RecordingBegun(msgspec.Struct, frozen=True):
     """A recording that is being made."""
 
     id: str
-    ends: Annotated[int, told("when it ends, or later if more happens: nanoseconds since the epoch")]
+    ends: Annotated[NanoMoment, told("when it ends, or later if more happens: nanoseconds since the epoch")]
 
 
 class Recordings(msgspec.Struct, frozen=True):
@@ -88,7 +88,7 @@ class EventMarks(msgspec.Struct, frozen=True):
 class RecordedEvent(msgspec.Struct, frozen=True, kw_only=True):
     """What an audit record of that time says; `notice` is what is no trigger: a change by people, for example."""
 
-    time: Annotated[int, told("nanoseconds since the epoch")]
+    time: NanoMoment
     kind: EventKind
     record: Annotated[str, told("id of the audit record")]
     event: str
@@ -104,8 +104,8 @@ class Timeline(msgspec.Struct, frozen=True):
     """A recording, or a part of it, in columns of equal time: what flowed, and what happened."""
 
     id: str
-    since: Annotated[int, told("where the first column begins: nanoseconds since the epoch")]
-    until: Annotated[int, told("the last moment of the last column: nanoseconds since the epoch")]
+    since: Annotated[NanoMoment, told("where the first column begins: nanoseconds since the epoch")]
+    until: Annotated[NanoMoment, told("the last moment of the last column: nanoseconds since the epoch")]
     topics: Annotated[
         list[RecordedFlow], told("by their names, those of the recording without a message here too")
     ]
@@ -120,7 +120,7 @@ class Timeline(msgspec.Struct, frozen=True):
 class RecordedMessage(msgspec.Struct, frozen=True):
     """A message of a recording as its publisher sent it, before the monitors."""
 
-    time: Annotated[int, told("when the relay received it: nanoseconds since the epoch")]
+    time: Annotated[NanoMoment, told("when the relay received it: nanoseconds since the epoch")]
     place: Annotated[str, told("where it is in the recording; `at` takes it")]
     topic: str
     type: str

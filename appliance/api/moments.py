@@ -1,0 +1,83 @@
+"""Moments as JSON has them: the number that a struct has, and beside it RFC 3339 (`since`, `since_utc`).
+
+Which fields are moments says their type (`Moment`, `NanoMoment`): nobody who makes an answer thinks of it. The contract
+is completed from the same words.
+"""
+
+import functools
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from appliance.api.problems import ProblemError
+from appliance.audit.moment import parse_moment
+from appliance.audit.output import rfc3339
+from appliance.channel.answers.field_docs import UNIT
+
+_UTC = "_utc"
+_OF_A_SECOND = 1_000_000  # more digits of a float would be invented
+
+
+def in_full(value: Any) -> Any:
+    """What msgspec encodes, each moment in it with its text."""
+    if isinstance(value, msgspec.Struct):
+        units = _units(type(value))
+        if units is None:
+            return value
+        fields: dict[str, Any] = {}
+        for name in value.__struct_fields__:
+            fields[name] = in_full(getattr(value, name))
+            if name in units:
+                fields[name + _UTC] = _text(fields[name], units[name])
+        return fields
+    if isinstance(value, Mapping):
+        return {name: in_full(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [in_full(one) for one in value]
+    return value
+
+
+def describe(schema: dict[str, Any]) -> None:
+    """Put the texts into the schema of a struct, each after its moment."""
+    fields: dict[str, Any] = {}
+    for name, field in schema.get("properties", {}).items():
+        fields[name] = field
+        if _unit(field) is not None:
+            text = {"type": "string", "format": "date-time", "description": f"`{name}` as RFC 3339, UTC"}
+            nothing = [{"type": "null"}] if "anyOf" in field else []
+            fields[name + _UTC] = {"anyOf": [text, *nothing]} if nothing else text
+            if name in schema.get("required", ()):
+                schema["required"].append(name + _UTC)
+    if fields:
+        schema["properties"] = fields
+
+
+def given(text: str) -> int:
+    """A moment that somebody gave, in nanoseconds since the epoch. Raises `ProblemError` (422)."""
+    try:
+        return parse_moment(text, time.time_ns())
+    except (OverflowError, ValueError) as error:
+        raise ProblemError(422, "bad-input", str(error)) from error
+
+
+def _text(moment: float | None, unit: str) -> str | None:
+    if moment is None:
+        return None
+    return rfc3339(int(moment) if unit == "nanoseconds" else round(moment * _OF_A_SECOND) * 1_000)
+
+
+@functools.cache
+def _units(kind: type[msgspec.Struct]) -> dict[str, str] | None:
+    """The units of its moments; None where there is none in anything that is in it either."""
+    _, kinds = msgspec.json.schema_components([kind])
+    found = {
+        name: {field: unit for field, of in schema.get("properties", {}).items() if (unit := _unit(of))}
+        for name, schema in kinds.items()
+    }
+    return found[kind.__name__] if any(found.values()) else None
+
+
+def _unit(field: dict[str, Any]) -> str | None:
+    return field.get(UNIT) or next(filter(None, map(_unit, field.get("anyOf", ()))), None)

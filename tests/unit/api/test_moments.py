@@ -1,0 +1,91 @@
+"""Tests of `appliance.api.moments`: each moment of an answer as RFC 3339, too, and the rest as it was."""
+
+from typing import Annotated, Any
+
+import jsonschema_rs
+import msgspec
+import pytest
+
+from appliance.api.moments import describe, given, in_full
+from appliance.api.problems import ProblemError
+from appliance.api.routing import CONTRACT
+from appliance.channel.answers.field_docs import Moment, NanoMoment, told
+from appliance.channel.answers.graph import Graph
+from tests.support.answers import example
+
+
+class _Inner(msgspec.Struct):
+    at: Annotated[Moment | None, told("null: never")]
+    exact: NanoMoment
+
+
+class _Outer(msgspec.Struct):
+    since: Moment
+    rows: list[_Inner]
+    named: dict[str, _Inner | None]
+    pair: tuple[int, _Inner]
+    text: str = "since"
+
+
+_INNER = {
+    "at": None,
+    "at_utc": None,
+    "exact": 1_795_155_646_123_456_789,
+    "exact_utc": "2026-11-20T06:20:46.123456789Z",
+}
+
+
+def _outer() -> _Outer:
+    inner = _Inner(None, 1_795_155_646_123_456_789)
+    return _Outer(1_795_155_646.1, [inner], {"a": inner, "b": None}, (3, inner))
+
+
+def test_each_moment_has_its_text_beside_it() -> None:
+    """Wherever it is: in lists, in tables, none at all; and texts of numbers have no digits that were not there."""
+    assert in_full(_outer()) == {
+        "since": 1_795_155_646.1,
+        "since_utc": "2026-11-20T06:20:46.100000000Z",
+        "rows": [_INNER],
+        "named": {"a": _INNER, "b": None},
+        "pair": [3, _INNER],
+        "text": "since",
+    }
+
+
+def test_the_schema_says_it() -> None:
+    """With every field that is required; what is sent fits it."""
+    (root,), kinds = msgspec.json.schema_components([_Outer], ref_template="#/components/schemas/{name}")
+    for schema in kinds.values():
+        describe(schema)
+        schema["additionalProperties"] = False
+        schema["required"] = list(schema["properties"])
+    document = {**root, "components": {"schemas": kinds}}
+    jsonschema_rs.validator_for(document, validate_formats=True).validate(in_full(_outer()))
+    wrong = in_full(_outer()) | {"since_utc": "yesterday"}
+    assert not jsonschema_rs.validator_for(document, validate_formats=True).is_valid(wrong)
+
+
+def _bare(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _bare(one) for name, one in value.items() if not name.endswith("_utc")}
+    return [_bare(one) for one in value] if isinstance(value, list) else value
+
+
+@pytest.mark.parametrize("kind", sorted(CONTRACT.kinds, key=str), ids=lambda kind: str(kind.__name__))
+def test_nothing_else_of_an_answer_changes(kind: type[msgspec.Struct]) -> None:
+    """Of no kind that REST or a verb says: names, defaults and all else are what msgspec makes of it."""
+    one = example(kind)
+    assert _bare(msgspec.json.decode(msgspec.json.encode(in_full(one)))) == msgspec.to_builtins(one)
+
+
+def test_what_has_no_moment_is_not_walked_through() -> None:
+    """The graph of a robot is encoded as it is."""
+    graph = example(Graph)
+    assert in_full(graph) is graph
+
+
+def test_what_is_given_may_be_wrong() -> None:
+    """A moment as RFC 3339, or a problem that says what would be right."""
+    assert given("2026-11-20T06:20:46.123456789Z") == 1_795_155_646_123_456_789
+    with pytest.raises(ProblemError, match="2026-03-01T12:00:00Z"):
+        given("yesterday")
