@@ -1,7 +1,8 @@
 """A host of the lab on which a kit's own scripts run, as root on a Debian machine without systemd would run them.
 
 It has its own network (the lab's namespace) and, in a mount namespace, its own `/etc` (what is written there is seen
-there alone) and `/run`. Nothing of the machine that runs the test is changed.
+there alone) and `/run`; with a root of its own, that system's programs. Nothing of the machine that runs the test is
+changed.
 """
 
 import os
@@ -17,17 +18,23 @@ _MOUNTS = """\
 set -e
 mount --make-rprivate /
 mkdir -p "$1" && mount -t tmpfs tmpfs "$1" && mkdir "$1/upper" "$1/work"
-mount -t overlay overlay -o lowerdir=/etc,upperdir="$1/upper",workdir="$1/work" /etc
-mount -t tmpfs tmpfs /run
-echo mounted
-exec sleep infinity
+mount -t overlay overlay -o lowerdir="$2/etc",upperdir="$1/upper",workdir="$1/work" "$2/etc"
+mount -t tmpfs tmpfs "$2/run"
+if [ -n "$2" ]; then
+    mount -t proc proc "$2/proc"
+    mount --rbind /dev "$2/dev"
+fi
+exec chroot "$2/" sh -c 'echo mounted; exec sleep infinity'
 """
 
 
 class ScriptHost:
-    """A context manager; `address` is what ROS nodes on it are told to be (set once it has joined)."""
+    """A context manager; `address` is what ROS nodes on it are told to be (set once it has joined).
 
-    def __init__(self, host: Host, directory: Path) -> None:
+    `root` is the root of its file system, where that is not this machine's.
+    """
+
+    def __init__(self, host: Host, directory: Path, root: Path | None = None) -> None:
         self.outer = host
         self.directory = directory
         self.address = ""
@@ -35,7 +42,7 @@ class ScriptHost:
         directory.mkdir(parents=True, exist_ok=True)
         self._holder = Process(
             host,
-            ["unshare", "-m", "sh", "-c", _MOUNTS, "sh", str(self._upper)],
+            ["unshare", "-m", "sh", "-c", _MOUNTS, "sh", str(self._upper), str(root or "")],
             env={"PATH": os.environ["PATH"]},
             label=f"mounts of {host.name}",
         )
@@ -50,7 +57,7 @@ class ScriptHost:
 
     def command(self, args: Sequence[str]) -> list[str]:
         """A command line that runs this on the host."""
-        return ["nsenter", "-t", str(self._holder.pid), "-m", "-n", "--", *args]
+        return ["nsenter", "-t", str(self._holder.pid), "-m", "-n", "-r", "--", *args]
 
     def popen(self, args: Sequence[Any], **options: Any) -> "subprocess.Popen[Any]":
         """Start a program on the host."""

@@ -26,3 +26,21 @@ def test_it_is_for_the_plainest_shell(script: Path) -> None:
 def test_it_needs_no_python(script: Path) -> None:
     """A robot with Python 3.8, or none, can be enrolled."""
     assert re.findall(r"python|perl|ruby", script.read_text(), re.IGNORECASE) == []
+
+
+# What curl 7.68 and OpenSSL 1.1.1 have, of Ubuntu 20.04; who adds an option looks there first.
+_CURL = "silent show-error max-time insecure pinnedpubkey fail data-binary"
+_OPENSSL = (
+    "x509 pkey ecparam req crl verify dgst base64 pkeyutl"  # pkeyutl -rawin is OpenSSL 3's: for Ed25519 only
+)
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
+def test_it_asks_of_its_tools_what_ubuntu_20_04_has(script: Path) -> None:
+    """A laptop with Noetic joins and renews (tests/package/test_noetic.py runs it on a system of that age)."""
+    text = re.sub(r"#.*", "", script.read_text()).replace("\\\n", " ")
+    calls = re.findall(r"\b(?:curl|call|ask) [^|;&]*", text)
+    assert {option for call in calls for option in re.findall(r" --([a-z-]+)", call)} <= set(_CURL.split())
+    assert set(re.findall(r"\bopenssl ([a-z0-9]+) -", text)) <= set(_OPENSSL.split())
+    raw = [line for line in text.splitlines() if "-rawin" in line]
+    assert len(raw) == (script.name == "renew.sh")

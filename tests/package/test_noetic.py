@@ -1,0 +1,87 @@
+"""Machines of Noetic's generation beside the appliance: docs/noetic-robot.md.
+
+Ubuntu is not to be had from Debian's archive. Debian 11 is of its age: ROS 1.15, Python 3.9, OpenSSL 1.1.1, nftables
+0.9, strongSwan 5.9. Each machine here is such a system, in a mount namespace and a host of the lab.
+"""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from examples.landshark.lab import Lab
+from tests.support.debian_base import make_base
+from tests.support.nodes import RosSession
+from tests.support.script_host import ScriptHost
+from tests.support.tunnel_site import MASTER, MIDDLE, OWN, POLICY, TunnelSite
+from tests.support.tunnels import need_strongswan
+
+pytestmark = pytest.mark.timeout(2400)  # the system is fetched, and the image is built
+SUITE = "bullseye"
+PACKAGES = (
+    *("python3-rospy", "python3-rostopic", "python3-std-msgs", "topic-tools"),
+    # What a kit takes.
+    *("charon-systemd", "strongswan-swanctl", "libcharon-extra-plugins", "libstrongswan-standard-plugins"),
+    *("nftables", "iproute2", "openssl", "curl", "procps"),
+)
+API = 8443
+CONFIG = f"api: 0.0.0.0:{API}\napi_networks: [10.88.0.0/24]\napi_names: [{MIDDLE}]\n"
+TALKER = ("rostopic", "pub", "--rate=10", "/chatter", "std_msgs/String", "data: hello")
+
+
+@pytest.fixture
+def system(tmp_path: Path) -> Path:
+    """The root of a Debian 11, to be changed."""
+    return make_base(tmp_path / "system", PACKAGES, suite=SUITE)
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[TunnelSite]:
+    """An appliance whose REST the lab's network may reach."""
+    need_strongswan()
+    (tmp_path / "appliance.yaml").write_text(CONFIG)
+    with Lab("rosrv-noetic") as lab:
+        policy = POLICY.replace("host:ocu-1", "host:laptop")
+        options = ("--config", str(tmp_path / "appliance.yaml"))
+        with TunnelSite(lab, tmp_path, policy=policy, options=options) as one:
+            yield one
+
+
+def test_a_laptop_joins_renews_and_leaves_without_python(
+    site: TunnelSite, system: Path, tmp_path: Path
+) -> None:
+    """By the kit's scripts as they are, with OpenSSL 1.1.1; its nodes, which need Python, come when it has joined."""
+    hidden = tmp_path / "hidden"
+    hidden.mkdir()
+    pythons = [path for path in (system / "usr/bin").iterdir() if path.name.startswith("python3")]
+    for path in pythons:
+        path.rename(hidden / path.name)
+    script = system / "root/join.sh"
+    added = site.appliance.rosrv(
+        "host", "add", "laptop", "--appliance", MIDDLE, "--token", "--out", str(script), "--json"
+    )
+    with ScriptHost(site.ocu, tmp_path / "laptop", root=system) as laptop:
+        assert laptop.run("python3", "--version", check=False).returncode == 127
+        assert "OpenSSL 1.1.1" in laptop.run("openssl", "version").stdout
+        mark = site.mark
+        joined = laptop.run("sh", "/root/join.sh", json.loads(added.stdout)["token"])
+        site.recorded(mark, event="tunnel up")
+        mark = site.mark
+        assert "in force" in laptop.run("/etc/rosrv/renew.sh", "--now").stdout
+        site.recorded(mark, event="host renewed")
+        site.recorded(mark, event="tunnel up")
+        for path in pythons:
+            (hidden / path.name).rename(path)
+        laptop.address = re.findall(r"ROS_IP=(\S+)", joined.stdout)[0]
+        with (
+            RosSession(MASTER, tmp_path, site.robot) as on_robot,
+            RosSession(f"http://{OWN}:11311", tmp_path, laptop) as on_laptop,
+        ):
+            on_laptop.start(TALKER)
+            on_robot.listener("rospy", "/chatter", name="arm").wait_for(event="received")
+        mark = site.mark
+        laptop.run("/etc/rosrv/leave.sh")
+        site.recorded(mark, event="tunnel down")
+        assert laptop.run("nft", "list", "tables").stdout == ""
