@@ -44,8 +44,9 @@ test-package: ## what is installed: the package's life in a virtual machine, ima
 	@scripts/setup --package
 	$(PYTEST) tests/package --quiet --durations=15
 
-wheel: setup ## the wheel, for pipx: dist/rosrv_appliance-VERSION-py3-none-any.whl
+wheel: setup ## the wheel, for pipx: dist/rosrv_appliance-VERSION-py3-none-any.whl, and the versions that were tested
 	$(BIN)/python -m hatchling build --target wheel
+	sed -n 's/^\([a-z0-9.-]*==[^ ]*\) .*/\1/p' requirements.lock > dist/rosrv_appliance-$$($(BIN)/python -c 'import appliance; print(appliance.__version__)')-constraints.txt
 
 package: setup ## the Debian packages of both architectures: dist/rosrv_VERSION_ARCH.deb
 	@scripts/setup --package

@@ -1,40 +1,39 @@
-"""The wheel in an environment of its own, far from a checkout and without a compiler: all of `rosrv` is there."""
+"""The wheel, installed by pipx as docs/install.md says, far from a checkout: all of `rosrv` is there."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from appliance import __version__
 from tests.support.nodes import has_ros
-from tests.support.requirements import need_root, needs
+from tests.support.requirements import need_program, need_root, needs
 
 ROOT = Path(__file__).parents[2]
-BIN = Path(sys.executable).parent
 pytestmark = pytest.mark.timeout(600)
 
 
 @pytest.fixture(scope="module")
 def rosrv() -> Iterator[Path]:
-    """The command, as `pipx install --global` puts it: a fresh environment, nothing built, the lock's versions."""
+    """The command, installed by the page's own: `make wheel`, `pipx install`; no compiler is asked for anything."""
+    pipx = need_program("pipx", "pipx")
+    subprocess.run(["make", "--silent", "wheel"], cwd=ROOT, check=True, capture_output=True)
+    built = ROOT / "dist" / f"rosrv_appliance-{__version__}"
     folder = Path(tempfile.mkdtemp(prefix="rosrv-wheel-"))
     folder.chmod(0o755)  # the appliance's processes run as other users
-    build = [str(BIN / "python"), "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder)]
-    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
-    uv = str(BIN / "uv")
-    python = folder / "venv/bin/python"
-    subprocess.run([uv, "venv", "--quiet", "--python", "/usr/bin/python3", str(folder / "venv")], check=True)
     subprocess.run(
-        [uv, "pip", "install", "--quiet", "--python", str(python), "--no-build",
-         "--constraints", str(ROOT / "requirements.lock"), str(next(folder.glob("*.whl")))],
+        [pipx, "install", "--python", "/usr/bin/python3",
+         f"--pip-args=--only-binary :all: --constraint {built}-constraints.txt", f"{built}-py3-none-any.whl"],
+        env=os.environ | {"PIPX_HOME": str(folder / "pipx"), "PIPX_BIN_DIR": str(folder / "bin")},
         check=True,
     )  # fmt: skip
-    yield python.with_name("rosrv")
+    yield folder / "bin/rosrv"
     shutil.rmtree(folder)
 
 
@@ -62,6 +61,9 @@ def test_it_says_what_it_is(rosrv: Path, tmp_path: Path) -> None:
         for part in facts["parts"]
         if part["kind"] == "python"
     }
+    # pipx's own, which each of its environments sees.
+    for own in {"pip", "setuptools", "wheel", "packaging"} - locked.keys():
+        installed.pop(own, None)
     assert installed == locked | {"rosrv-appliance": facts["version"]}
     assert "simulated robot" in run(rosrv, "demo", "--help", folder=tmp_path).stdout
 
@@ -72,7 +74,7 @@ def test_its_selftest_names_a_policy_to_begin_with(rosrv: Path, tmp_path: Path) 
     rows = {row["check"]: row for row in map(json.loads, done.stdout.splitlines())}
     assert rows["policy"]["outcome"] == "warn", done.stdout + done.stderr
     named = rows["policy"]["advice"].rpartition("--policy ")[2]
-    assert Path(named).is_relative_to(rosrv.parents[1])
+    assert Path(named).is_relative_to(rosrv.parents[1] / "pipx/venvs")
     assert run(rosrv, "policy", "check", named, folder=tmp_path).returncode == 0
 
 
