@@ -51,7 +51,7 @@ from appliance.rosmop.why import NOBODY, Bound, Sender, of_slice
 
 OnFault = Literal["drop", "pass"]
 Patience = Callable[[], Callable[[], bool]]
-Asked = Callable[[str, int, str, int], bool]
+Asked = Callable[[Verdict, int], bool]
 
 TRIAL_BUDGET = 100_000
 """Instructions that a specification on trial may spend on one message: what waits meanwhile waits some milliseconds."""
@@ -301,7 +301,7 @@ class MonitorSet:
         self._walks = walks_of(self.compiled, self._monitors)
 
     def explain_when(self, asked: Asked, tried: Asked) -> None:
-        """Explain only verdicts that are asked for, by monitor, property, category and source; and those on trial."""
+        """Explain only verdicts that are asked for, by themselves and the source of the message; and those on trial."""
         self._asked = asked
         for trial in self.trials:
             trial.explain_when(tried, tried)
@@ -772,14 +772,17 @@ class MonitorSet:
 
     def _verdict(self, monitor: Monitor, running: RunningProperty, category: str) -> Verdict:
         source, index = running.code.property.source, running.index
-        asked = self._asked is None or self._asked(monitor.name, index, category, self._sender.source)
-        slices, one, why = monitor.slices, monitor.slice, None
+        slices, one = monitor.slices, monitor.slice
+        binding = {} if slices is None or one is None else slices.binding(one)
+        verdict = Verdict(monitor.name, index, source.logic, category, source, binding=binding)
+        if self._asked is not None and not self._asked(verdict, self._sender.source):
+            return verdict
         if slices is None or one is None:
-            why = running.history.explain(category) if asked else None
-            return Verdict(monitor.name, index, source.logic, category, source, why)
-        if asked and self._explains:
-            why = of_slice(running.code.property, monitor.trail, slices.values(one), category)
-        return Verdict(monitor.name, index, source.logic, category, source, why, slices.binding(one))
+            return replace(verdict, why=running.history.explain(category))
+        if not self._explains:
+            return verdict
+        why = of_slice(running.code.property, monitor.trail, slices.values(one), category)
+        return replace(verdict, why=why)
 
     def _handle(
         self,

@@ -19,7 +19,7 @@ from appliance.cli.monitor.input import usage_error
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.outcomes import Outcome, Verdict, bound
 from appliance.rosmop.why import Sender
 
 _OWN = "/rosrv"  # the appliance: what monitors publish is not given to monitors
@@ -225,18 +225,21 @@ def replay(
 
 
 class _Asked:
-    """Of each category of a property the first verdict of a second is explained, as on the robot."""
+    """Of each category of a property, and each binding, the first verdict of a second is explained."""
 
     def __init__(self) -> None:
         self.now = 0
-        self._told: dict[tuple[str, int, str], int] = {}
+        self._second = 0
+        self._told: set[tuple[str, int, str, str]] = set()
 
-    def __call__(self, monitor: str, index: int, category: str, _source: int) -> bool:
-        key, second = (monitor, index, category), self.now // 10**9
-        if self._told.get(key) == second:
-            return False
-        self._told[key] = second
-        return True
+    def __call__(self, verdict: Verdict, _source: int) -> bool:
+        if self._second != self.now // 10**9:
+            self._second = self.now // 10**9
+            self._told.clear()
+        key = verdict.monitor, verdict.property, verdict.category, bound(verdict)
+        told = key in self._told
+        self._told.add(key)
+        return not told
 
 
 def _outcome(  # noqa: PLR0917  a message, and what is known of it

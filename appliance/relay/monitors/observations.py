@@ -75,7 +75,7 @@ class Observations:
         `shared` is the detail of the count of all that have this distinction.
         """
         text = text[:_TEXT]
-        key = self._key(kind, monitor, place, distinction, shared)
+        key = self._known(kind, monitor, place, distinction, shared)
         self._said(key, place)
         if key in self._told:
             self._told[key] += 1
@@ -112,14 +112,14 @@ class Observations:
         shared: Mapping[str, Any] = _NOTHING,
     ) -> None:
         """So many more happened at `place`, the last at this time; they are told as a count."""
-        key = self._key(kind, monitor, place, distinction, shared)
+        key = self._known(kind, monitor, place, distinction, shared)
         self._said(key, place)
         self._told[key] = self._told.get(key, 0) + count
         self._last[key] = max(time, self._last.get(key, 0))
 
     def told(self, kind: str, monitor: str, place: Place, distinction: str = "") -> bool:
         """Whether this has been told in this second, so that the next is only counted."""
-        return (kind, monitor, *place[:3], distinction) in self._told
+        return self._key(kind, monitor, place, distinction) in self._told
 
     def tick(self) -> None:
         """A second is over: tell the counts, and the state of the monitors if it changed."""
@@ -158,18 +158,20 @@ class Observations:
         if self._callers.setdefault(key, place.caller_id) != place.caller_id:
             self._callers[key] = ""
 
-    def _key(
+    def _key(self, kind: str, monitor: str, place: Place, distinction: str) -> _Key:
+        key = (kind, monitor, *place[:3], distinction[:_TEXT])
+        beyond = key not in self._told and self._distinct.get((kind, monitor), 0) >= _DISTINCT
+        return (kind, monitor, *place[:3], "") if beyond else key
+
+    def _known(
         self, kind: str, monitor: str, place: Place, distinction: str, shared: Mapping[str, Any]
     ) -> _Key:
-        key = (kind, monitor, *place[:3], distinction[:_TEXT])
-        if key in self._told or not distinction:
-            return key
-        known = self._distinct.get((kind, monitor), 0)
-        if known >= _DISTINCT:
-            return (kind, monitor, *place[:3], "")
-        self._distinct[kind, monitor] = known + 1
-        if shared:
-            self._shared[key] = shared
+        """The key, which counts among the distinctions from now on."""
+        key = self._key(kind, monitor, place, distinction)
+        if key[-1] and key not in self._told:
+            self._distinct[kind, monitor] = self._distinct.get((kind, monitor), 0) + 1
+            if shared:
+                self._shared[key] = shared
         return key
 
     def _add(self, event: MonitorEvent) -> None:

@@ -15,7 +15,7 @@ from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.places import NOWHERE, Place, Senders, Sighting
 from appliance.rosmop.explained import conditions, explained
 from appliance.rosmop.monitor import Monitor
-from appliance.rosmop.outcomes import Outcome, bound
+from appliance.rosmop.outcomes import Outcome, Verdict, bound
 from appliance.rosmop.runtime.context import Published
 
 _EXPLAINED = 10
@@ -71,11 +71,14 @@ class Telling:
         """Whether the next drop of a monitor at a place is only counted."""
         return self._observations.told("drop", monitor, place)
 
-    def asks(self, monitor: str, index: int, category: str, source: int) -> bool:
+    def asks(self, verdict: Verdict, source: int) -> bool:
         """Whether a verdict is told in full, and so explained: as many as `_EXPLAINED` in a second are."""
         place = self.senders.place(source) or NOWHERE
-        told = self._observations.told(f"{self._prefix}verdict", monitor, place, f"{index} {category}")
-        if told or self._explained >= _EXPLAINED:
+        kind = f"{self._prefix}verdict"
+        if (
+            self._observations.told(kind, verdict.monitor, place, _which(verdict))
+            or self._explained >= _EXPLAINED
+        ):
             return False
         self._explained += 1
         return True
@@ -276,7 +279,7 @@ class Telling:
                 place,
                 outcome.time,
                 f"{name}: {verdict.category}",
-                distinction=f"{verdict.property} {verdict.category}{bound(verdict)}",
+                distinction=_which(verdict),
                 detail={
                     "property": verdict.property,
                     "logic": verdict.logic,
@@ -351,3 +354,8 @@ def _monitor(event: str) -> str:
 def _together(events: Sequence[str]) -> list[str]:
     """The events that changed a message, if it was more than one monitor."""
     return list(events) if _monitor(events[0]) != _monitor(events[-1]) else []
+
+
+def _which(verdict: Verdict) -> str:
+    """What distinguishes a verdict from the others of its monitor."""
+    return f"{verdict.property} {verdict.category}{bound(verdict)}"

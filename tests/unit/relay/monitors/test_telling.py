@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from appliance.channel.messages import MonitorEvent, MonitorsCounted, MonitorsReported
+from appliance.relay.monitors import observations
 from appliance.relay.monitors.places import Place
 from tests.unit.relay.monitors.test_passage import Monitored
 from tests.unit.rosmop.acting import message
@@ -218,4 +219,25 @@ def test_a_verdict_names_its_binding(together: bool) -> None:
         ("property 1 of turns (ere) with x = 5.0: match", {"x": 5.0}),
         ("property 1 of turns (ere) with x = 6.0: match", {"x": 6.0}),
     ]
+    told.monitored.close()
+
+
+AGAIN = """again(double x) { event on(double x) /cmd geometry_msgs/Twist '{linear.x:x}' { }
+    ptltl: on @validation { ROS_INFO("again"); } }"""
+TURNED = """turned() { event on(double z) /cmd geometry_msgs/Twist '{angular.z:z}' when (z > 1) { }
+    ptltl: on @validation { ROS_INFO("turned"); } }"""
+
+
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("bindings", [[5.0] * 20, [float(number) for number in range(20)]])
+def test_what_is_only_counted_takes_no_explanation(
+    together: bool, bindings: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither a binding that repeats nor one of more than can be told apart: the next that is told in full has it."""
+    monkeypatch.setattr(observations, "_DISTINCT", 2)
+    told = Told(together=together, texts=(AGAIN, TURNED))
+    told.send(*[(x, 0, 0) for x in bindings], (5.0, 0, 2))
+    full = [one for one in told.events("verdict") if not one.count]
+    assert full[-1].monitor == "turned"
+    assert [len(one.detail["why"]["events"]) for one in full] == [1] * len(full)
     told.monitored.close()
