@@ -26,7 +26,7 @@ OTHERS = "(others)"  # no name of ROS, and no address, has a bracket
 _NAMES = 8
 _LONGEST_NAME = 256
 _LONGEST_KEY = 1024
-ABOUT = ("call", "key", "node", "subgraph", "method", "status", "who", "monitor")
+ABOUT = ("call", "key", "node", "subgraph", "method", "status", "who", "monitor", "topics")
 """What a call was about, in `detail`."""
 
 

@@ -18,6 +18,7 @@ from appliance.control.errors import SenselessError, UnknownThingError
 _PATIENCE_SECONDS = 10.0
 _LONGEST_NOTE = 300
 _MOST_TOPICS = 20
+_LONGEST_NAME = 500
 _Answer = (
     messages.RecordingBegun | messages.RecordingRemoved | messages.MemoryLent | messages.RecordingRefused
 )
@@ -115,11 +116,11 @@ class RecordingOrders:
 
     async def read(self, request: admin.RecordingRead, who: str) -> Recording:
         """Say that somebody reads some of its messages; what is read again within seconds is counted."""
-        topics = [topic[:_LONGEST_NOTE] for topic in request.topics[:_MOST_TOPICS]]
-        what = ", ".join(topics) or "all topics"
-        return await self._given_out(
-            request.id, "recording read", f"messages of {what}, by {who}", who, reads=True, topics=topics
-        )
+        topics = request.topics
+        if len(topics) > _MOST_TOPICS or any(len(topic) > _LONGEST_NAME for topic in topics):
+            raise SenselessError(f"at most {_MOST_TOPICS} topics at once, of {_LONGEST_NAME} characters each")
+        reason = f"messages of {', '.join(topics) or 'all topics'}, by {who}"
+        return await self._given_out(request.id, "recording read", reason, who, reads=True, topics=topics)
 
     async def _given_out(
         self, recording_id: str, event: str, reason: str, who: str, *, reads: bool = False, **detail: Any

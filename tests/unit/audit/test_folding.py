@@ -289,6 +289,17 @@ def test_reads_are_folded_as_denials_are() -> None:
     )  # fmt: skip
 
 
+def test_a_reading_of_other_topics_is_no_repetition() -> None:
+    """Who read which topics of a recording stands in full; the same again is counted."""
+    folder = make_folder()
+    scan, image, again = (
+        denial("", event="recording read", decision=None, folds=True, category=None, caller_id=None,
+               reason=f"messages of {topic}, by eve", detail={"who": "eve", "topics": [topic]})
+        for topic in ("/scan", "/image", "/scan")
+    )  # fmt: skip
+    assert offer(folder, scan, image, again) == [scan, image]
+
+
 def test_reads_beyond_the_share_are_recorded_in_full() -> None:
     """No read loses its key: past the share of kinds each is a record of its own, and takes no kind of a denial."""
     folder = make_folder(keys=64, keys_per_host=16)

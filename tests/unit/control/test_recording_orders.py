@@ -216,3 +216,23 @@ def test_what_is_in_memory_can_be_fetched_and_is_not_listed() -> None:
         recorder.close()
 
     played(story)
+
+
+def test_more_topics_than_the_record_can_name_are_refused() -> None:
+    """What is read is what the record says: no name is left out of it, and none is cut."""
+
+    async def story() -> None:
+        scene = Scene()
+        recorder = scene.attach(lambda _message: [])
+        recorder.send(messages.RecordingsStated([KEPT]))
+        await told(scene, lambda: bool(cast(Any, scene.orders.state()).recordings))
+        for topics in ([f"/t{number}" for number in range(21)], ["/" + "t" * 500]):
+            with pytest.raises(SenselessError, match="at most 20 topics"):
+                await scene.orders.read(admin.RecordingRead(KEPT.id, topics), "eve")
+        assert not scene.trail.events
+        longest = "/" + "t" * 499
+        await scene.orders.read(admin.RecordingRead(KEPT.id, [longest]), "eve")
+        assert scene.trail.events[0][1]["topics"] == [longest]
+        recorder.close()
+
+    played(story)
