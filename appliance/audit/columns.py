@@ -60,12 +60,10 @@ def _storable(value: Any, kinds: tuple[type, ...]) -> bool:
     if kind not in kinds:
         return False
     if kind is str:
-        return len(value) <= LONGEST_TEXT and (value.isascii() or _is_unicode(value))
+        return len(value) <= LONGEST_TEXT and (
+            value.isascii() or not any("\ud800" <= c <= "\udfff" for c in value)
+        )
     return kind is not int or -_LARGEST_INTEGER <= value <= _LARGEST_INTEGER
-
-
-def _is_unicode(text: str) -> bool:
-    return not any("\ud800" <= character <= "\udfff" for character in text)
 
 
 def from_columns(columns: StoredColumns) -> Record:

@@ -70,6 +70,24 @@ def as_json(entry: Entry) -> str:
     return json.dumps(as_object(entry), separators=(",", ":"))
 
 
+def fields_of(entry: Entry) -> dict[str, str | None]:
+    """What names a record and says what it is about, as text; None is what it has not."""
+    record = entry.record
+    return {
+        "sequence": str(entry.sequence),
+        "id": record.id,
+        "event": record.event,
+        "severity": record.severity.value,
+        "decision": record.decision,
+        "host": record.host,
+        "caller_id": record.caller_id,
+        "category": record.category,
+        "resource": record.resource,
+        "rule": rule_text(record.rule),
+        "revision": None if record.revision is None else str(record.revision),
+    }
+
+
 def rule_text(rule: RuleReference | None) -> str | None:
     """A rule and where it stands, as one word of a line; None for none."""
     return None if rule is None else f"[{rule.section}] {rule.key} {rule.file}:{rule.line}"

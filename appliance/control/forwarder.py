@@ -47,7 +47,7 @@ class Forwarded:
         """For `rosrv status` and the metrics; None when nothing is to be forwarded."""
         if self._wanted.to is None:
             return None
-        report = self._report or messages.ForwardingReported(0, 0, 0, 0, 0.0, 0, "")
+        report = self._report or messages.ForwardingReported()
         trouble = report.trouble
         if self._channel is None or self._report is None:
             trouble = trouble or "the forwarder does not run yet"

@@ -23,6 +23,7 @@ from appliance.audit.output import Entry
 from appliance.audit.query import Filter
 from appliance.audit.record import Record, Severity
 from appliance.audit.search import search
+from appliance.channel.messages import ForwardingReported
 from appliance.forwarding.position import Position, load_position, save_position
 from appliance.forwarding.receiver import Receiver
 from appliance.forwarding.syslog import Formatter
@@ -33,21 +34,6 @@ _IDLE_SECONDS = 0.5
 _BACK_OFF = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 _SAVE_SECONDS = 1.0
 _log = structlog.get_logger()
-
-
-class Progress(msgspec.Struct, frozen=True):
-    """How it stands: what was sent, how far behind that is, and why nothing goes on now (empty when it does).
-
-    `behind` is in records, `seconds` how long the oldest of them has waited; `missed` could never be sent.
-    """
-
-    sent: int = 0
-    sequence: int = 0
-    checkpoint: int = 0
-    behind: int = 0
-    seconds: float = 0.0
-    missed: int = 0
-    trouble: str = ""
 
 
 class Forwarder:
@@ -73,7 +59,7 @@ class Forwarder:
         self._saved: Position | None = None
         self._saved_at = 0.0
         self._failures = 0
-        self.progress = Progress()
+        self.progress = ForwardingReported()
 
     def step(self) -> float:
         """Send the next batch; in how many seconds to come again."""
@@ -127,7 +113,7 @@ class Forwarder:
         self._position = Position(
             position.log, through, last, entries[-1].record.id if entries else position.record
         )
-        self.progress = Progress(
+        self.progress = ForwardingReported(
             sent=self.progress.sent + len(messages),
             sequence=through,
             checkpoint=last,

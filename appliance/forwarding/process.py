@@ -12,13 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child import Child
 from appliance.config import Settings, Syslog, load_resolved
-from appliance.forwarding.forwarder import Forwarder, Progress
+from appliance.forwarding.forwarder import Forwarder
 from appliance.forwarding.receiver import DatagramReceiver, Receiver, StreamReceiver, tls_context
 from appliance.forwarding.syslog import LONGEST_DATAGRAM, LONGEST_IN_STREAM, Formatter
 
@@ -80,15 +78,14 @@ class Reports:
 
     def __init__(self, send: Callable[[messages.ForwardingReported], bool]) -> None:
         self._send = send
-        self._told = report_of(Progress())
+        self._told = messages.ForwardingReported()
 
-    def tell(self, progress: Progress) -> None:
+    def tell(self, progress: messages.ForwardingReported) -> None:
         """If something is new, tell it."""
-        message = report_of(progress)
-        if message != self._told and self._send(message):
-            self._told = message
+        if progress != self._told and self._send(progress):
+            self._told = progress
 
-    def anew(self, progress: Progress) -> None:
+    def anew(self, progress: messages.ForwardingReported) -> None:
         """There is another control."""
         if self._send(self._told):
             self.tell(progress)
@@ -124,8 +121,3 @@ def receiver_of(wanted: Syslog) -> Receiver:
             return tls_context(wanted.ca, wanted.certificate, wanted.key)
 
     return StreamReceiver(host, port, context, wanted.name)
-
-
-def report_of(progress: Progress) -> messages.ForwardingReported:
-    """What control is told."""
-    return messages.ForwardingReported(**msgspec.structs.asdict(progress))

@@ -17,7 +17,7 @@ import msgspec
 
 from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
 from appliance.audit.ocsf import as_ocsf_line
-from appliance.audit.output import Entry, printable, rule_text
+from appliance.audit.output import Entry, fields_of, printable
 from appliance.audit.record import Record, Severity
 
 ELEMENT = "rosrv@32473"  # 32473 is kept for examples (RFC 5612): the project has no number of its own
@@ -58,11 +58,11 @@ class Formatter:
         head = self._head(record.severity, record.time, record.event)
         if self._ocsf:
             named = {
-                name: value for name, value in _parameters(entry).items() if name in _IDENTIFYING and value
+                name: value for name, value in fields_of(entry).items() if name in _IDENTIFYING and value
             }
             room = self._longest - len(_message(head, ELEMENT, named, "")) - 1
             return _message(head, ELEMENT, named, as_ocsf_line(entry, room))
-        named = {name: _value(value, self._room) for name, value in _parameters(entry).items() if value}
+        named = {name: _value(value, self._room) for name, value in fields_of(entry).items() if value}
         text = _ascii(record.reason or record.event)
         detail = json.dumps(record.detail, separators=(",", ":")) if record.detail else ""
         if len(detail) < self._longest:
@@ -93,23 +93,6 @@ class Formatter:
         priority = self._facility * 8 + _SEVERITIES[severity]
         event_id = _name(event.replace(" ", "-"), _LONGEST_MESSAGE_ID)
         return f"<{priority}>1 {_time(time)} {self._host} rosrv - {event_id}"
-
-
-def _parameters(entry: Entry) -> dict[str, str | None]:
-    record: Record = entry.record
-    return {
-        "sequence": str(entry.sequence),
-        "id": record.id,
-        "event": record.event,
-        "severity": record.severity.value,
-        "decision": record.decision,
-        "host": record.host,
-        "caller_id": record.caller_id,
-        "category": record.category,
-        "resource": record.resource,
-        "rule": rule_text(record.rule),
-        "revision": None if record.revision is None else str(record.revision),
-    }
 
 
 def _message(head: str, element: str, fields: dict[str, str], text: str) -> bytes:

@@ -40,11 +40,12 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from appliance.channel.answers.status import FirewallRule
 from appliance.network import conntrack, links
 from appliance.network.endings import end_processes
 from appliance.network.endpoint import Endpoint, outward_address
 from appliance.network.firewall import iptables
-from appliance.network.firewall.firewall import RuleStatus, statuses
+from appliance.network.firewall.firewall import statuses
 from appliance.network.firewall.nft import NftBackend
 from appliance.network.firewall.rules import (
     LOOPBACK,
@@ -203,7 +204,7 @@ class Isolation:
         if self._rules:
             self._install(self._rules)
 
-    def rules(self) -> tuple[RuleStatus, ...]:
+    def rules(self) -> tuple[FirewallRule, ...]:
         """Return the rules on the host with their counters."""
         return statuses(self._rules, self._backend.counters())
 

@@ -117,7 +117,11 @@ class Groups:
         if network is None or "%" in text:
             self._findings.error(word.line, word.column, _address_fault(text))
             return None
-        if network.is_loopback and not self._warned_loopback and not self._robot_is_loopback():
+        if (
+            network.is_loopback
+            and not self._warned_loopback
+            and not any(member.is_loopback for member in self.robot)
+        ):
             self._warned_loopback = True
             self._findings.warn(
                 word.line, word.column, f"{text} is the appliance itself {self._robot_instead()}"
@@ -130,9 +134,6 @@ class Groups:
             return "(unless isolation is none): write robot if you mean the nodes of its machine"
         robot = ", ".join(str(member).removesuffix("/32").removesuffix("/128") for member in self.robot)
         return f"here; the robot is {robot}: write robot if you mean it"
-
-    def _robot_is_loopback(self) -> bool:
-        return any(member.is_loopback for member in self.robot)
 
     def _enrolled(self, word: Word) -> Atom | None:
         name = word.text.removeprefix(_HOST)
@@ -208,11 +209,11 @@ class Groups:
 def _as_network(member: Address | Network) -> Network:
     if isinstance(member, ipaddress.IPv4Network | ipaddress.IPv6Network):
         return canonical_network(member)
-    return canonical_network(ipaddress.ip_network(int(member)) if member.version == 4 else _single_v6(member))
-
-
-def _single_v6(address: Address) -> Network:
-    return ipaddress.IPv6Network((int(address), 128))
+    return canonical_network(
+        ipaddress.ip_network(int(member))
+        if member.version == 4
+        else ipaddress.IPv6Network((int(member), 128))
+    )
 
 
 def _address_fault(text: str) -> str:

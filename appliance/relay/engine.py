@@ -66,7 +66,7 @@ class Engine:
             limits,
             standing=self._table.standing,
             arrived=self._arrived,
-            turned_away=self._turned_away,
+            turned_away=lambda key, host, reason: self._reporter.refused(key, NOTHING, host, "", reason),
             make_room=self._make_place,
         )
         self.topics: dict[tuple[str, str], tuple[RelayedTopic, Publisher | OwnPublisher]] = {}
@@ -382,9 +382,6 @@ class Engine:
         yield from list(self.clients)
         for relayed, _publisher in self.topics.values():
             yield from [member for member in relayed.members if isinstance(member, Subscriber)]
-
-    def _turned_away(self, key: str, host: str, reason: str) -> None:
-        self._reporter.refused(key, NOTHING, host, "", reason)
 
     def _visitor_failed(self, visitor: Visitor, reason: str) -> None:
         visitor.close()

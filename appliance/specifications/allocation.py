@@ -104,7 +104,8 @@ class Allocation:
         groups = groups_of(checked)
         homes = self._homes(groups, carried)
         plan = self._planned(groups, homes, carried)
-        if plan.losing & self._gaining(plan):
+        gaining = {plan.files[name] for name in plan.moved_files} | {move.target for move in plan.moves}
+        if plan.losing & gaining:
             homes = self._one_way(groups, homes, carried)
             plan = self._planned(groups, homes, carried)
         return plan
@@ -157,9 +158,6 @@ class Allocation:
         losing = {before.files[name] for name in moved}
         losing |= {move.source for move in moves if (move.kind, move.name) in before.resources}
         return Plan(files, resources, moves, moved, frozenset(losing))
-
-    def _gaining(self, plan: Plan) -> set[int]:
-        return {plan.files[name] for name in plan.moved_files} | {move.target for move in plan.moves}
 
     def adopt(self, plan: Plan) -> None:
         """This is the allocation from now on."""

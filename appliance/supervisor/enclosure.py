@@ -15,21 +15,21 @@ Invariants:
 import contextlib
 import ipaddress
 import threading
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import msgspec
 import structlog
 
-from appliance.channel.answers.status import FirewallRule, FirewallState
+from appliance.channel.answers.status import FirewallState
 from appliance.channel.own_node import ADDRESS as OWN_NODE_ADDRESS
 from appliance.ipsec.leftovers import LeftoversError, clear_leftovers
 from appliance.ipsec.strongswan import USER_SPACE_INTERFACE
 from appliance.network import links
 from appliance.network.endpoint import Endpoint, only_address
 from appliance.network.esp import Esp, choose_esp
-from appliance.network.firewall.firewall import Firewall, RuleStatus
+from appliance.network.firewall.firewall import Firewall
 from appliance.network.firewall.rules import FirewallSettings, Forwarder, OwnNode, PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import Namespace, NetworkError
@@ -239,7 +239,7 @@ class Contained(Enclosure):
                 self.firewall.install(self._settings())
                 self._owed = False
                 report = self.firewall.report()
-        return FirewallState(report.backend, list(report.not_used), _shown(report.rules))
+        return FirewallState(report.backend, list(report.not_used), list(report.rules))
 
     def probe(self) -> str | None:
         """Try to reach ROSMaster and the inner face as another local user."""
@@ -380,9 +380,7 @@ class InNamespace(Contained):
                 log.critical("rules on the host were taken away and are put back", rules=gone)
                 self._isolation.put_rules_back()
                 rules = self._isolation.rules()
-            return msgspec.structs.replace(
-                super().report(), forwarding=_shown(rules), **self._look_at_others()
-            )
+            return msgspec.structs.replace(super().report(), forwarding=list(rules), **self._look_at_others())
 
     def _look_at_others(self) -> dict[str, list[str]]:
         """What programs such as Docker do to forwarded packets on the host; it is said when it changes."""
@@ -403,10 +401,6 @@ class InNamespace(Contained):
             for obstacle in found["obstacles"]:
                 log.warning("connections from the network may not reach the appliance", reason=obstacle)
         return found
-
-
-def _shown(rules: Iterable[RuleStatus]) -> list[FirewallRule]:
-    return [FirewallRule(**asdict(rule)) for rule in rules]
 
 
 def enclosure_of(isolation: str, ports: Ports, backend: Literal["auto", "iptables", "nft"]) -> Enclosure:

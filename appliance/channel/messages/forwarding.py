@@ -10,13 +10,13 @@ class ForwardingReported(Message):
     wait, the oldest for `seconds`; `missed` were removed before they could be sent; `trouble` is why nothing goes on.
     """
 
-    sent: int
-    sequence: int
-    checkpoint: int
-    behind: int
-    seconds: float
-    missed: int
-    trouble: str
+    sent: int = 0
+    sequence: int = 0
+    checkpoint: int = 0
+    behind: int = 0
+    seconds: float = 0.0
+    missed: int = 0
+    trouble: str = ""
 
 
 ForwardingLink = ForwardingReported

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from appliance.audit.export_proof import ExportVerification
 from appliance.audit.findings import Elsewhere, Kind, Verification
-from appliance.audit.output import Entry, printable, rfc3339, rule_text
+from appliance.audit.output import Entry, fields_of, printable, rfc3339, rule_text
 from appliance.audit.record import Record, Severity
 from appliance.audit.search import Shown
 
@@ -55,16 +55,7 @@ def print_shown(shown: Shown) -> None:
     fields = {
         "id": record.id,
         "time": rfc3339(record.time),
-        "sequence": str(shown.entry.sequence),
-        "event": record.event,
-        "severity": record.severity.value,
-        "decision": record.decision,
-        "host": record.host,
-        "caller_id": record.caller_id,
-        "category": record.category,
-        "resource": record.resource,
-        "rule": rule_text(record.rule),
-        "revision": None if record.revision is None else str(record.revision),
+        **fields_of(shown.entry),
         "reason": record.reason,
         "duration": None if record.duration_us is None else f"{record.duration_us} us",
         **{f"detail.{name}": str(value) for name, value in record.detail.items()},

@@ -2,7 +2,7 @@
 
 import functools
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from appliance.cli import output
@@ -95,7 +95,9 @@ def _definition_texts(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
     """The definitions below a folder by `package/File`, and where each stands, by that name and the type's."""
     texts: dict[str, str] = {}
     places: dict[str, str] = {}
-    for path in _definition_files(folder):
+    for path in sorted(path for path in folder.rglob("*") if path.suffix in (".msg", ".srv")):
+        if not path.is_file():
+            continue
         package = path.parent.parent if path.parent.name in ("msg", "srv") else path.parent
         if package == folder.parent or path.parent == folder:
             text = f"a definition belongs into the folder of its package: {folder}/package/{path.name}"
@@ -104,10 +106,6 @@ def _definition_texts(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
         places[name] = places[name.rsplit(".", 1)[0]] = str(path)
         texts[name] = _text_of(path)
     return texts, places
-
-
-def _definition_files(folder: Path) -> Iterable[Path]:
-    return sorted(path for path in folder.rglob("*") if path.suffix in (".msg", ".srv") and path.is_file())
 
 
 def _text_of(path: Path) -> str:

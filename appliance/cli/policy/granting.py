@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
+from appliance.audit.record import Record
 from appliance.channel.admin import PolicyLoad, PolicyWanted
 from appliance.channel.answers.policy import Granted, Why
 from appliance.cli.admin_socket import NotRunningError
@@ -46,10 +47,7 @@ def _explained(appliance: Appliance, record: str) -> Why:
     from appliance.api.judgement import explained, is_refusal  # noqa: PLC0415  not for every verb
 
     with Errors():
-        shown = appliance.audit().show(record, 0)
-        if shown is None:
-            fail(f"no record with the id {record!a} is in the log", 1)
-        found = shown.entry.record
+        found = _record(appliance, record)
         try:
             known = appliance.ask(PolicyWanted()).given() if is_refusal(found) else None
         except NotRunningError as error:
@@ -122,14 +120,19 @@ def _granted(appliance: Appliance, record: str) -> Granted:
     from appliance.policy.grant import UngrantableError  # noqa: PLC0415  as above
 
     with Errors():
-        shown = appliance.audit().show(record, 0)
-        if shown is None:
-            fail(f"no record with the id {record!a} is in the log", 1)
+        found = _record(appliance, record)
         known = appliance.ask_or_exit(PolicyWanted(), as_json=False)
         try:
-            return granted(shown.entry.record, known)
+            return granted(found, known)
         except UngrantableError as error:
             fail(str(error), 1)
+
+
+def _record(appliance: Appliance, record: str) -> Record:
+    shown = appliance.audit().show(record, 0)
+    if shown is None:
+        fail(f"no record with the id {record!a} is in the log", 1)
+    return shown.entry.record
 
 
 def _over_rest(appliance: Appliance, record: str, what: str) -> dict[str, Any]:
@@ -142,5 +145,5 @@ def _over_rest(appliance: Appliance, record: str, what: str) -> dict[str, Any]:
     try:
         return appliance.way.client.call("GET", f"/v1/audit/{record}/{what}")
     except ProblemError as problem:
-        typer.echo(f"rosrv policy: {problem.lines[0]}", err=True)
+        typer.echo(f"rosrv {'audit' if what == 'why' else 'policy'}: {problem.lines[0]}", err=True)
         raise typer.Exit(1) from None

@@ -8,6 +8,7 @@ Order of use: `install` before ROSMaster starts, `update` when a port becomes kn
 from dataclasses import dataclass
 from typing import Literal
 
+from appliance.channel.answers.status import FirewallRule
 from appliance.network.firewall.backend import Backend, FirewallError, RuleCounter
 from appliance.network.firewall.iptables import IptablesBackend
 from appliance.network.firewall.nft import NftBackend
@@ -19,23 +20,11 @@ BackendChoice = Literal["auto", "nft", "iptables"]
 
 
 @dataclass(frozen=True)
-class RuleStatus:
-    """A rule with what it has matched so far; `in_force` is false when the kernel has it no more."""
-
-    chain: str
-    purpose: str
-    rule: str
-    packets: int
-    octets: int
-    in_force: bool
-
-
-@dataclass(frozen=True)
 class FirewallReport:
     """How the firewall stands."""
 
     backend: str | None  # None: not installed
-    rules: tuple[RuleStatus, ...]
+    rules: tuple[FirewallRule, ...]
     not_used: tuple[str, ...]  # why a back end that was tried was not taken
 
     @property
@@ -131,7 +120,7 @@ class Firewall:
 
 def statuses(
     rules: tuple[Rule, ...], counters: tuple[RuleCounter, ...], families: tuple[Family, ...] = (4, 6)
-) -> tuple[RuleStatus, ...]:
+) -> tuple[FirewallRule, ...]:
     """Join the rules with what the kernel says of them; the counts of both families are added up.
 
     A rule is in force when the kernel has it at least once for each family it is for (or once for both), of those
@@ -147,5 +136,5 @@ def statuses(
         packets, octets = sum(one.packets for one in seen), sum(one.octets for one in seen)
         present = sum(2 if one.family is None else 1 for one in seen)
         in_force = present >= len({*rule.families()} & {*families})
-        found.append(RuleStatus(chain, purpose, rule.describe(), packets, octets, in_force))
+        found.append(FirewallRule(chain, purpose, rule.describe(), packets, octets, in_force))
     return tuple(found)

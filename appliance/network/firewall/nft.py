@@ -66,7 +66,7 @@ class NftBackend:
         if (_FAMILY, TABLE) not in [(table.get("family"), table.get("name")) for table in tables]:
             return ()
         rules = self._list("rule", "list", "table", _FAMILY, TABLE)
-        hooked = {jump for rule in rules for jump in _jumps(rule)}
+        hooked = {part["jump"]["target"] for rule in rules for part in rule["expr"] if "jump" in part}
         return _counters([rule for rule in rules if rule["chain"] in hooked])
 
     def foreign_forward_drops(self) -> tuple[str, ...]:
@@ -324,10 +324,6 @@ def _translates_source(rule: Json) -> bool:
         for part in rule["expr"]
         if isinstance(part, dict)
     )
-
-
-def _jumps(rule: Json) -> list[str]:
-    return [part["jump"]["target"] for part in rule["expr"] if "jump" in part]
 
 
 def _counters(rules: list[Json]) -> tuple[RuleCounter, ...]:

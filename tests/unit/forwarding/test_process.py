@@ -4,7 +4,6 @@ import asyncio
 from collections.abc import Callable
 from typing import Any, cast
 
-import msgspec
 import pytest
 
 from appliance.audit_trail import AuditTrail
@@ -12,7 +11,6 @@ from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.config import Syslog
 from appliance.control.forwarder import Forwarded
-from appliance.forwarding.forwarder import Progress
 from appliance.forwarding.process import Reports
 
 
@@ -37,9 +35,9 @@ class Control:
         """As a channel does it."""
 
 
-def missed(count: int) -> Progress:
+def missed(count: int) -> messages.ForwardingReported:
     """So many records were missed."""
-    return msgspec.structs.replace(Progress(), missed=count)
+    return messages.ForwardingReported(missed=count)
 
 
 @pytest.fixture
@@ -60,7 +58,7 @@ def reports(controls: list[Control]) -> Reports:
     return Reports(send)
 
 
-def begin(controls: list[Control], reports: Reports, progress: Progress) -> Control:
+def begin(controls: list[Control], reports: Reports, progress: messages.ForwardingReported) -> Control:
     """A control that is there from now on."""
     control = Control()
     control.forwarded.attach(cast(Channel, control))
