@@ -14,9 +14,10 @@ from appliance.audit.moment import parse_moment
 from appliance.audit.output import rfc3339
 from appliance.channel import admin
 from appliance.channel.answers.recordings import Recording, Recordings
+from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.monitor.input import usage_error
 from appliance.cli.record import bag_of
-from appliance.cli.running import Appliance
+from appliance.cli.running import Appliance, body_or_exit
 
 _SECOND = 1_000_000_000
 
@@ -76,20 +77,27 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span, *, as_json: b
 
     Ends the program with 1 when there is nothing, or when the appliance refuses.
     """
-    found = [row for row in known.recordings if row.began <= span.until and row.ended >= span.since]
-    last = max((row.ended for row in found), default=0)
-    if span.until > max(last, time.time_ns() - int(known.before * _SECOND)):
-        order = admin.RecordingOfMemory(max(span.since, last + 1), span.until)
-        found.append(appliance.ask_or_exit(order, as_json=as_json))
+    found: list[tuple[Span, Recording]] = []
+    for row in sorted(known.recordings, key=lambda row: row.began):
+        since, until = (
+            max(row.began, found[-1][0].until + 1 if found else span.since),
+            min(row.ended, span.until),
+        )
+        if since <= until:
+            found.append((Span(since, until), row))
+    memory = time.time_ns() - int(known.before * _SECOND)
+    missing = [gap for gap in gaps([part for part, _row in found], span) if gap.until > memory]
+    lent = _lent(appliance, Span(missing[0].since, span.until), as_json=as_json) if missing else None
+    if lent is not None:
+        parts = (Span(max(gap.since, lent.began), min(gap.until, lent.ended)) for gap in missing)
+        found += [(part, lent) for part in parts if part.since <= part.until]
     pieces: list[Piece] = []
     with tempfile.TemporaryDirectory(prefix="rosrv-replay-") as folder:
-        for recording in sorted(found, key=lambda row: row.began):
-            since = max(recording.began, span.since, pieces[-1].span.until + 1 if pieces else 0)
-            until = min(recording.ended, span.until)
-            if since <= until:
-                name = recording.id if recording in known.recordings else "memory"
-                bag = bag_of(appliance, recording.id, Path(folder) / recording.id, as_json=as_json)
-                pieces.append(Piece(name, bag, Span(since, until), recording.why_not))
+        bags: dict[str, Path] = {}
+        for part, row in sorted(found, key=lambda one: one[0]):
+            if row.id not in bags:
+                bags[row.id] = bag_of(appliance, row.id, Path(folder) / row.id, as_json=as_json)
+            pieces.append(Piece("memory" if row is lent else row.id, bags[row.id], part, row.why_not))
         if not pieces:
             text = f"nothing is recorded of {span}: {_there(known.recordings)}"
             typer.echo(f"rosrv monitor: {text}; the memory has the last {known.before:g} s", err=True)
@@ -97,15 +105,24 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span, *, as_json: b
         yield pieces
 
 
-def gaps(pieces: Sequence[Piece], span: Span) -> Iterator[Span]:
-    """The times of the span that no piece has. Of all that there is (`span.since` is 0) none is before the first."""
-    at = span.since or pieces[0].span.since
-    for piece in pieces:
-        if piece.span.since > at + 1:
-            yield Span(at, piece.span.since)
-        at = piece.span.until
-    if span.until > at + 1:
+def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
+    """The times of the span that no part has, in their order, as the parts are."""
+    at = span.since
+    for part in parts:
+        if part.since > at:
+            yield Span(at, part.since - 1)
+        at = max(at, part.until + 1)
+    if span.until >= at:
         yield Span(at, span.until)
+
+
+def _lent(appliance: Appliance, span: Span, *, as_json: bool) -> Recording | None:
+    """What is in memory of a time, as a recording; None when nothing is. Ends the program with 1 when it is refused."""
+    try:
+        answer = appliance.ask(admin.RecordingOfMemory(*span))
+    except NotRunningError as error:
+        raise usage_error(str(error)) from None
+    return None if answer.trouble == "unknown" else body_or_exit(answer, as_json=as_json)
 
 
 def _there(recordings: Sequence[Recording]) -> str:

@@ -189,16 +189,18 @@ class _Report:
 
     def cover(self, pieces: Sequence[Piece], span: Span) -> None:
         """Say what of this time the pieces do not have."""
-        for gap in gaps(pieces, span):
+        # Of all that there is none is before the first.
+        began = span.since or pieces[0].span.since
+        for gap in gaps([piece.span for piece in pieces], Span(began, span.until)):
             if self._as_json:
                 say_json({"kind": "gap", "since": gap.since / BILLION, "until": gap.until / BILLION})
             else:
                 say(f"not recorded: {gap}", "yellow")
-        for piece in pieces:
-            if piece.why_not and self._as_json:
-                say_json({"kind": "incomplete", "bag": piece.name, "text": piece.why_not})
-            elif piece.why_not:
-                say(f"{piece.name} is not complete: {piece.why_not}", "yellow")
+        for name, why_not in dict.fromkeys((piece.name, piece.why_not) for piece in pieces if piece.why_not):
+            if self._as_json:
+                say_json({"kind": "incomplete", "bag": name, "text": why_not})
+            else:
+                say(f"{name} is not complete: {why_not}", "yellow")
 
     def of(self, monitors: MonitorSet, reader: Reader, piece: Piece, topics: Sequence[str]) -> int:
         """A recording; how many messages there were."""

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from appliance.channel.admin import A, AdminAnswer, AdminRequest
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble
 from appliance.cli.admin_socket import encoded
 from appliance.cli.rest.orders import carry_out
 from appliance.cli.rest.session import ProblemError, RestClient
@@ -25,7 +25,8 @@ class RestWay:
         try:
             return AdminAnswer(True, carry_out(self.client, request))
         except ProblemError as problem:
-            return AdminAnswer(False, error=problem.lines[0], findings=problem.lines[1:])
+            trouble: Trouble = "unknown" if problem.status == 404 else ""
+            return AdminAnswer(False, error=problem.lines[0], findings=problem.lines[1:], trouble=trouble)
 
     def audit(self) -> "RestLog":
         """Its audit log."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from appliance.channel.admin import AdminAnswer, encode
+from appliance.channel.admin import AdminAnswer, Trouble, encode
 from appliance.channel.answers.recordings import Recording, Recordings
 from tests.support.answers import example
 from tests.unit.cli.monitor.test_verbs import invoke, make_bag, number, records, write
@@ -27,6 +27,8 @@ class Kept:
         self.folder = folder
         self.rows: list[Recording] = []
         self.memory: Recording | None = None
+        self.trouble: Trouble = "failed"
+        self.before = 60.0
         self.asked: list[dict[str, Any]] = []
 
     def keep(self, name: str, began: int, ended: int, *, memory: bool = False, **more: Any) -> Recording:
@@ -48,12 +50,16 @@ class Kept:
         self.asked.append(request)
         if request["verb"] == "recordings":
             body = example(
-                Recordings, recordings=[], topics=["/*"], never=["/secret*", "std_msgs/Char"], before=60.0
+                Recordings,
+                recordings=[],
+                topics=["/*"],
+                never=["/secret*", "std_msgs/Char"],
+                before=self.before,
             )
             return AdminAnswer(True, Recordings(self.rows, body.topics, body.never, body.before))
         if request["verb"] == "recording memory":
             if self.memory is None:
-                return AdminAnswer(False, error="the flight recorder does not run at the moment")
+                return AdminAnswer(False, error="it does not run at the moment", trouble=self.trouble)
             return AdminAnswer(True, self.memory)
         known = [*self.rows, *([self.memory] if self.memory is not None else [])]
         return AdminAnswer(True, next(row for row in known if row.id == request["id"]))
@@ -109,7 +115,7 @@ def test_what_recordings_have_together_is_judged_once_and_gaps_are_said(kept: Ke
     kept.keep("d" * 20, 900, 909)
     found = records(replay(kept, "--since", at(5), "--until", at(70), "--json"))
     gaps = [(one["since"] - BASE, one["until"] - BASE) for one in found if one["kind"] == "gap"]
-    assert gaps == [(29, 50), (59, 70)]
+    assert [(round(since), round(until)) for since, until in gaps] == [(29, 50), (59, 70)]
     drops = [(one["bag"][0], one["time"] - BASE) for one in found if one["kind"] == "drop"]
     assert drops == [("a", 8), ("a", 9), ("a", 18), ("a", 19), ("b", 28), ("b", 29), ("c", 58), ("c", 59)]
     assert [(one["bag"], one["text"][:10]) for one in found if one["kind"] == "incomplete"] == [
@@ -135,10 +141,32 @@ def test_the_memory_follows_the_recordings(kept: Kept) -> None:
     assert [round(one["since"] - BASE) for one in gaps] == [949, 999]  # the memory begins a second later
 
 
+def test_the_memory_has_what_was_before_a_recording(kept: Kept) -> None:
+    """What is in no recording yet is read of it, wherever it lies; what a recording has, of that."""
+    kept.before = 3600.0
+    kept.keep("a" * 20, 20, 29)
+    kept.keep("e" * 20, 10, 49, memory=True)
+    found = records(replay(kept, "--since", at(5), "--until", at(60), "--json"))
+    drops = [(one["bag"][0], one["time"] - BASE) for one in found if one["kind"] == "drop"]
+    assert drops == [("m", 18), ("m", 19), ("a", 28), ("a", 29), ("m", 38), ("m", 39), ("m", 48), ("m", 49)]
+    assert kept.fetched == ["e" * 20, "a" * 20]
+    gaps = [(one["since"] - BASE, one["until"] - BASE) for one in found if one["kind"] == "gap"]
+    assert [(round(since), round(until)) for since, until in gaps] == [(5, 10), (49, 60)]
+
+
+def test_a_time_that_is_not_in_memory_any_more_is_a_gap(kept: Kept) -> None:
+    """The appliance began since: the recordings are judged all the same."""
+    kept.before = 3600.0
+    kept.keep("a" * 20, 20, 29)
+    kept.trouble = "unknown"
+    found = records(replay(kept, "--since", at(5), "--until", at(29), "--json"))
+    assert [one["kind"] for one in found] == ["gap", "drop", "drop"]
+
+
 @pytest.mark.parametrize(
     ("span", "words"),
     [(("--since", "2020-01-01", "--until", "2020-01-02"), "nothing is recorded of 2020-01-01"),
-     (("--since", "1h"), "the flight recorder does not run")],
+     (("--since", "1h"), "it does not run")],
 )  # fmt: skip
 def test_nothing_recorded_and_a_refusal_end_it(kept: Kept, span: tuple[str, ...], words: str) -> None:
     """Exit status 1; what there is instead is said."""
