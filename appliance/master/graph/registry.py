@@ -182,7 +182,6 @@ class Registry:
         self._by_key: dict[str, Incarnation] = {}
         self._known: dict[tuple[str, Address, str], Incarnation] = {}
         self._live: dict[str, Incarnation] = {}
-        self._at: dict[NodeUri, Incarnation] = {}  # live ones, by where they are called
         self._topics: dict[tuple[Kind, str], dict[str, Incarnation]] = {}
         self._types: dict[str, str] = {}  # of topics that somebody has, as ROSMaster has them
         self._subscribed_keys: list[str] = []  # the parameters of `_topics`, sorted
@@ -210,10 +209,6 @@ class Registry:
         incarnation = self._live.get(name)
         there = incarnation is not None and (incarnation.registrations or incarnation.shelf)
         return incarnation if there else None
-
-    def at(self, address: NodeUri) -> Incarnation | None:
-        """The live incarnation that has an address: of several that gave it, the one that registered last."""
-        return self._at.get(address)
 
     def live(self) -> list[Incarnation]:
         """All live incarnations."""
@@ -307,9 +302,6 @@ class Registry:
         if incarnation.life is Life.LIVE:
             if self.occupant(incarnation.name) is None:
                 self._live[incarnation.name] = incarnation
-            other = self._at.get(incarnation.call_uri)
-            if other is None or _last(other) < _last(incarnation):
-                self._at[incarnation.call_uri] = incarnation
             for registration in incarnation.registrations.values():
                 self._index(incarnation, registration)
 
@@ -318,7 +310,7 @@ class Registry:
         kept: list[Durable] = []
         if incarnation.life is Life.SHADOW:  # it was lost while its call was under way
             kept += self.revive(incarnation, incarnation.changed)
-        self._live[incarnation.name] = self._at[incarnation.call_uri] = incarnation
+        self._live[incarnation.name] = incarnation
         registration = incarnation.registrations.get((kind, resource))
         if registration is None or registration.detail != detail:
             self._order += 1
@@ -367,7 +359,7 @@ class Registry:
     def revive(self, incarnation: Incarnation, when: float) -> list[Durable]:
         """A shadow answers again and its name is free: it is live as before."""
         incarnation.life, incarnation.changed = Life.LIVE, when
-        self._live[incarnation.name] = self._at[incarnation.call_uri] = incarnation
+        self._live[incarnation.name] = incarnation
         for registration in incarnation.registrations.values():
             self._index(incarnation, registration)
         return [SaveNode(incarnation)]
@@ -376,7 +368,8 @@ class Registry:
         """Drop an incarnation for good; its ports may go to another."""
         for kind, resource in incarnation.registrations:
             self._unindex(incarnation, kind, resource)
-        self._leave(incarnation)
+        if self._live.get(incarnation.name) is incarnation:
+            del self._live[incarnation.name]
         if self._by_key.pop(incarnation.key, None) is not None:
             self._nodes_of[incarnation.host] -= 1
             self._registrations_of[incarnation.host] -= len(incarnation.registrations)
@@ -388,15 +381,9 @@ class Registry:
     def _retire(self, incarnation: Incarnation, life: Life, when: float) -> list[Durable]:
         incarnation.life, incarnation.changed = life, when
         incarnation.told_lists.clear()
-        self._leave(incarnation)
-        return [SaveNode(incarnation)]
-
-    def _leave(self, incarnation: Incarnation) -> None:
-        """It holds its name and its address no longer."""
         if self._live.get(incarnation.name) is incarnation:
             del self._live[incarnation.name]
-        if self._at.get(incarnation.call_uri) is incarnation:
-            del self._at[incarnation.call_uri]
+        return [SaveNode(incarnation)]
 
     def _index(self, incarnation: Incarnation, registration: Registration) -> None:
         holders = self._topics.setdefault((registration.kind, registration.resource), {})
@@ -422,11 +409,6 @@ class Registry:
                     self._types.pop(resource, None)
                 if kind is Kind.PARAMETER:
                     del self._subscribed_keys[bisect_left(self._subscribed_keys, resource)]
-
-
-def _last(incarnation: Incarnation) -> int:
-    """When it made the last of the registrations that it has."""
-    return max((one.order for one in incarnation.registrations.values()), default=0)
 
 
 def new_key() -> str:

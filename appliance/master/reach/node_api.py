@@ -1,11 +1,11 @@
 """Calls of the appliance to nodes, at their peer address.
 
-A call that is meant for one node never goes to an address that another live one has: when a node is killed, the next
-may get its port, and would be told to shut down in its place, or answer for it. Of two that gave the same address that
-one has it which registered last: a port is one program's.
+When a node is killed, the next may get its port. What is meant for the dead must not end the living: an order to shut
+down for an earlier life of a node is not sent where a live node is called. (Two live nodes may share an address: some
+programs serve several names with one API.)
 """
 
-from appliance.master.graph.registry import Incarnation, Registry
+from appliance.master.graph.registry import Incarnation, Life, Registry
 from appliance.ros.uris import node_uri
 from appliance.ros.xmlrpc import Limits, Value
 from appliance.rpc.client import RefusedError, XmlRpcClient
@@ -24,10 +24,11 @@ class NodeApi:
         return XmlRpcClient(incarnation.call_uri, timeout=self._timeout, limits=self._limits)
 
     async def call(self, incarnation: Incarnation, method: str, *params: Value) -> Value:
-        """Call a node. Raises `CallFailedError`; `RefusedError` also where another node is at its address."""
-        uri = incarnation.call_uri
-        there = self._registry.at(uri)
-        if there is not None and there is not incarnation:
-            where = node_uri(uri.host, uri.port, uri.path)
-            raise RefusedError(f"{where} was not called: {there.name} has that address now")
+        """Call a node. Raises `CallFailedError`; `RefusedError` also for what would shut down another in its place."""
+        if method == "shutdown" and incarnation.life is not Life.LIVE:
+            uri = incarnation.call_uri
+            there = next((one for one in self._registry.live() if one.call_uri == uri), None)
+            if there is not None:
+                where = node_uri(uri.host, uri.port, uri.path)
+                raise RefusedError(f"{where} was not called: {there.name} has that address now")
         return await self.client(incarnation).call(method, *params)

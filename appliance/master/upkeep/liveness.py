@@ -1,8 +1,8 @@
 """Which nodes are still there: looked at every few seconds, and at once when something of a node breaks.
 
-A node whose API refuses connections (twice in a row) or has become another node's, cannot be reached or does not answer
-for `silent` seconds is *lost*: unregistered at ROSMaster as `rosnode cleanup` would, its registrations kept as a
-shadow. A shadow whose API answers again gets them back, because a ROS 1 node never registers twice.
+A node whose API refuses connections (twice in a row), is answered by another process than before, cannot be reached or
+does not answer for `silent` seconds is *lost*: unregistered at ROSMaster as `rosnode cleanup` would, its registrations
+kept as a shadow. A shadow whose API answers again gets them back, because a ROS 1 node never registers twice.
 """
 
 import asyncio
@@ -142,6 +142,9 @@ class Liveness:
         self._settings = settings
         self._nodes = nodes
         self._answered: dict[str, float] = {}
+        self._processes: dict[
+            str, tuple[float, int]
+        ] = {}  # when it had registered last, and the process then
         self._looks: dict[str, asyncio.Task[None]] = {}
         self._turns = Turns(PROBES.bounds, standing)
 
@@ -158,7 +161,9 @@ class Liveness:
             self._answered = {
                 node.key: self._answered[node.key] for node in known if node.key in self._answered
             }
-            self._watchlist.keep_only({node.key for node in known})
+            keys = {node.key for node in known}
+            self._processes = {key: given for key, given in self._processes.items() if key in keys}
+            self._watchlist.keep_only(keys)
             for incarnation in known:
                 self.look_at(incarnation)
 
@@ -189,7 +194,7 @@ class Liveness:
         since = self._answered.setdefault(incarnation.key, now)
         patience = max(0.0, self._settings.silent - (now - since)) + self._settings.interval
         try:
-            await self._nodes.call(incarnation, "getPid", RELAY_NAME)
+            await self._call(incarnation)
         except (RefusedError, UnreachedError):
             presence = Presence.GONE
         except (UnansweredError, BrokenOffError):
@@ -252,7 +257,7 @@ class Liveness:
         """Whether it answers: True, False, or None when it refuses connections; and why."""
         for attempt in (1, 2):
             try:
-                await self._nodes.call(incarnation, "getPid", RELAY_NAME)
+                await self._call(incarnation)
             except RefusedError as error:
                 if attempt == 2:
                     return None, f"{incarnation.name}: {error}"
@@ -262,6 +267,23 @@ class Liveness:
             else:
                 return True, ""
         return False, ""
+
+    async def _call(self, incarnation: Incarnation) -> None:
+        """Call the node. Raises `CallFailedError`; `RefusedError` also where another process has its port.
+
+        Who registers anew at the same address may be another process: the one that answers from then on counts.
+        """
+        answer = await self._nodes.call(incarnation, "getPid", RELAY_NAME)
+        match answer:
+            case [_, _, int(process)]:
+                pass
+            case _:
+                return
+        when, before = self._processes.setdefault(incarnation.key, (incarnation.touched, process))
+        if when != incarnation.touched:
+            self._processes[incarnation.key] = incarnation.touched, process
+        elif process != before:
+            raise RefusedError(f"process {process} answers in the place of {before}")
 
     async def _lose(self, incarnation: Incarnation, why: str) -> None:
         if not incarnation.registrations and not incarnation.shelf:

@@ -1,4 +1,4 @@
-"""A node was killed and another has its port: nothing that is meant for the one reaches the other."""
+"""A node was killed and another has its port: the other is not ended in its place, nor counts as its life."""
 
 from typing import Any, cast
 
@@ -8,24 +8,19 @@ from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation, Kind, Life
 from appliance.master.reach.delivery import Delivery
 from appliance.ros.xmlrpc import Value
-from appliance.rpc.client import RefusedError
 from appliance.shares.pool import Standing
 from tests.support.control_parts import ControlParts
 
 pytestmark = pytest.mark.anyio
-TELLINGS = [
-    NodeCall("publisherUpdate", ("/t", [])),
-    NodeCall("paramUpdate", ("/p/", 1)),
-    NodeCall("shutdown", ("replaced",)),
-]
 
 
 class Street(ControlParts):
-    """Control, with the queues of calls to nodes; who is called at which port: everybody answers."""
+    """Control, with the queues of calls to nodes; who is called at which port: the process that has it answers."""
 
     def surround(self) -> None:
         """As `ControlParts`."""
         self.heard: list[tuple[int, str]] = []
+        self.process = 1
         cast(Any, self.nodes).client = lambda node: _Door(self, node)
         self.delivery = Delivery(
             self.nodes,
@@ -35,13 +30,14 @@ class Street(ControlParts):
         )
         self.deliveries = cast(Any, self.delivery)
 
-    async def moved_in(self) -> tuple[Incarnation, Incarnation]:
-        """/dead was killed, and /heir has its port since; both have registered."""
+    async def two_at_one_address(self) -> tuple[Incarnation, Incarnation]:
+        """Two live nodes with the same port; both have registered."""
         await self.round()
-        dead, heir = self.node("/dead", 1), self.node("/heir", 1)
-        await self.register(dead, Kind.SUBSCRIPTION, "/t")
-        await self.register(heir, Kind.SUBSCRIPTION, "/u")
-        return dead, heir
+        first, second = self.node("/first", 1), self.node("/second", 1)
+        await self.register(first, Kind.SUBSCRIPTION, "/t")
+        await self.look(first)
+        await self.register(second, Kind.SUBSCRIPTION, "/u")
+        return first, second
 
 
 class _Door:
@@ -50,50 +46,58 @@ class _Door:
 
     async def call(self, method: str, *_params: Value) -> Value:
         self._street.heard.append((self._port, method))
-        return [1, "", 1]
-
-
-@pytest.mark.parametrize("telling", TELLINGS, ids=[one.method for one in TELLINGS])
-async def test_who_has_the_port_now_is_told_nothing_of_the_dead(telling: NodeCall) -> None:
-    """Neither a list, nor a parameter, nor to shut down; what is meant for it arrives."""
-    street = Street()
-    dead, heir = await street.moved_in()
-    street.delivery.push(dead, telling)
-    await street.settle()
-    assert street.heard == []
-    street.delivery.push(heir, telling)
-    await street.settle()
-    assert street.heard == [(4001, telling.method)]
+        return [1, "", self._street.process]
 
 
 async def test_the_name_of_the_dead_is_registered_anew() -> None:
     """The order to shut down for the earlier life is not carried out on the node that has its port."""
     street = Street()
-    dead, heir = await street.moved_in()
-    await street.register(street.node("/dead", 2), Kind.SUBSCRIPTION, "/t")
+    dead, heir = await street.two_at_one_address()
+    await street.register(street.node("/first", 2), Kind.SUBSCRIPTION, "/t")
     await street.settle()
     assert dead.life is Life.REPLACED
     assert "shutdown" not in {method for _port, method in street.heard}
     assert heir.life is Life.LIVE
 
 
-async def test_an_answer_from_that_address_is_no_life_of_the_dead() -> None:
-    """The dead is lost at the next look, does not return by the other's answer, and returns when it registers."""
+async def test_the_earlier_life_is_told_to_shut_down() -> None:
+    """Where nobody else has its address."""
     street = Street()
-    dead, heir = await street.moved_in()
-    await street.look(dead)
-    await street.look(dead)
-    assert (dead.life, heir.life, street.heard) == (Life.SHADOW, Life.LIVE, [])
+    await street.round()
+    await street.register(street.node("/first", 1), Kind.SUBSCRIPTION, "/t")
+    await street.register(street.node("/first", 2), Kind.SUBSCRIPTION, "/t")
+    await street.settle()
+    assert (4001, "shutdown") in street.heard
+
+
+async def test_the_answer_of_another_process_is_no_life_of_the_dead() -> None:
+    """The dead is lost at the next look, does not return by the other's answers, and returns when it registers."""
+    street = Street()
+    dead, heir = await street.two_at_one_address()
+    street.process = 2
+    for node in (dead, heir, dead):
+        await street.look(node)
+    assert (dead.life, heir.life) == (Life.SHADOW, Life.LIVE)
+    dead.touched += 1  # as `Arrivals` does at each registering call
     await street.register(dead, Kind.SUBSCRIPTION, "/t")
-    await street.look(heir)
-    assert (dead.life, heir.life) == (Life.LIVE, Life.SHADOW)
+    await street.look(dead)
+    await street.look(dead)
+    assert dead.life is Life.LIVE
 
 
-async def test_the_address_is_free_again_when_its_holder_is_gone() -> None:
-    """A node that shares its address with one that is forgotten is called again."""
+@pytest.mark.parametrize(
+    "telling", [NodeCall("publisherUpdate", ("/t", [])), NodeCall("shutdown", ("by hand",))]
+)
+async def test_programs_that_serve_two_nodes_with_one_api(telling: NodeCall) -> None:
+    """Both live, and both are told what is theirs."""
     street = Street()
-    dead, heir = await street.moved_in()
-    with pytest.raises(RefusedError, match="/heir has that address now"):
-        await street.nodes.call(dead, "getPid", "/rosrv")
-    street.enactor.carry_out(street.graph.forgotten(heir))
-    assert await street.nodes.call(dead, "getPid", "/rosrv") == [1, "", 1]
+    nodes = await street.two_at_one_address()
+    for node in nodes:
+        await street.look(node)
+        await street.look(node)
+    assert [node.life for node in nodes] == [Life.LIVE, Life.LIVE]
+    street.heard.clear()
+    for node in nodes:
+        street.delivery.push(node, telling)
+        await street.settle()
+    assert street.heard == [(4001, telling.method)] * 2
