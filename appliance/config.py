@@ -280,9 +280,9 @@ class RecorderRules(_Section):
         ],
         description="names or types that are never recorded; unless it is given: cameras and microphones",
     )
-    triggers: list[Literal["drop", "change", "verdict", "fault", "denial", "alarm"]] = Field(
-        default=["drop", "verdict", "fault", "alarm"],
-        description="what begins a recording, besides an operator",
+    triggers: list[Literal["drop", "change", "verdict", "fault", "denial", "alarm", "service"]] = Field(
+        default=["drop", "verdict", "fault", "alarm", "service"],
+        description="what begins a recording, besides an operator; service: a node's call, if the policy lets it",
     )
     per_hour: Count = Field(default=6, description="recordings that triggers of one kind may begin")
     disk: Annotated[ByteSize, Field(ge=64 << 20)] = Field(
@@ -510,6 +510,12 @@ class Settings(_Section):
     def api_address(self) -> tuple[str, int] | None:
         """`api` as host and port; None when it is off."""
         return None if self.api == "off" else split_address(self.api)
+
+    @property
+    def own_services(self) -> list[str]:
+        """What the appliance itself offers to nodes: the service that has the flight recorder record."""
+        offered = self.recorder.enabled and "service" in self.recorder.triggers
+        return [f"{self.publish_as}/record_now"] if offered else []
 
 
 def load_resolved(path: Path) -> Settings:

@@ -1,16 +1,18 @@
-"""The flight recorder beside `rosbag record`, on the same traffic: `python -m benchmarks.recorder [--seconds 15]`.
+"""The flight recorder beside `rosbag record` and `rosbag_snapshot`: `python -m benchmarks.recorder [--seconds 15]`.
 
 One node talks on fifty topics (20 MB/s in all) or on five (0.1 MB/s), one listens, on loopback, in turns: at a plain
-master, there with `rosbag record -a` (and `rosbag_snapshot`, if the machine has it), at the appliance without and with
-the recorder. Of what was recorded: messages, and those that are missing between the first and the last of a topic;
-seconds from the end of what is recorded until the whole file is there. Of the machine: processor time of the relay and
-the recorder until then, or of `rosbag record` until it is asked to end, in percent of a core over the seconds that are
-recorded; the median delay from publisher to subscriber.
+master, there with `rosbag record -a`, and with the node `snapshot` of rosbag_snapshot (no package of Debian: the one of
+`--snapshot`, in PATH or below /opt/ros), at the appliance without and with the recorder. Of what was recorded:
+messages, and those that are missing between the first and the last of a topic; seconds from the end of what is
+recorded until the whole file is there. Of the machine: processor time of the relay and the recorder until then, or of
+`rosbag record` until it is asked to end, in percent of a core over the seconds that are recorded; the median delay from
+publisher to subscriber.
 """
 
 import argparse
 import json
 import os
+import shutil
 import signal
 import statistics
 import struct
@@ -36,7 +38,6 @@ from tests.support.waiting import eventually
 LOADS = {"fifty topics, 20 MB/s": (50, 8192, 50), "five topics, 0.1 MB/s": (5, 1024, 20)}
 _SOURCE = Path(__file__).parent / "nodes" / "recorder_load.cpp"
 _PROGRAM = ROOT / "build" / "benchmarks" / "recorder_load"
-_SNAPSHOT = next((place for place in Path("/").glob("opt/ros/*/lib/rosbag_snapshot/snapshot")), None)
 _HEAD = struct.Struct("<4xQ")  # of a std_msgs/String: its length, the number
 _WARM_SECONDS = 3.0
 _CONFIGURATION = """
@@ -110,8 +111,17 @@ def counted(path: Path, closed: float) -> Bag:
     return Bag(sum(map(len, numbers.values())), lost, closed)
 
 
-def at_plain_master(folder: Path, load: tuple[int, int, int], seconds: float, recorder: str) -> Result:
-    """With no recorder, `rosbag`, or `snapshot`."""
+def snapshot_program() -> Path | None:
+    """The node of rosbag_snapshot, where this machine has it."""
+    installed = Path("/").glob("opt/ros/*/lib/rosbag_snapshot/snapshot")
+    found = shutil.which("snapshot")
+    return next(installed, None) if found is None else Path(found)
+
+
+def at_plain_master(
+    folder: Path, load: tuple[int, int, int], seconds: float, recorder: str, snapshot: Path | None
+) -> Result:
+    """With no recorder (""), `rosbag`, or `snapshot`, which is that program."""
     with PlainMaster(folder) as master, RosSession(master.master_uri, folder) as session:
         running = Load(session, *load)
         if not recorder:
@@ -122,7 +132,7 @@ def at_plain_master(folder: Path, load: tuple[int, int, int], seconds: float, re
             command = ["/usr/lib/rosbag/record", "-a", "-O", str(bag)]
         else:
             names = [f"/load/t{number}" for number in range(load[0])]
-            command = [str(_SNAPSHOT), "-d", str(seconds), "-s", "1000", *names]
+            command = [str(snapshot), "-d", str(seconds), "-s", "1000", *names]
         process = session.start(command, label=recorder)
         if recorder == "rosbag":
             eventually(bag.with_suffix(".bag.active").exists, "rosbag records")
@@ -133,7 +143,7 @@ def at_plain_master(folder: Path, load: tuple[int, int, int], seconds: float, re
             process.interrupt(signal.SIGINT)
             process.popen.wait(120)
         else:
-            session.run(str(_SNAPSHOT), "-t", "-O", str(bag), timeout=120)
+            session.run(str(snapshot), "-t", "-O", str(bag), timeout=120)
         closed = time.monotonic() - ended
         return Result(running.end(), counted(bag, closed), cpu)
 
@@ -172,9 +182,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=15, help="that are recorded")
     parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument(
+        "--snapshot", type=Path, default=snapshot_program(), help="the node of rosbag_snapshot"
+    )
     given = parser.parse_args()
+    if given.snapshot is not None and not os.access(given.snapshot, os.X_OK):
+        parser.error(f"{given.snapshot} is no program")
     subprocess.run([str(ROOT / "scripts" / "build-roscpp"), str(_SOURCE), str(_PROGRAM)], check=True)
-    snapshot = ["snapshot"] if _SNAPSHOT is not None else []
+    snapshot = ["snapshot"] if given.snapshot is not None else []
     for title, load in LOADS.items():
         results: dict[str, list[Result]] = {}
         for _round in range(given.rounds):
@@ -185,11 +200,12 @@ def main() -> None:
                     if name in ("appliance", "recorder"):
                         result = at_appliance(folder, load, given.seconds, recorder=name == "recorder")
                     else:
-                        result = at_plain_master(folder, load, given.seconds, name if name != "plain" else "")
+                        recorder = name if name != "plain" else ""
+                        result = at_plain_master(folder, load, given.seconds, recorder, given.snapshot)
                 results.setdefault(name, []).append(result)
         show(title, results)
     if not snapshot:
-        Console().print("rosbag_snapshot is not on this machine: no row for it")
+        Console().print("rosbag_snapshot is not on this machine (--snapshot PROGRAM): no row for it")
     Console().print(f"load average of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 

@@ -17,6 +17,7 @@ from appliance.config import Settings
 from appliance.control.doors import Doors, value_limits
 from appliance.control.lifeline import ControlLifeline
 from appliance.control.policies import Policies
+from appliance.control.recording_orders import RecordingOrders
 from appliance.control.standing import HostStanding
 from appliance.master import rosout
 from appliance.master.calls.call import served
@@ -99,6 +100,11 @@ class Parts:
         self._limits = value_limits(base.settings)
         self._offload = int(base.settings.limits.offload_bytes)
         self.registry, self.trail = base.registry, base.trail
+        self.recordings = RecordingOrders(
+            base.settings.recorder,
+            base.trail,
+            lambda: messages.RevisionsStated(base.policies.revision, self.monitors.revision),
+        )
         self._make_graph()
         self._make_reach()
         self._make_changers()
@@ -160,6 +166,7 @@ class Parts:
             policy=self._policy,
             broken=self._watchlist.look_at,
             own_header=rosout.header(standard_definitions()) if settings.monitors_on_rosout else None,
+            own_call=self.recordings.called,
         )
         self.rosmaster = RosMaster(
             settings.rosmaster_port,
@@ -256,7 +263,9 @@ class Parts:
             name=settings.publish_as,
             inner_port=base.port(INNER),
             wanted=self._published,
+            services=settings.own_services,
             register=self._registration.register_publisher,
+            offer=self._registration.register_service,
         )
         self.monitors = Monitors(
             settings.monitors,

@@ -38,7 +38,6 @@ from appliance.control.looks import Looks
 from appliance.control.monitor_orders import MonitorOrders
 from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.control.policy_orders import PolicyOrders
-from appliance.control.recording_orders import RecordingOrders
 from appliance.control.rest import RestLink
 from appliance.control.robot import own_address, robot_addresses
 from appliance.control.signing import Signing
@@ -227,11 +226,6 @@ class _Control:
             self._tokens.told()
         self._clock = Clock(base.trail, lambda: self._audit.ids.ahead)
         self._forwarded = Forwarded(self._settings.audit.syslog, base.trail)
-        self._recordings = RecordingOrders(
-            self._settings.recorder,
-            base.trail,
-            lambda: messages.RevisionsStated(base.policies.revision, parts.monitors.revision),
-        )
         looks = Looks(
             parts,
             base.policies,
@@ -239,7 +233,7 @@ class _Control:
             self._lifeline.surroundings,
             audit=self._audit_state,
             clock=self._clock.state,
-            recorder=self._recordings.state,
+            recorder=parts.recordings.state,
             queued_deliveries=lambda: parts.delivery.waiting,
             live=parts.revocation.live,
         )
@@ -249,7 +243,7 @@ class _Control:
             MonitorOrders(parts),
             HostOrders(self._hosts, parts.relay.carried_out),
             TokenOrders(self._tokens),
-            self._recordings,
+            parts.recordings,
             EvidenceOrders(self._audit, base.trail),
         )
         self._rest = RestLink(
@@ -368,7 +362,7 @@ class _Control:
             case "syslog":
                 self._forwarded.attach(Channel(sock, messages.ForwardingLink))
             case "recorder":
-                self._recordings.attach(Channel(sock, messages.RecorderLink))
+                self._parts.recordings.attach(Channel(sock, messages.RecorderLink))
             case _:
                 _log.error("a link leads to a process that control does not know", role=role)
                 sock.close()

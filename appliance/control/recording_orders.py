@@ -110,6 +110,31 @@ class RecordingOrders:
         assert isinstance(answer, messages.RecordingBegun)  # noqa: S101  what this order is answered with
         return RecordingBegun(answer.id, answer.ends)
 
+    async def called(self, call: messages.OwnServiceCalled) -> messages.OwnServiceAnswered:
+        """A node that the policy lets calls the service: record; the recording's id, or why there is none."""
+        try:
+            self._require()
+            before, after = self._rules.before, self._rules.after
+            record = self._trail.happened(
+                "recording ordered",
+                f"by a call of {call.service}",
+                severity=Severity.NOTICE,
+                host=call.host,
+                caller_id=call.caller_id,
+                category="call",
+                resource=call.service,
+                who=call.caller_id,
+                before=before,
+                after=after,
+            )
+            text = f"{call.caller_id} of {call.host} called {call.service}"
+            trigger = Trigger(time.time_ns(), "service", record, text[:_LONGEST_NOTE])
+            answer = await self._ask(lambda number: messages.RecordingWanted(number, trigger, before, after))
+        except (RecorderAwayError, UnknownThingError) as error:
+            return messages.OwnServiceAnswered(call.number, False, str(error))
+        assert isinstance(answer, messages.RecordingBegun)  # noqa: S101  what this order is answered with
+        return messages.OwnServiceAnswered(call.number, True, answer.id)
+
     async def fetch(self, request: admin.RecordingFetch, who: str) -> Recording:
         """Say that somebody takes its messages, which he reads where they lie."""
         return await self._given_out(request.id, "recording fetched", f"by {who}", who)

@@ -135,6 +135,8 @@ class Recorder:
             why_not = str(error)
         if self._making is None or why_not:
             self._answers.append(messages.RecordingRefused(wanted.number, why_not))
+            if wanted.trigger.what == "service":  # an operator reads the refusal, of a node's nobody may
+                self._missed(wanted.trigger, why_not)
         else:
             progress = self._making.progress
             self._answers.append(messages.RecordingBegun(wanted.number, progress.id, progress.ends))
@@ -200,10 +202,15 @@ class Recorder:
         if any(kept.began <= trigger.time <= kept.ended for kept in self._shelf.recordings):
             return
         why_not = self._record(trigger, self._rules.before, self._rules.after)
+        if why_not:
+            self._missed(trigger, why_not)
+
+    def _missed(self, trigger: Trigger, why: str) -> None:
+        """Have it recorded that such a trigger began no recording, which is said again after a while."""
         now = self._clock()
-        if why_not and self._told.get(trigger.what, -_TELL_AGAIN) + _TELL_AGAIN <= now:
+        if self._told.get(trigger.what, -_TELL_AGAIN) + _TELL_AGAIN <= now:
             self._told[trigger.what] = now
-            self._answers.append(messages.RecordingMissed(trigger, why_not))
+            self._answers.append(messages.RecordingMissed(trigger, why))
 
     def _record(self, trigger: Trigger, before: float, after: float) -> str:
         """Have a recording with this trigger in it; why there is none, or empty. Raises `OSError`."""

@@ -25,6 +25,7 @@ from appliance.relay.connections.frames import Scratch
 from appliance.relay.connections.headers import kept
 from appliance.relay.connections.links import Link
 from appliance.relay.connections.memory import Memory
+from appliance.relay.connections.own_service import OwnService
 from appliance.relay.connections.ports import Ports
 from appliance.relay.connections.sockets import tune
 from appliance.relay.connections.subscriber import Subscriber
@@ -72,6 +73,7 @@ class Engine:
         self.topics: dict[tuple[str, str], tuple[RelayedTopic, Publisher | OwnPublisher]] = {}
         self._own: dict[str, OwnPublisher] = {}
         self._own_headers: dict[str, dict[str, str]] = {}
+        self._own_service = OwnService(loop, self._reporter.send)
         self.clients: set[ServiceClient] = set()
         self._services: dict[tuple[str, str], ServiceTraffic] = {}
         self.visitors: set[Visitor] = set()
@@ -90,6 +92,7 @@ class Engine:
         self._link = link
         self._reporter.attach(link)
         self._looks.end_all()
+        self._own_service.control_gone()
 
     def record(self, recorded: Recorded) -> None:
         """Leave what publishers say from their next connection on with the flight recorder."""
@@ -119,10 +122,10 @@ class Engine:
             self._ask_for_latched(self.middle.resume(message.name))
         elif isinstance(message, messages.LookWanted | messages.LookEnded):
             self._look(message)
-        elif isinstance(message, messages.OwnHeaderStated):
-            self._state_header(message)
-        elif isinstance(message, messages.OwnPublished):
-            self._publish(message.topic, message.data)
+        elif isinstance(message, messages.OwnHeaderStated | messages.OwnPublished):
+            self._own_topic(message)
+        elif isinstance(message, messages.OwnServiceAnswered):
+            self._own_service.answered(message)
         elif isinstance(message, messages.OrdersAsked):
             self._reporter.send(messages.OrdersCarriedOut())
         else:
@@ -296,7 +299,10 @@ class Engine:
             if concerned and relayed.lacks_latched and isinstance(publisher, Publisher):
                 publisher.give_again()
 
-    def _state_header(self, message: messages.OwnHeaderStated) -> None:
+    def _own_topic(self, message: messages.OwnHeaderStated | messages.OwnPublished) -> None:
+        if isinstance(message, messages.OwnPublished):
+            self._publish(message.topic, message.data)
+            return
         self._own_headers[message.topic] = {
             "type": message.type,
             "md5sum": message.md5sum,
@@ -436,6 +442,7 @@ class Engine:
         caller_id = bound_name(self._table, visitor.key, visitor.host, fields)
         if service is None or caller_id is None:  # `missing` has looked
             return
+        node = self._table.node(visitor.key)
         traffic = self._services.setdefault((service.key, service.service), ServiceTraffic())
 
         def refuse(sock: socket.socket, reason: str) -> None:
@@ -456,6 +463,7 @@ class Engine:
             traffic=traffic,
             refuse=refuse,
             ended=ended,
+            own=self._own_service if node is not None and node.monitors else None,
         )
         self.clients.add(client)
         client.start(rest)
@@ -509,6 +517,7 @@ class Engine:
                 publisher.look()
         for client in list(self.clients):
             client.look()
+        self._own_service.tidy()
         self.middle.tick()
         self._reporter.tick(self._rows, self.memory.held())
         self._loop.after(self._limits.report_every, self._tick)

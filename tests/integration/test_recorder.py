@@ -15,7 +15,7 @@ import pytest
 
 from appliance.api.contract import EXAMPLES
 from appliance.recorder.mcap import as_mcap
-from tests.support.appliance import ROSRV, Appliance
+from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
 from tests.support.waiting import eventually
@@ -34,7 +34,7 @@ recorder:
   before: 30
   after: 2
   disk: 512MiB
-  triggers: [drop]
+  triggers: [drop, service]
   never: [/secret/*]
 audit: {reserve_bytes: 1MiB}
 """
@@ -206,6 +206,43 @@ def test_a_killed_recorder_goes_on(appliance: Appliance, ros: RosSession, tmp_pa
     chatter = said(ros, fetched(appliance, row["id"], tmp_path), "/chatter")
     assert set(heard) <= set(chatter)
     assert len(chatter) == len(set(chatter))
+
+
+def test_nodes_call_for_a_recording_if_the_policy_lets_them(appliance: Appliance, ros: RosSession) -> None:
+    """A roscpp and a rospy node, and the stock tool; who may not is told so, and nobody takes the service's place."""
+    service = "/rosrv/record_now"
+    ros.talker("roscpp", "/chatter", name="voice")
+    assert ros.run("rosservice", "type", service).stdout == "std_srvs/Trigger\n"
+    assert "/rosrv" in ros.run("rosservice", "node", service).stdout
+    answers = []
+    for client in ("roscpp", "rospy"):
+        node = ros.service_client(client, service, "--trigger", name=f"{client}_arm")
+        node.send("now")
+        answers.append(node.wait_for(event="answered"))
+    assert [answer["success"] for answer in answers] == [True, True]
+    called = ros.run("rosservice", "call", service).stdout
+    made = {answer["message"] for answer in answers}
+    made.add(called.removeprefix('success: True\nmessage: "').rstrip('"\n'))
+    row, *later = recordings(appliance, len(made))
+    assert {one["id"] for one in (row, *later)} == made
+    assert row["triggers"][0]["what"] == "service"
+    assert row["triggers"][0]["text"] == f"/roscpp_arm of 127.0.0.1 called {service}"
+    ordered = appliance.recorded(event="recording ordered")[-1]
+    assert (ordered["caller_id"], ordered["host"], ordered["resource"]) == (
+        "/roscpp_arm",
+        "127.0.0.1",
+        service,
+    )
+    assert ordered["id"] == row["triggers"][0]["record"]
+    ros.service_server("rospy", service, name="namesake")
+    [denied] = appliance.recorded(event="decision", decision="deny", caller_id="/namesake")
+    assert denied["reason"] == f"the service {service} belongs to the appliance"
+    appliance.reload(OPEN_POLICY + f"[Clients]\n{service} = 10.9.9.9\ndefault = *\n")
+    stranger = ros.service_client("rospy", service, "--trigger", name="stranger")
+    stranger.send("now")
+    assert "10.9.9.9" not in stranger.wait_for(event="failed")["reason"]
+    [denied] = appliance.recorded(event="decision", decision="deny", caller_id="/stranger")
+    assert (denied["category"], denied["resource"]) == ("call", service)
 
 
 def test_over_rest_messages_are_for_investigators(

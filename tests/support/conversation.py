@@ -150,6 +150,7 @@ class Conversation:
             policy=lambda: parts.current,
             broken=lambda _node: None,
             own_header=None,
+            own_call=cast(Any, None),
         )
         relay.attach(0, cast(Any, link), cast(Any, _Monitors()))
         parts.enactor.carry_out(parts.graph.tell_everybody(lambda _topic: True))

@@ -321,7 +321,7 @@ class Control(ControlParts):
             Any,
             RelayControl(
                 self.registry, self.grants, cast(Any, _Ports()), self.nodes, idle(Carried), allocation=Allocation(1),
-                policy=lambda: self.current, broken=self.watchlist.look_at, own_header=None,
+                policy=lambda: self.current, broken=self.watchlist.look_at, own_header=None, own_call=cast(Any, None),
             ),
         )  # fmt: skip
         cast(Any, self.relay.carried).used = world.used

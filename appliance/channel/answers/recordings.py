@@ -6,7 +6,7 @@ import msgspec
 
 from appliance.channel.answers.field_docs import NanoMoment, told
 
-TriggerKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "order"]
+TriggerKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "service", "order"]
 EventKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "notice"]
 
 

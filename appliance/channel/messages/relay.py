@@ -342,6 +342,23 @@ class OwnPublished(Message):
     data: bytes
 
 
+class OwnServiceCalled(Message):
+    """A client called the service that the appliance itself offers; it waits for `OwnServiceAnswered`."""
+
+    number: int
+    service: str
+    host: str
+    caller_id: str
+
+
+class OwnServiceAnswered(Message):
+    """What came of a call of the appliance's own service, in words."""
+
+    number: int
+    success: bool
+    text: str
+
+
 class PublicationRefused(Message):
     """A publisher (or service) is not carried: its definition is another than the specifications'."""
 
@@ -476,5 +493,5 @@ RelayLink = (
     | MessagesLimited | ConnectionClosed | ConnectionRefused | TrafficReported | SpecificationsStated
     | MonitorSwitched | MonitorResumed | OwnHeaderStated | OwnPublished | SpecificationsTaken
     | SpecificationsRefused | PublicationRefused | MonitorsReported | MonitorsCounted | LookWanted | LookEnded
-    | MessageSeen | OrdersAsked | OrdersCarriedOut
+    | MessageSeen | OrdersAsked | OrdersCarriedOut | OwnServiceCalled | OwnServiceAnswered
 )  # fmt: skip

@@ -67,7 +67,11 @@ class Gate:
         if attempt.api is not None:
             denial = self._late(caller, attempt.api)
             if denial is None and call.verb is not Verb.UNREGISTER:
-                denial = _unreachable(caller, attempt.api) or self._over_limit(caller, attempt.api)
+                denial = (
+                    self._taken(attempt)
+                    or _unreachable(caller, attempt.api)
+                    or self._over_limit(caller, attempt.api)
+                )
         return denial or self._bound(attempt, decision)
 
     # --- the binding of claims ---
@@ -95,6 +99,14 @@ class Gate:
             return Contest(holder, decision)
         held, other = f"{caller.caller_id} is held by", f"{caller.peer.host} cannot speak for it"
         return _no(f"{held} {holder.host}; {other}", told=f"{held} a node of another host; {other}")
+
+    def _taken(self, attempt: Attempt) -> Decision | None:
+        """A service has one provider, the last who registers it; what the appliance offers nobody takes from it."""
+        if attempt.call.kind is Kind.SERVICE:
+            for provider in self._registry.registered(Kind.SERVICE, attempt.resource):
+                if provider.of_monitors:
+                    return _no(f"the service {attempt.resource} belongs to the appliance")
+        return None
 
     def is_own_subscriber(self, caller: Caller, topic: str) -> bool:
         """Whether a node of the appliance calls another node, at its outer face, for a topic that it subscribed to.

@@ -8,7 +8,7 @@ stated to the relay that carries it (`allocation`), a node to every relay that c
 import asyncio
 import ipaddress
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -109,7 +109,8 @@ _WORDS = {kind: word for word, kind in _KINDS.items()}
 class RelayControl:
     """What control knows and wants of the relays.
 
-    `broken(incarnation)` hears of lost upstreams, `own_header` is of what control publishes itself.
+    `broken(incarnation)` hears of lost upstreams, `own_header` is of what control publishes itself, `own_call`
+    answers calls of the service that the appliance itself offers.
     """
 
     def __init__(
@@ -124,6 +125,7 @@ class RelayControl:
         policy: Callable[[], Policy],
         broken: Callable[[Incarnation], None],
         own_header: messages.OwnHeaderStated | None,
+        own_call: Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]],
     ) -> None:
         self._registry = registry
         self._grants = grants
@@ -136,6 +138,7 @@ class RelayControl:
         self._posts = tuple(RelayPost(index) for index in range(allocation.relays))
         self._asking: set[asyncio.Task[None]] = set()
         self._own_header = own_header
+        self._own_call = own_call
         self._looks = TopicLooks()
 
     @property
@@ -336,9 +339,8 @@ class RelayControl:
 
     def _received(self, post: RelayPost, message: messages.Message, monitors: Monitors) -> None:
         match message:
-            case messages.UpstreamWanted():
-                work = self._find_upstream(post, message.key, message.topic)
-                task = asyncio.get_running_loop().create_task(work)
+            case messages.UpstreamWanted() | messages.OwnServiceCalled():
+                task = asyncio.get_running_loop().create_task(self._answer(post, message))
                 self._asking.add(task)
                 task.add_done_callback(self._asking.discard)
             case messages.UpstreamLost():
@@ -366,6 +368,14 @@ class RelayControl:
                 self.carried.publication_refused(message)
             case _:
                 monitors.received(message, post.index)
+
+    async def _answer(
+        self, post: RelayPost, asked: messages.UpstreamWanted | messages.OwnServiceCalled
+    ) -> None:
+        if isinstance(asked, messages.OwnServiceCalled):
+            post.send(await self._own_call(asked))
+        else:
+            await self._find_upstream(post, asked.key, asked.topic)
 
     def _held_back(self, message: messages.LatchRefused | messages.MessagesLimited) -> None:
         """Messages were not kept or not passed on."""

@@ -1,4 +1,4 @@
-"""What monitors publish, as a node of the graph: the appliance registers as that topic's publisher.
+"""What monitors publish and the service that the appliance offers, as a node of the graph: it registers as any does.
 
 Its node API is the listener of the inner faces, under a path of its own (`PUBLISHER_PATH`): there is nothing to tell
 it, so every call of a master is acknowledged there. The relay serves its messages (`NodePlaced.monitors`).
@@ -7,7 +7,7 @@ it, so every call of a master is acknowledged there. The relay serves its messag
 import asyncio
 import ipaddress
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection
 
 import structlog
 
@@ -17,7 +17,7 @@ from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, R
 from appliance.master.reach.places import NoPortError
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import Entries
-from appliance.ros.uris import node_uri, parse_node_uri
+from appliance.ros.uris import node_uri, parse_node_uri, parse_service_uri, service_uri
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import Peer
 
@@ -27,9 +27,10 @@ _AGAIN_SECONDS = 1.0
 
 
 class OwnPublisher:
-    """Registers what `wanted()` says (topic to type), and nothing else, under `name`.
+    """Registers what `wanted()` says (topic to type) and `services`, and nothing else, under `name`.
 
-    `register(caller, topic, type, api)` is `registerPublisher`.
+    `register(caller, topic, type, api)` is `registerPublisher`, `offer(caller, service, service_api, api)`
+    `registerService`.
     """
 
     def __init__(
@@ -42,16 +43,24 @@ class OwnPublisher:
         name: str,
         inner_port: int,
         wanted: Callable[[], dict[str, str]],
+        services: Collection[str],
         register: Callable[[Caller, str, str, ApiUri], Awaitable[Answer]],
+        offer: Callable[[Caller, str, ApiUri, ApiUri], Awaitable[Answer]],
     ) -> None:
         self._registry = registry
         self._graph = graph
         self._enactor = enactor
         self._entries = entries
         self._register = register
+        self._offer = offer
         self._name = name
-        self._uri = node_uri(_LOOPBACK, inner_port, PUBLISHER_PATH)
+        uri = node_uri(_LOOPBACK, inner_port, PUBLISHER_PATH)
+        self._api = ApiUri(uri, parse_node_uri(uri))
+        # The relay answers calls itself: of the URI the port counts, and only for being one.
+        uri = service_uri(_LOOPBACK, inner_port)
+        self._service_api = ApiUri(uri, parse_service_uri(uri))
         self._wanted = wanted
+        self._services = services
         self._woken = asyncio.Event()
         self._woken.set()
 
@@ -73,20 +82,25 @@ class OwnPublisher:
                 self._woken.set()
 
     async def _settle(self) -> None:
-        wanted = self._wanted()
+        published = self._wanted()
+        wanted = {Kind.PUBLICATION: published.keys(), Kind.SERVICE: self._services}
         for incarnation in self._mine():
-            for topic in incarnation.resources(Kind.PUBLICATION):
-                if incarnation.api_text != self._uri or topic not in wanted:
-                    await self._entries.end(incarnation, Kind.PUBLICATION, topic)
-                    gone = self._graph.unregistered(incarnation, Kind.PUBLICATION, topic)
-                    self._enactor.carry_out(gone)
-        for topic, type_name in wanted.items():
-            peer = Peer(ipaddress.ip_address(_LOOPBACK), _LOOPBACK, _LOOPBACK)
-            caller = Caller(peer, self._name, time.monotonic_ns(), own=True)
-            api = ApiUri(self._uri, parse_node_uri(self._uri))
-            answer = await self._register(caller, topic, type_name, api)
+            for kind, resource in list(incarnation.registrations):
+                if incarnation.api_text != self._api.text or resource not in wanted.get(kind, ()):
+                    await self._entries.end(incarnation, kind, resource)
+                    self._enactor.carry_out(self._graph.unregistered(incarnation, kind, resource))
+        for topic, type_name in published.items():
+            answer = await self._register(self._caller(), topic, type_name, self._api)
             if answer[0] != 1:
                 raise CallFailedError(f"{self._name} cannot publish {topic}: {answer[1]!s}")
+        for service in self._services:
+            answer = await self._offer(self._caller(), service, self._service_api, self._api)
+            if answer[0] != 1:
+                raise CallFailedError(f"{self._name} cannot offer {service}: {answer[1]!s}")
+
+    def _caller(self) -> Caller:
+        peer = Peer(ipaddress.ip_address(_LOOPBACK), _LOOPBACK, _LOOPBACK)
+        return Caller(peer, self._name, time.monotonic_ns(), own=True)
 
     def _mine(self) -> list[Incarnation]:
         return [incarnation for incarnation in self._registry.live() if incarnation.of_monitors]

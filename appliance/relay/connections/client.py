@@ -18,6 +18,7 @@ from appliance.relay.connections.exchange import ServiceExchange
 from appliance.relay.connections.frames import SMALL
 from appliance.relay.connections.headers import size_of, switched_on, to_client, to_service
 from appliance.relay.connections.memory import Stall, Weight
+from appliance.relay.connections.own_service import OwnServer, OwnService
 from appliance.relay.connections.sockets import Stream, begin_connect
 from appliance.relay.context import RelayContext
 from appliance.relay.grants import Service
@@ -61,7 +62,7 @@ class ServiceTraffic:
 
 
 class ServiceClient:
-    """One client of one service; `caller_id` is the name it is bound to.
+    """One client of one service; `caller_id` is the name it is bound to. `own`: the appliance itself offers it.
 
     Either `ended()` is called once, when both connections are closed, or `refuse(sock, reason)`, which takes
     the client's socket over.
@@ -79,6 +80,7 @@ class ServiceClient:
         traffic: ServiceTraffic,
         refuse: Callable[[socket.socket, str], None],
         ended: Callable[[], None],
+        own: OwnService | None = None,
     ) -> None:
         self.service = service
         self.host = host
@@ -88,6 +90,7 @@ class ServiceClient:
         self._traffic = traffic
         self._refuse = refuse
         self._ended = ended
+        self._own = own
         self._number = 0
         self._live = True
         memory = context.memory
@@ -97,7 +100,7 @@ class ServiceClient:
             Weight(memory.queues.of(host)),
         )
         self._stall = Stall(context.limits.stall_seconds)
-        self._server: Stream | None = None
+        self._server: Stream | OwnServer | None = None
         self._timer: Timer | None = None
         self._parser = HeaderParser(context.limits.header_bytes)
         self._greeted = False
@@ -117,18 +120,25 @@ class ServiceClient:
         """Connect to the service; `rest` is what the client has sent after its header."""
         try:
             self._exchange.from_client(rest)
-            sock = begin_connect(self.service.host, self.service.port)
+            self._server = self._reach()
         except (OSError, OverflowError) as error:
             self._turn_away(f"cannot connect to the service: {_why(error)}")
             return
         except PeerError as error:
             self._turn_away(str(error))
             return
-        self._server = Stream(
-            self._context.loop, sock, self._server_received, self._server_broken, opened=self._connected
-        )
         self._patience(self._context.limits.connect_seconds)
         self._weigh()
+
+    def _reach(self) -> Stream | OwnServer:
+        """What leads to the service. Raises `OSError` and `OverflowError`."""
+        loop, service = self._context.loop, self.service
+        if self._own is not None:
+            called = service.service, self.host, self.caller_id
+            received, opened = self._server_received, self._connected
+            return OwnServer(self._own, loop, called=called, received=received, opened=opened)
+        sock = begin_connect(service.host, service.port)
+        return Stream(loop, sock, self._server_received, self._server_broken, opened=self._connected)
 
     def judge_again(self) -> None:
         """Other specifications are in force: a service that does not fit them is carried no longer."""

@@ -1,6 +1,6 @@
-"""A rospy client of std_srvs/SetBool: service_client.py SERVICE [--persistent].
+"""A rospy client of std_srvs/SetBool: service_client.py SERVICE [--persistent] [--trigger].
 
-Each line `true` or `false` on standard input is one call.
+Each line `true` or `false` on standard input is one call; with --trigger of a std_srvs/Trigger, whatever it says.
 """
 
 import argparse
@@ -8,7 +8,7 @@ import sys
 
 import rospy
 from report import report
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 
 def main():
@@ -16,13 +16,15 @@ def main():
     arguments = argparse.ArgumentParser()
     arguments.add_argument("service")
     arguments.add_argument("--persistent", action="store_true")
+    arguments.add_argument("--trigger", action="store_true")
     options = arguments.parse_args(rospy.myargv()[1:])
     rospy.init_node("service_client")
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
-    call = rospy.ServiceProxy(options.service, SetBool, persistent=options.persistent)
+    kind = Trigger if options.trigger else SetBool
+    call = rospy.ServiceProxy(options.service, kind, persistent=options.persistent)
     for line in sys.stdin:
         try:
-            answer = call(line.strip() == "true")
+            answer = call() if options.trigger else call(line.strip() == "true")
             report("answered", success=answer.success, message=answer.message)
         except (rospy.ServiceException, rospy.ROSException) as error:
             report("failed", reason=str(error))

@@ -93,6 +93,37 @@ def test_a_recorder_that_is_off_or_away_is_said() -> None:
     played(story)
 
 
+def test_a_call_of_the_service_is_an_order_with_a_name_and_a_host() -> None:
+    """The node gets the recording's id; of a refusal, or of a recorder that is away, the reason."""
+    heard: list[Any] = []
+    call = messages.OwnServiceCalled(7, "/rosrv/record_now", "10.0.0.5", "/arm")
+
+    def answer(message: Any) -> list[messages.Message]:
+        heard.append(message)
+        if len(heard) == 1:
+            return [messages.RecordingBegun(message.number, KEPT.id, 5)]
+        return [messages.RecordingRefused(message.number, "this hour has its 6")]
+
+    async def story() -> None:
+        scene = Scene()
+        away = await scene.orders.called(call)
+        assert (away.success, away.text) == (False, "the flight recorder does not run at the moment")
+        assert scene.trail.events == []
+        recorder = scene.attach(answer)
+        assert await scene.orders.called(call) == messages.OwnServiceAnswered(7, True, KEPT.id)
+        assert await scene.orders.called(call) == messages.OwnServiceAnswered(7, False, "this hour has its 6")
+        [(event, detail), _again] = scene.trail.events
+        assert event == "recording ordered"
+        assert (detail["host"], detail["caller_id"], detail["resource"]) == ("10.0.0.5", "/arm", call.service)
+        wanted = heard[0]
+        assert (wanted.trigger.what, wanted.trigger.record) == ("service", "record")
+        assert wanted.trigger.text == "/arm of 10.0.0.5 called /rosrv/record_now"
+        assert (wanted.before, wanted.after) == (60, 10)
+        recorder.close()
+
+    played(story)
+
+
 def test_what_is_closed_is_recorded_noted_and_listed() -> None:
     """And what is removed, by whomever, goes; a look at one that is not there is refused."""
     heard: list[Any] = []

@@ -206,6 +206,23 @@ def test_a_flood_of_triggers_fills_no_disk(tmp_path: Path) -> None:
     scene.log.close()
 
 
+def test_a_flood_of_calls_of_the_service_fills_no_disk(tmp_path: Path) -> None:
+    """Nodes have their hour as triggers have: each call is answered; control is told once that there are no more."""
+    scene = Scene(tmp_path, per_hour=2)
+    told: list[messages.Message] = []
+    for number in range(6):
+        call = messages.RecordingWanted(number, Trigger(scene.clock.now, "service", "id", "/arm"), 5, 2)
+        told += scene.later(0, call) + scene.later(3)
+    begun = [answer.number for answer in told if isinstance(answer, messages.RecordingBegun)]
+    refused = [answer for answer in told if isinstance(answer, messages.RecordingRefused)]
+    assert (begun, [answer.number for answer in refused]) == ([0, 1], [2, 3, 4, 5])
+    [missed] = [answer for answer in told if isinstance(answer, messages.RecordingMissed)]
+    assert missed.reason == refused[0].reason
+    assert "recorder.per_hour" in missed.reason
+    assert len(scene.closed(told)) == 2
+    scene.log.close()
+
+
 def test_a_recording_has_an_eighth_of_the_disk(tmp_path: Path) -> None:
     """What is beyond is counted, and the recording says why it ended."""
     scene = Scene(tmp_path, disk=8 * 100_000)

@@ -10,12 +10,12 @@ from appliance.master.calls.call import Attempt
 from appliance.master.calls.gate import Contest, Gate, HostLimits, contested
 from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
-from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, Registry
 from appliance.master.upkeep.liveness import Presence, Probe
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.parameter_tree import Tree
-from appliance.ros.uris import parse_node_uri
+from appliance.ros.uris import parse_node_uri, parse_service_uri
 from appliance.rpc.server import Peer
 
 ADMIN, OPERATOR = "10.0.0.9", "10.0.0.5"
@@ -161,6 +161,33 @@ def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
         itself = here.decide(Attempt(Caller(loopback, "/rosout", 0, own=True), call, given), {})
         assert isinstance(itself, Decision)
         assert itself.allowed is does
+
+
+@pytest.mark.parametrize(("path", "allowed"), [(PUBLISHER_PATH, False), ("/", True)])
+def test_nobody_takes_a_service_from_the_appliance(path: str, allowed: bool) -> None:
+    """The last who registers a service has it, as in plain ROS, but of what the appliance offers."""
+    policy = compile_policy("[Nodes]\ndefault = *\n", file="test.ini")
+    registry = Registry()
+    uri, robot = f"http://127.0.0.1:4000{path}", ipaddress.ip_address("10.0.0.5")
+    home = ipaddress.ip_address("127.0.0.1")
+    node = Incarnation(
+        "key", "/rosrv", home, parse_node_uri(uri), uri, str(home), 19001, 19002, own=path != "/"
+    )
+    registry.add(node)
+    registry.register(node, Kind.SERVICE, "/rosrv/record_now", "4000")
+    caller = Caller(Peer(robot, str(robot), "10.0.0.1"), "/namesake", 0)
+    api = ApiUri("http://10.0.0.5:5/", parse_node_uri("http://10.0.0.5:5/"))
+    given = (
+        "/rosrv/record_now",
+        ApiUri("rosrpc://10.0.0.5:6", parse_service_uri("rosrpc://10.0.0.5:6")),
+        api,
+    )
+    attempt = Attempt(caller, MASTER_CALLS["registerService"], given)
+    decision = Gate(lambda: policy, registry, HostLimits()).decide(attempt, {})
+    assert isinstance(decision, Decision)
+    assert decision.allowed is allowed
+    if not allowed:
+        assert decision.reason == "the service /rosrv/record_now belongs to the appliance"
 
 
 def test_the_appliances_nodes_may_ask_others_for_a_topic() -> None:

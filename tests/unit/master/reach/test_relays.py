@@ -116,6 +116,7 @@ class World:
             policy=lambda: self.policy,
             broken=lambda _incarnation: None,
             own_header=None,
+            own_call=cast(Any, None),
         )
         self.graph = Graph(
             self.registry, self.grants, cast(Any, _UNUSED), may_be_told=lambda _node, _key, _value: True

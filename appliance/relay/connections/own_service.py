@@ -1,0 +1,138 @@
+"""The service that the appliance itself offers (`std_srvs/Trigger`): control answers it, by way of the relay.
+
+To a client's connection it is a service like any other: it stands where the stream to a node would (`OwnServer`), so
+grants, headers, monitors and bounds are the same.
+
+Invariants:
+- Of one host one call is with control at a time, and a second lies between two. What it calls meanwhile is answered as
+  that one is, so that no host can occupy control with calls.
+- A call is answered: when control ends before it has, in words that say so.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from appliance.channel.messages import Message, OwnServiceAnswered, OwnServiceCalled
+from appliance.relay.loop import Loop
+from appliance.ros.tcpros import HeaderParser, encode_header, encode_service_reply
+
+HEADER: Final = {
+    "type": "std_srvs/Trigger",
+    "md5sum": "937c9679a518e3a18d831e57125ea522",
+    "request_type": "std_srvs/TriggerRequest",
+    "response_type": "std_srvs/TriggerResponse",
+}
+_AWAY = "the appliance's control is away: nothing came of this call"
+_SECOND = 1.0
+
+
+@dataclass(slots=True)
+class _Call:
+    """The last call of a host: who waits for its answer, or what that was and until when it holds."""
+
+    number: int
+    waiting: list["OwnServer"] = field(default_factory=list)
+    reply: bytes = b""
+    until: float = 0.0
+
+
+class OwnService:
+    """Who calls it, and what control answers. `send` tells control, if there is one."""
+
+    def __init__(self, loop: Loop, send: Callable[[Message], None]) -> None:
+        self._loop = loop
+        self._send = send
+        self._calls: dict[str, _Call] = {}
+        self._number = 0
+
+    def call(self, service: str, host: str, caller_id: str, server: "OwnServer") -> None:
+        """A request has come in."""
+        last = self._calls.get(host)
+        if last is not None and not last.until:
+            last.waiting.append(server)
+        elif last is not None and self._loop.clock() < last.until:
+            server.answered(last.reply)
+        else:
+            self._number += 1
+            self._calls[host] = _Call(self._number, [server])
+            self._send(OwnServiceCalled(self._number, service, host, caller_id))
+
+    def forget(self, host: str, server: "OwnServer") -> None:
+        """A client has gone."""
+        last = self._calls.get(host)
+        if last is not None and server in last.waiting:
+            last.waiting.remove(server)
+
+    def answered(self, answer: OwnServiceAnswered) -> None:
+        """Control has answered."""
+        for call in [call for call in self._calls.values() if call.number == answer.number]:
+            self._settle(call, answer.success, answer.text)
+
+    def control_gone(self) -> None:
+        """There is no control that could answer what was asked."""
+        for call in list(self._calls.values()):
+            if not call.until:
+                self._settle(call, False, _AWAY)
+
+    def tidy(self) -> None:
+        """A second is over."""
+        now = self._loop.clock()
+        self._calls = {host: call for host, call in self._calls.items() if not call.until or now < call.until}
+
+    def _settle(self, call: _Call, success: bool, text: str) -> None:
+        data = text.encode()
+        call.reply = encode_service_reply(bytes([success]) + len(data).to_bytes(4, "little") + data)
+        call.until = self._loop.clock() + _SECOND
+        waiting, call.waiting = call.waiting, []
+        for server in waiting:
+            server.answered(call.reply)
+
+
+class OwnServer:
+    """One client's connection to it, in the place of a `Stream`: `received` gets what a service would send.
+
+    `opened()` is called at once when the loop turns; then the client's header is to be sent, and requests in turns.
+    """
+
+    backlog = 0
+
+    def __init__(
+        self,
+        own: OwnService,
+        loop: Loop,
+        *,
+        called: tuple[str, str, str],
+        received: Callable[[bytes], None],
+        opened: Callable[[], None],
+    ) -> None:
+        """`called` are the service, the client's host and its name."""
+        self._own = own
+        self._loop = loop
+        self._called = called
+        self._received = received
+        self._greeted = False
+        self._timer = loop.after(0, opened)
+
+    def send(self, data: bytes) -> None:
+        """The client's header, which the grant has vouched for; then requests, which have nothing in them."""
+        if self._greeted:
+            self._own.call(*self._called, self)
+            return
+        self._greeted = True
+        fields = HeaderParser().feed(data) or {}
+        md5sum = fields.get("md5sum", "")
+        if md5sum in {"*", HEADER["md5sum"]}:
+            self.answered(encode_header(HEADER))
+        else:
+            reason = f"{self._called[0]} is a {HEADER['type']} with md5sum {HEADER['md5sum']}, not {md5sum}"
+            self.answered(encode_header({"error": reason}))
+
+    def answered(self, reply: bytes) -> None:
+        """Give it to the client when the loop turns."""
+        self._timer = self._loop.after(0, lambda: self._received(reply))
+
+    def close(self) -> None:
+        """The client has gone, or may not call any more."""
+        self._timer.cancel()
+        self._own.forget(self._called[1], self)

@@ -1,0 +1,133 @@
+"""The service that the appliance itself offers, with a control that a test plays."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from appliance.channel.messages import (
+    ClientGranted,
+    ConnectionClosed,
+    ConnectionOpened,
+    NodePlaced,
+    OwnServiceAnswered,
+    OwnServiceCalled,
+    ServicePlaced,
+)
+from appliance.relay.connections.own_service import HEADER
+from appliance.ros.standard import standard_definitions
+from appliance.ros.tcpros import encode_frame, encode_header, encode_service_reply
+from tests.unit.relay.world import LOOPBACK, Peer, World
+
+OTHER = "127.0.0.9"
+CALL = {"callerid": "/client", "service": "/rosrv/record_now", "md5sum": "*"}
+
+
+class Scene(World):
+    """A relay with the service of the appliance, which /client may call from two hosts; its port is `port`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.port = self.listen()
+        self.state(NodePlaced("own", "/rosrv", LOOPBACK, monitors=True), self.port)
+        self.state(ServicePlaced("own", CALL["service"], LOOPBACK, 1))
+        for host in (LOOPBACK, OTHER):
+            self.state(ClientGranted("own", CALL["service"], host, "/client"))
+
+    def client(self, host: str = LOOPBACK, **fields: str) -> Peer:
+        """A client that has read the service's header."""
+        peer = self.connect(encode_header(CALL | fields), host=host)
+        assert self.gets_header(peer) == HEADER | {"callerid": "/rosrv"}
+        return peer
+
+    def called(self) -> list[OwnServiceCalled]:
+        """What control was told of calls."""
+        return [message for message in self.told if isinstance(message, OwnServiceCalled)]
+
+
+@pytest.fixture
+def scene() -> Iterator[Scene]:
+    """A relay."""
+    scene = Scene()
+    yield scene
+    scene.close()
+
+
+def reply(success: bool, text: str) -> bytes:
+    """A std_srvs/TriggerResponse as it comes."""
+    return encode_service_reply(bytes([success]) + encode_frame(text.encode()))
+
+
+def test_the_header_is_that_of_the_type() -> None:
+    """Whoever knows std_srvs/Trigger may call."""
+    definitions = standard_definitions()
+    assert HEADER["md5sum"] == definitions.service_md5sum("std_srvs/Trigger")
+
+
+def test_control_answers_a_call(scene: Scene) -> None:
+    """It is told who calls from where; the client gets what it says, and on a persistent connection the next, too."""
+    client = scene.client(persistent="1")
+    assert scene.hears(ConnectionOpened, resource=CALL["service"]).host == LOOPBACK
+    client.send(encode_frame(b""))
+    asked = scene.hears(OwnServiceCalled)
+    assert (asked.service, asked.host, asked.caller_id) == (CALL["service"], LOOPBACK, "/client")
+    scene.state(OwnServiceAnswered(asked.number, True, "an id"))
+    scene.gets(client, reply(True, "an id"))
+    now = scene.loop.clock()
+    scene.loop.clock = lambda: now + 1.1
+    client.send(encode_frame(b""))
+    asked = scene.hears(OwnServiceCalled)
+    scene.state(OwnServiceAnswered(asked.number, False, "why not"))
+    scene.gets(client, reply(False, "why not"))
+
+
+def test_a_flood_of_one_host_is_one_call_to_control(scene: Scene) -> None:
+    """What it calls while one is with control is answered as that is, and control hears of another host at once."""
+    flood = [scene.client(persistent="1") for _one in range(5)]
+    for client in flood:
+        client.send(encode_frame(b""))
+    asked = scene.hears(OwnServiceCalled, host=LOOPBACK)
+    other = scene.client(OTHER)
+    other.send(encode_frame(b""))
+    scene.hears(OwnServiceCalled, host=OTHER)
+    gone = flood.pop()
+    gone.sock.close()
+    scene.hears(ConnectionClosed)
+    now = scene.loop.clock()
+    scene.loop.clock = lambda: now
+    scene.state(OwnServiceAnswered(asked.number, True, "one"))
+    for client in flood:
+        scene.gets(client, reply(True, "one"))
+        client.send(encode_frame(b"") * 20)
+    for client in flood:
+        scene.gets(client, reply(True, "one") * 20)
+    assert scene.called() == []
+
+
+def test_a_call_is_answered_when_control_ends(scene: Scene) -> None:
+    """With false, and why; a call that the next control is asked gets its answer."""
+    client = scene.client()
+    client.send(encode_frame(b""))
+    scene.hears(OwnServiceCalled)
+    scene.control.close()
+    scene.link.close()
+    scene.connect_control()
+    assert b"control is away" in scene.ends(client)
+    other = scene.client(OTHER)
+    other.send(encode_frame(b""))
+    asked = scene.hears(OwnServiceCalled)
+    scene.state(OwnServiceAnswered(asked.number, True, "two"))
+    assert scene.ends(other) == reply(True, "two")
+
+
+def test_who_means_another_type_is_told_so(scene: Scene) -> None:
+    """As a node would; control hears nothing of it."""
+    client = scene.connect(encode_header(CALL | {"md5sum": "0" * 32}))
+    assert f"not {'0' * 32}" in scene.gets_header(client)["error"]
+    assert scene.called() == []
+
+
+def test_without_a_grant_nobody_calls(scene: Scene) -> None:
+    """The policy decides at lookupService, as of each service."""
+    client = scene.connect(encode_header(CALL | {"callerid": "/stranger"}))
+    assert "no grant for [/stranger]" in scene.gets_header(client)["error"]
+    assert scene.called() == []
