@@ -8,7 +8,7 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -19,7 +19,7 @@ from starlette.responses import JSONResponse, StreamingResponse
 from appliance.api.access import Bearer
 from appliance.api.judgement import explained, granted, is_refusal
 from appliance.api.problems import ProblemError
-from appliance.api.roles import OPERATOR, VIEWER, Viewer, ask
+from appliance.api.roles import OPERATOR, VIEWER, Reader, Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.api.streams import Held, Streams, peer_of, turn
@@ -28,7 +28,7 @@ from appliance.audit.database import LogUnreadableError
 from appliance.audit.evidence import Chain, evidence, evidence_line
 from appliance.audit.findings import Verification
 from appliance.audit.moment import MomentError, parse_moment
-from appliance.audit.output import Entry, as_json, as_object
+from appliance.audit.output import Entry, as_object
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
 from appliance.audit.schema import json_schema
@@ -59,7 +59,7 @@ _PAGE = {
     "required": ["records", "cursor"],
     "additionalProperties": False,
 }
-_SHOWN = {
+_ONE = {
     "type": "object",
     "properties": {
         "record": _RECORD_REF,
@@ -169,16 +169,17 @@ def routes(services: Services) -> Routes:
     router = Routes(prefix="/v1/audit", tags=["audit"])
     desk = Desk(services)
 
-    @router.get("", operation_id="search_audit", responses=_json(_PAGE), dependencies=[VIEWER])
+    @router.get("", operation_id="search_audit", responses=_json(_PAGE))
     async def search_audit(
+        bearer: Viewer,
         wanted: Wanted,
         cursor: Annotated[str | None, Query(max_length=18, description="of the page before")] = None,
         limit: Limit = 100,
         order: Annotated[Literal["newest", "oldest"], Query(description="which comes first")] = "newest",
     ) -> JSONResponse:
-        """Records that match, a page at a time."""
+        """Records that match, a page at a time; for viewers without what messages said (`detail.withheld`)."""
         page = await desk.read(search, desk.path, wanted, cursor, limit, newest_first=order == "newest")
-        return JSONResponse({"records": list(map(as_object, page.entries)), "cursor": page.cursor})
+        return JSONResponse({"records": _shown(page.entries, bearer), "cursor": page.cursor})
 
     @router.get(
         "/stream",
@@ -227,8 +228,8 @@ def routes(services: Services) -> Routes:
         responses=_text("application/x-ndjson", "A record a line."),
         response_class=Response,
     )
-    async def export_audit(request: Request, bearer: Viewer, wanted: Wanted) -> Response:
-        """All records that match, oldest first, one JSON object a line.
+    async def export_audit(request: Request, bearer: Reader, wanted: Wanted) -> Response:
+        """All records that match, oldest first, one JSON object a line. For investigators, operators and admins.
 
         Each has in `chain` its place in the hash chain, as far as a signed checkpoint: `rosrv audit verify --export`
         proves it on any machine, with the appliance's public key.
@@ -237,10 +238,9 @@ def routes(services: Services) -> Routes:
         give_back = services.exports.take(bearer, peer_of(request), "exports")
         return Held(StreamingResponse(_lines(entries), media_type="application/x-ndjson"), give_back)
 
-    @router.get(
-        "/{record_id}", operation_id="audit_record", responses=_json(_SHOWN) | _UNKNOWN, dependencies=[VIEWER]
-    )
+    @router.get("/{record_id}", operation_id="audit_record", responses=_json(_ONE) | _UNKNOWN)
     async def audit_record(
+        bearer: Viewer,
         record_id: OneRecord,
         neighbours: Annotated[int, Query(ge=0, le=_MOST_NEIGHBOURS)] = 5,
     ) -> JSONResponse:
@@ -248,8 +248,8 @@ def routes(services: Services) -> Routes:
         shown = await desk.read(show, desk.path, record_id, neighbours)
         if shown is None:
             raise ProblemError(404, "unknown", f"there is no record {record_id}")
-        around = {"before": list(map(as_object, shown.before)), "after": list(map(as_object, shown.after))}
-        return JSONResponse({"record": as_object(shown.entry), **around})
+        around = {"before": _shown(shown.before, bearer), "after": _shown(shown.after, bearer)}
+        return JSONResponse({"record": _shown([shown.entry], bearer)[0], **around})
 
     @router.get("/{record_id}/why", operation_id="why_of_record", responses=_UNKNOWN)
     async def why_of_record(record_id: OneRecord, bearer: Viewer) -> Why:
@@ -305,10 +305,18 @@ async def _follow(
             return
         entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
         for entry in entries:
-            yield ServerSentEvent(event="record", id=str(entry.sequence), data=as_json(entry))
+            [record] = _shown([entry], bearer)
+            yield ServerSentEvent(
+                event="record", id=str(entry.sequence), data=json.dumps(record, separators=(",", ":"))
+            )
         if not entries:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(services.stopping.wait(), _POLL_SECONDS)
+
+
+def _shown(entries: Iterable[Entry], bearer: Bearer) -> list[dict[str, Any]]:
+    """The records as who asks may read them."""
+    return [as_object(entry, contents=reads_contents(bearer)) for entry in entries]
 
 
 def _begun(entries: Iterator[_T]) -> Iterator[_T]:

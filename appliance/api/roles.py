@@ -42,6 +42,22 @@ Investigator = Annotated[Bearer, Depends(_Requires(Role.INVESTIGATOR))]
 Operator = Annotated[Bearer, OPERATOR]
 Admin = Annotated[Bearer, Depends(_Requires(Role.ADMIN))]
 
+
+def reads_contents(bearer: Bearer) -> bool:
+    """Whether who calls may read what single messages said in the records of monitors: all but viewers."""
+    return bearer.role > Role.VIEWER
+
+
+def _no_viewer(bearer: Viewer) -> Bearer:
+    if not reads_contents(bearer):
+        text = f"this is for investigators, operators and admins; the token {bearer.name} is a viewer's"
+        raise ProblemError(403, "not-for-this-role", text)
+    return bearer
+
+
+Reader = Annotated[Bearer, Depends(_no_viewer)]
+"""Whoever may read what messages said in records: investigators, operators and admins."""
+
 _PROBLEMS = {
     "request": (422, "bad-input"),
     "refused": (422, "refused"),

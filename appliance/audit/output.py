@@ -23,6 +23,10 @@ _OF_THE_RECORD = (
 )  # fmt: skip
 
 
+_CONTENTS = ("before", "after", "before_fields", "after_fields")
+"""What a message said, in the detail of a monitor's record."""
+
+
 class Entry(NamedTuple):
     """A record of the log with its sequence."""
 
@@ -40,10 +44,17 @@ def rfc3339(time: int) -> str:
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{fraction:09d}Z"
 
 
-def as_object(entry: Entry) -> dict[str, Any]:
-    """The documented JSON object of a record; `decision` is absent where nothing was decided."""
+def as_object(entry: Entry, *, contents: bool = True) -> dict[str, Any]:
+    """The documented JSON object of a record; `decision` is absent where nothing was decided.
+
+    Without `contents` a monitor's record lacks what the message said, and `detail.withheld` names it.
+    """
     record = entry.record
     fields = {name: getattr(record, name) for name in _OF_THE_RECORD}
+    withheld = [name for name in _CONTENTS if name in record.detail and "monitor" in record.detail]
+    if withheld and not contents:
+        kept = {name: value for name, value in record.detail.items() if name not in withheld}
+        fields["detail"] = kept | {"withheld": withheld}
     if record.decision is None:
         del fields["decision"]
     head = {

@@ -73,3 +73,19 @@ def test_printable(text: str, shown: str) -> None:
 def test_time(time: int, text: str) -> None:
     """Times are UTC with nanoseconds over the whole range that can be stored."""
     assert rfc3339(time) == text
+
+
+def test_who_may_not_read_messages_gets_a_monitors_record_without_them() -> None:
+    """It says what is left out; what a condition compared stays, and fields of the same name that are no message."""
+    said = {"before": "00", "before_fields": {"data": "x"}}
+    dropped = Record(
+        id="0" * 20, time=0, event="message dropped", detail={"monitor": "m", "conditions": [], **said}
+    )
+    entry = Entry(1, dropped)
+    assert as_object(entry)["detail"] == dropped.detail
+    shown = as_object(entry, contents=False)["detail"]
+    assert shown == {"monitor": "m", "conditions": [], "withheld": ["before", "before_fields"]}
+    ordered = Entry(
+        2, Record(id="0" * 20, time=0, event="recording ordered", detail={"before": 60.0, "who": "eve"})
+    )
+    assert as_object(ordered, contents=False) == as_object(ordered)
