@@ -7,7 +7,6 @@ waits a moment and is then told to come back.
 import asyncio
 import contextlib
 import json
-import time
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -18,6 +17,7 @@ from starlette.responses import JSONResponse, StreamingResponse
 
 from appliance.api.access import Bearer
 from appliance.api.judgement import explained, granted, is_refusal
+from appliance.api.moments import given
 from appliance.api.problems import ProblemError
 from appliance.api.roles import OPERATOR, VIEWER, Reader, Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes
@@ -27,8 +27,7 @@ from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.evidence import Chain, evidence, evidence_line
 from appliance.audit.findings import Verification
-from appliance.audit.moment import MomentError, parse_moment
-from appliance.audit.output import Entry, as_object
+from appliance.audit.output import Entry, as_json, as_object, without_contents
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
 from appliance.audit.schema import json_schema
@@ -103,27 +102,23 @@ def _wanted(
         bool, Query(description="0: leave out REST calls that were allowed and only looked")
     ] = True,
 ) -> Filter:
-    now = time.time_ns()
     if resource is not None and topic is not None:
         raise ProblemError(422, "bad-input", "resource and topic are two words for one thing: give one")
-    try:
-        return Filter(
-            decision=tuple(dict.fromkeys([*(decision or ()), *(["deny"] if deny else [])])),
-            since=None if since is None else parse_moment(since, now),
-            until=None if until is None else parse_moment(until, now),
-            host=host,
-            caller_id=caller_id,
-            resource=resource if topic is None else topic,
-            category=category,
-            event=event,
-            severity=severity,
-            rule=rule,
-            text=text,
-            who=who,
-            without_looks=not looks,
-        )
-    except (MomentError, OverflowError, ValueError) as error:
-        raise ProblemError(422, "bad-input", str(error)) from error
+    return Filter(
+        decision=tuple(dict.fromkeys([*(decision or ()), *(["deny"] if deny else [])])),
+        since=None if since is None else given(since),
+        until=None if until is None else given(until),
+        host=host,
+        caller_id=caller_id,
+        resource=resource if topic is None else topic,
+        category=category,
+        event=event,
+        severity=severity,
+        rule=rule,
+        text=text,
+        who=who,
+        without_looks=not looks,
+    )
 
 
 Wanted = Annotated[Filter, Depends(_wanted)]
@@ -179,7 +174,7 @@ def routes(services: Services) -> Routes:
     ) -> JSONResponse:
         """Records that match, a page at a time; for viewers without what messages said (`detail.withheld`)."""
         page = await desk.read(search, desk.path, wanted, cursor, limit, newest_first=order == "newest")
-        return JSONResponse({"records": _shown(page.entries, bearer), "cursor": page.cursor})
+        return JSONResponse({"records": _shown(page.entries, bearer, wanted.text), "cursor": page.cursor})
 
     @router.get(
         "/stream",
@@ -201,7 +196,7 @@ def routes(services: Services) -> Routes:
         start = int(last_event_id) if last_event_id is not None else after
         follower = await desk.read(Follower, desk.path, wanted, start)
         give_back = desk.streams.take(bearer, peer_of(request), "clients follow the audit log")
-        following = _follow(services, desk, follower, bearer)
+        following = _follow(services, desk, follower, bearer, wanted.text)
         return Held(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
     @router.get("/verify", operation_id="verify_audit", dependencies=[OPERATOR])
@@ -253,7 +248,7 @@ def routes(services: Services) -> Routes:
 
     @router.get("/{record_id}/why", operation_id="why_of_record", responses=_UNKNOWN)
     async def why_of_record(record_id: OneRecord, bearer: Viewer) -> Why:
-        """Why what a record tells happened: who did it, which events and values made it so, at which line.
+        """Why what a record tells happened: who did it, which events and values (not for viewers) made it so, where.
 
         Of a monitor's verdict the events are such that they alone give it; of a refusal there is the smallest change of
         the policy in force that would allow it.
@@ -261,7 +256,7 @@ def routes(services: Services) -> Routes:
         shown = await desk.read(show, desk.path, record_id, 0)
         if shown is None:
             raise ProblemError(404, "unknown", f"there is no record {record_id}")
-        record = shown.entry.record
+        record = _readable(shown.entry, bearer).record
         known = None
         if is_refusal(record):
             known = await ask(services.control, PolicyWanted(), bearer)
@@ -297,7 +292,7 @@ def _text(media_type: str, description: str) -> Responses:
 
 
 async def _follow(
-    services: Services, desk: Desk, follower: Follower, bearer: Bearer
+    services: Services, desk: Desk, follower: Follower, bearer: Bearer, text: str | None
 ) -> AsyncIterator[ServerSentEvent]:
     while not services.stopping.is_set():
         if not services.doorkeeper.still_good(bearer):
@@ -305,18 +300,27 @@ async def _follow(
             return
         entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
         for entry in entries:
-            [record] = _shown([entry], bearer)
-            yield ServerSentEvent(
-                event="record", id=str(entry.sequence), data=json.dumps(record, separators=(",", ":"))
-            )
+            for record in _shown([entry], bearer, text):
+                data = json.dumps(record, separators=(",", ":"))
+                yield ServerSentEvent(event="record", id=str(entry.sequence), data=data)
         if not entries:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(services.stopping.wait(), _POLL_SECONDS)
 
 
-def _shown(entries: Iterable[Entry], bearer: Bearer) -> list[dict[str, Any]]:
-    """The records as who asks may read them."""
-    return [as_object(entry, contents=reads_contents(bearer)) for entry in entries]
+def _shown(entries: Iterable[Entry], bearer: Bearer, text: str | None = None) -> list[dict[str, Any]]:
+    """The records as who asks may read them, without those that only what he may not read made match the text."""
+    shown = []
+    for entry in entries:
+        readable = _readable(entry, bearer)
+        if readable is entry or text is None or text.casefold() in as_json(readable).casefold():
+            shown.append(as_object(readable))
+    return shown
+
+
+def _readable(entry: Entry, bearer: Bearer) -> Entry:
+    """The record as who asks may read it."""
+    return entry if reads_contents(bearer) else without_contents(entry)
 
 
 def _begun(entries: Iterator[_T]) -> Iterator[_T]:

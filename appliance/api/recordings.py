@@ -14,6 +14,7 @@ from fastapi.responses import StreamingResponse
 from starlette.convertors import StringConvertor, register_url_convertor
 
 from appliance.api.access import Bearer
+from appliance.api.control import ControlLink
 from appliance.api.moments import given
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Investigator, Operator, Viewer, answered, ask
@@ -96,21 +97,15 @@ class MemorySpan(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1/recordings", tags=["recordings"])
-    control = services.control
-    reading = asyncio.Semaphore(1)
+    _add_all(router, services.control)
+    _add_one(router, services.control)
+    _add_bag(router, services)
+    _add_reading(router, services)
+    return router
 
-    async def read(
-        asked: admin.RecordingWanted | admin.RecordingRead, bearer: Bearer, what: _Reading[_T]
-    ) -> _T:
-        """What is read of a bag, one at a time; the recording is what control answers."""
-        recording = answered(await control.ask(asked, bearer, _SLOW_SECONDS))
-        async with turn(reading, "readings of recordings"):
-            try:
-                return await asyncio.to_thread(what, recording, _bag_of(services, recording.id))
-            except FileNotFoundError:
-                raise _gone(recording.id) from None
-            except ValueError as error:
-                raise ProblemError(422, "bad-input", str(error)) from error
+
+def _add_all(router: Routes, control: ControlLink) -> None:
+    """What is there, and what is to be there."""
 
     @router.get("", operation_id="recordings", responses=_UNKNOWN)
     async def recordings(bearer: Viewer) -> Recordings:
@@ -131,10 +126,24 @@ def routes(services: Services) -> Routes:
         order = admin.RecordingOfMemory(_moment(span.since), _moment(span.until))
         return answered(await control.ask(order, bearer, _SLOW_SECONDS))
 
+
+def _add_one(router: Routes, control: ControlLink) -> None:
+    """A recording, without its messages."""
+
     @router.get("/{recording_id:recording}", operation_id="recording", responses=_UNKNOWN)
     async def recording(recording_id: OneId, bearer: Viewer) -> Recording:
         """Why a recording was made, and what it has."""
         return await ask(control, admin.RecordingWanted(recording_id), bearer)
+
+    @router.delete("/{recording_id:recording}", operation_id="remove_recording", responses=_UNKNOWN)
+    async def remove(recording_id: OneId, bearer: Admin) -> Recording:
+        """Remove a recording; it is recorded who removed it. For admins."""
+        order = admin.RecordingRemove(recording_id)
+        return answered(await control.ask(order, bearer, _SLOW_SECONDS))
+
+
+def _add_bag(router: Routes, services: Services) -> None:
+    """All messages of a recording, as a file."""
 
     @router.get(
         "/{recording_id:recording}/bag",
@@ -155,6 +164,24 @@ def routes(services: Services) -> Routes:
         except BaseException:
             give_back()
             raise
+
+
+def _add_reading(router: Routes, services: Services) -> None:
+    """What is read of a recording's bag."""
+    reading = asyncio.Semaphore(1)
+
+    async def read(
+        asked: admin.RecordingWanted | admin.RecordingRead, bearer: Bearer, what: _Reading[_T]
+    ) -> _T:
+        """What is read of a bag, one at a time; the recording is what control answers."""
+        recording = answered(await services.control.ask(asked, bearer, _SLOW_SECONDS))
+        async with turn(reading, "readings of recordings"):
+            try:
+                return await asyncio.to_thread(what, recording, _bag_of(services, recording.id))
+            except FileNotFoundError:
+                raise _gone(recording.id) from None
+            except ValueError as error:
+                raise ProblemError(422, "bad-input", str(error)) from error
 
     @router.get("/{recording_id:recording}/timeline", operation_id="recording_timeline", responses=_UNKNOWN)
     async def recording_timeline(
@@ -199,14 +226,6 @@ def routes(services: Services) -> Routes:
             bearer,
             lambda row, bag: messages_around(row, bag, moment, topic, neighbours),
         )
-
-    @router.delete("/{recording_id:recording}", operation_id="remove_recording", responses=_UNKNOWN)
-    async def remove(recording_id: OneId, bearer: Admin) -> Recording:
-        """Remove a recording; it is recorded who removed it. For admins."""
-        order = admin.RecordingRemove(recording_id)
-        return answered(await control.ask(order, bearer, _SLOW_SECONDS))
-
-    return router
 
 
 async def _bag(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:

@@ -23,8 +23,8 @@ _OF_THE_RECORD = (
 )  # fmt: skip
 
 
-_CONTENTS = ("before", "after", "before_fields", "after_fields")
-"""What a message said, in the detail of a monitor's record."""
+_CONTENTS = ("before", "after", "before_fields", "after_fields", "conditions", "why")
+"""What messages said, in the detail of a monitor's record: as bytes, as fields, and what was compared of them."""
 
 
 class Entry(NamedTuple):
@@ -44,17 +44,20 @@ def rfc3339(time: int) -> str:
     return f"{moment:%Y-%m-%dT%H:%M:%S}.{fraction:09d}Z"
 
 
-def as_object(entry: Entry, *, contents: bool = True) -> dict[str, Any]:
-    """The documented JSON object of a record; `decision` is absent where nothing was decided.
+def without_contents(entry: Entry) -> Entry:
+    """The record without what messages said, which `detail.withheld` names then: for who may not read messages."""
+    detail = entry.record.detail
+    withheld = [name for name in _CONTENTS if name in detail and "monitor" in detail]
+    if not withheld:
+        return entry
+    kept = {name: value for name, value in detail.items() if name not in withheld}
+    return Entry(entry.sequence, msgspec.structs.replace(entry.record, detail=kept | {"withheld": withheld}))
 
-    Without `contents` a monitor's record lacks what the message said, and `detail.withheld` names it.
-    """
+
+def as_object(entry: Entry) -> dict[str, Any]:
+    """The documented JSON object of a record; `decision` is absent where nothing was decided."""
     record = entry.record
     fields = {name: getattr(record, name) for name in _OF_THE_RECORD}
-    withheld = [name for name in _CONTENTS if name in record.detail and "monitor" in record.detail]
-    if withheld and not contents:
-        kept = {name: value for name, value in record.detail.items() if name not in withheld}
-        fields["detail"] = kept | {"withheld": withheld}
     if record.decision is None:
         del fields["decision"]
     head = {

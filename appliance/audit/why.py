@@ -23,6 +23,9 @@ def lines_of(record: Record) -> Iterator[str]:
         yield f"at: {', '.join(map(str, places))}"
     for place, values in _mapping(detail.get("conditions")).items():
         yield f"where: {place}" + "".join(f", {name} = {value}" for name, value in _mapping(values).items())
+    if "withheld" in detail:
+        yield "what messages said is not for this role"
+        return
     yield from lines_of_why(_mapping(detail.get("why")))
     if record.event == "monitor verdict" and "why" not in detail and "count" not in detail:
         yield "because: which events made it so is not known any more, or too many verdicts were told in that second"

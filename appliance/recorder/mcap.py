@@ -42,8 +42,8 @@ class _Writer:
         self.position = 0
         self.chunk = bytearray()
         self._index: dict[int, list[tuple[int, int]]] = {}
-        self._schemas: dict[tuple[str, str], bytes] = {}
-        self._channels: dict[int, bytes] = {}
+        self._schemas: dict[tuple[str, str], int] = {}
+        self._described: list[bytes] = []  # the records of schemas and channels
         self._numbers: dict[int, int] = {}
         self._chunks: list[bytes] = []
         self._counts: Counter[int] = Counter()
@@ -62,24 +62,21 @@ class _Writer:
     def _describe(self, connection: int) -> int:
         header = self._connections[connection]
         name, text = header["type"], header["message_definition"]
-        if (name, text) not in self._schemas:
-            number = len(self._schemas) + 1
-            self._schemas[name, text] = _record(
-                _SCHEMA, struct.pack("<H", number), _text(name), _text("ros1msg"), _text(text)
-            )
-            self.chunk += self._schemas[name, text]
-        schema = list(self._schemas).index((name, text)) + 1
+        schema = self._schemas.get((name, text))
+        if schema is None:
+            schema = self._schemas[name, text] = len(self._schemas) + 1
+            head = struct.pack("<H", schema)
+            self._tell(_record(_SCHEMA, head, _text(name), _text("ros1msg"), _text(text)))
         channel = self._numbers[connection] = len(self._numbers) + 1
         of_sender = {"latching": "0"} | {key: header[key] for key in _OF_SENDER if key in header}
-        self._channels[channel] = _record(
-            _CHANNEL,
-            struct.pack("<HH", channel, schema),
-            _text(header["topic"]),
-            _text("ros1"),
-            _map(b"".join(_text(key) + _text(value) for key, value in of_sender.items())),
-        )
-        self.chunk += self._channels[channel]
+        fields = b"".join(_text(key) + _text(value) for key, value in of_sender.items())
+        head = struct.pack("<HH", channel, schema)
+        self._tell(_record(_CHANNEL, head, _text(header["topic"]), _text("ros1"), _map(fields)))
         return channel
+
+    def _tell(self, description: bytes) -> None:
+        self.chunk += description
+        self._described.append(description)
 
     def close_chunk(self) -> bytes:
         """The chunk and its indexes; empty where there is no message."""
@@ -114,13 +111,11 @@ class _Writer:
         start = self.position + len(end)
         statistics = struct.pack(
             "<QHIIIIQQ",
-            self._counts.total(), len(self._schemas), len(self._channels), 0, 0, len(self._chunks), *self._times,
+            self._counts.total(), len(self._schemas), len(self._numbers), 0, 0, len(self._chunks), *self._times,
         )  # fmt: skip
-        described = b"".join((*self._schemas.values(), *self._channels.values()))
         footer = _record(_FOOTER, struct.pack("<QQI", start, 0, 0))
-        return b"".join((
-            end, described, _record(_STATISTICS, statistics, _numbers(self._counts)), *self._chunks, footer, _MAGIC
-        ))  # fmt: skip
+        counted = _record(_STATISTICS, statistics, _numbers(self._counts))
+        return b"".join((end, *self._described, counted, *self._chunks, footer, _MAGIC))
 
 
 def _record(op: int, *parts: bytes | bytearray) -> bytes:

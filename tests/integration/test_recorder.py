@@ -104,6 +104,7 @@ def viewers_see_no_contents(appliance: Appliance, dropped: str) -> None:
         assert ("before_fields" in detail.get("withheld", ())) is (role == "viewer")
         assert rest.get(f"/v1/audit/export?{every}").status == (403 if role == "viewer" else 200)
         assert (b'"bad ' in rest.get(f"/v1/audit?{every}").body) is (role != "viewer")
+        assert bool(rest.get(f"/v1/audit?{every}&text=bad").json["records"]) is (role != "viewer")
 
 
 def test_a_drop_makes_a_recording_that_stock_tools_read(
