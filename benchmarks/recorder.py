@@ -7,6 +7,9 @@ messages, and those that are missing between the first and the last of a topic; 
 recorded until the whole file is there. Of the machine: processor time of the relay and the recorder until then, or of
 `rosbag record` until it is asked to end, in percent of a core over the seconds that are recorded; the median delay from
 publisher to subscriber.
+
+*killed* is the appliance with the recorder, whose relay, control and recorder get SIGKILL together in the middle of
+what is recorded. What is missing there is what the subscriber heard and the recording has not.
 """
 
 import argparse
@@ -65,14 +68,17 @@ class Result:
 
 
 class Load:
-    """The two nodes at a master, warm."""
+    """The two nodes at a master, warm. What was heard stands in a file in `folder`."""
 
-    def __init__(self, session: RosSession, topics: int, size: int, hertz: int) -> None:
+    def __init__(self, session: RosSession, folder: Path, topics: int, size: int, hertz: int) -> None:
+        self._heard = folder / "heard"
         self._talker = session.start(
             [str(_PROGRAM), "talk", str(topics), str(size), str(hertz)], label="talker"
         )
         self._talker.wait_for(event="ready")
-        self._listener = session.start([str(_PROGRAM), "listen", str(topics)], label="listener")
+        self._listener = session.start(
+            [str(_PROGRAM), "listen", str(topics), str(self._heard)], label="listener"
+        )
         self._listener.wait_for(event="ready")
         self.last(_WARM_SECONDS)
 
@@ -91,6 +97,13 @@ class Load:
         self._talker.stop()
         return float(heard["p50_us"])
 
+    def heard(self) -> dict[str, set[int]]:
+        """The numbers of the messages that the listener had when it ended, by topic."""
+        numbers: dict[str, set[int]] = {}
+        for topic, number in struct.iter_unpack("=QQ", self._heard.read_bytes()):
+            numbers.setdefault(f"/load/t{topic}", set()).add(number)
+        return numbers
+
 
 @contextmanager
 def measured(pids: Mapping[str, int], seconds: float, into: dict[str, float]) -> Iterator[None]:
@@ -100,15 +113,27 @@ def measured(pids: Mapping[str, int], seconds: float, into: dict[str, float]) ->
     into |= {name: 100 * (cpu_seconds(pid) - before[name]) / seconds for name, pid in pids.items()}
 
 
-def counted(path: Path, closed: float) -> Bag:
-    """How many messages of the load a bag has, and how many are missing between the first and the last of a topic."""
+def counted(path: Path, closed: float, heard: dict[str, set[int]] | None = None) -> Bag:
+    """How many messages of the load a bag has, and how many are missing between the first and the last of a topic.
+
+    Of those that were `heard`, where it is given; a topic that the bag has not is missing as a whole.
+    """
     numbers: dict[str, set[int]] = {}
     with Reader(path) as reader:
         for connection, _time, data in reader.messages():
             if connection.topic.startswith("/load/"):
                 numbers.setdefault(connection.topic, set()).add(_HEAD.unpack_from(data)[0])
-    lost = sum(max(seen) - min(seen) + 1 - len(seen) for seen in numbers.values())
+    if heard is None:
+        lost = sum(max(seen) - min(seen) + 1 - len(seen) for seen in numbers.values())
+    else:
+        lost = sum(len(missing(numbers.get(topic, set()), told)) for topic, told in heard.items())
     return Bag(sum(map(len, numbers.values())), lost, closed)
+
+
+def missing(recorded: set[int], heard: set[int]) -> set[int]:
+    """What was heard and not recorded, of the time that the recording has."""
+    first, last = (min(recorded), max(recorded)) if recorded else (min(heard), max(heard))
+    return {number for number in heard if first <= number <= last} - recorded
 
 
 def snapshot_program() -> Path | None:
@@ -123,7 +148,7 @@ def at_plain_master(
 ) -> Result:
     """With no recorder (""), `rosbag`, or `snapshot`, which is that program."""
     with PlainMaster(folder) as master, RosSession(master.master_uri, folder) as session:
-        running = Load(session, *load)
+        running = Load(session, folder, *load)
         if not recorder:
             running.last(seconds)
             return Result(running.end())
@@ -148,8 +173,10 @@ def at_plain_master(
         return Result(running.end(), counted(bag, closed), cpu)
 
 
-def at_appliance(folder: Path, load: tuple[int, int, int], seconds: float, *, recorder: bool) -> Result:
-    """Without and with the recorder, which is asked at the end for the seconds before."""
+def at_appliance(
+    folder: Path, load: tuple[int, int, int], seconds: float, *, recorder: bool, kills: bool = False
+) -> Result:
+    """Without and with the recorder, which is asked at the end for the seconds before; with kills in the middle."""
     configuration = folder / "appliance.yaml"
     configuration.write_text(_CONFIGURATION.format(enabled=str(recorder).lower(), seconds=seconds))
     options = ("--config", str(configuration))
@@ -162,19 +189,27 @@ def at_appliance(folder: Path, load: tuple[int, int, int], seconds: float, *, re
             for row in appliance.status()["processes"]
             if row["role"] in ("relay", "recorder")
         }
-        running, cpu = Load(session, *load), dict[str, float]()
+        running, cpu = Load(session, folder, *load), dict[str, float]()
         if not recorder:
             with measured(pids, seconds, cpu):
                 running.last(seconds)
             return Result(running.end(), cpu=cpu)
+        if kills:
+            running.last(seconds / 2)
+            for row in appliance.status()["processes"]:
+                if row["role"] in ("relay", "control", "recorder"):
+                    os.kill(row["pid"], signal.SIGKILL)
+            running.last(seconds / 2)
+            pids = {}
         with measured(pids, seconds, cpu):
-            running.last(seconds)
+            running.last(0 if kills else seconds)
             order = ("record", "now", "--before", f"{seconds:g}s", "--after", "1s", "--json")
             begun = json.loads(appliance.rosrv(*order).stdout)
             bag = appliance.state / "recordings" / begun["id"] / "recording.bag"
             eventually(bag.exists, appliance.story, 120)
             closed = time.time() - begun["ends"] / 1e9
-        return Result(running.end(), counted(bag, closed), cpu)
+        p50 = running.end()
+        return Result(p50, counted(bag, closed, running.heard() if kills else None), cpu)
 
 
 def main() -> None:
@@ -193,12 +228,18 @@ def main() -> None:
     for title, load in LOADS.items():
         results: dict[str, list[Result]] = {}
         for _round in range(given.rounds):
-            for name in ("plain", "rosbag", *snapshot, "appliance", "recorder"):
+            for name in ("plain", "rosbag", *snapshot, "appliance", "recorder", "killed"):
                 with tempfile.TemporaryDirectory(prefix="rosrv-benchmark-") as place:
                     folder = Path(place)
                     folder.chmod(0o755)  # the appliance's processes run as other users
-                    if name in ("appliance", "recorder"):
-                        result = at_appliance(folder, load, given.seconds, recorder=name == "recorder")
+                    if name in ("appliance", "recorder", "killed"):
+                        result = at_appliance(
+                            folder,
+                            load,
+                            given.seconds,
+                            recorder=name != "appliance",
+                            kills=name == "killed",
+                        )
                     else:
                         recorder = name if name != "plain" else ""
                         result = at_plain_master(folder, load, given.seconds, recorder, given.snapshot)

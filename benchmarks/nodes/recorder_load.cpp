@@ -1,4 +1,5 @@
-// A robot that talks and one that listens: `talk TOPICS BYTES HERTZ`, `listen TOPICS`.
+// A robot that talks and one that listens: `talk TOPICS BYTES HERTZ`, `listen TOPICS FILE`.
+// FILE gets for each message that was heard its topic and its number, 8 bytes each.
 // A message begins with its number on its topic (from 0) and when it was published (CLOCK_MONOTONIC, ns), 8 bytes each.
 #include <ros/ros.h>
 #include <std_msgs/String.h>
@@ -6,6 +7,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <fstream>
 #include <string>
 #include <vector>
 
@@ -40,20 +42,26 @@ static void talk(ros::NodeHandle& node, int topics, size_t bytes, double hertz) 
   }
 }
 
-static void listen(ros::NodeHandle& node, int topics) {
+static void listen(ros::NodeHandle& node, int topics, const std::string& file) {
+  std::vector<uint64_t> numbers;
   std::vector<uint64_t> delays;
   std::vector<ros::Subscriber> subscribers;
-  const auto heard = [&delays](const std_msgs::String::ConstPtr& message) {
-    uint64_t published;
-    std::memcpy(&published, &message->data[8], sizeof published);
-    delays.push_back(now() - published);
-  };
   for (int number = 0; number < topics; ++number) {
+    const boost::function<void(const std_msgs::String::ConstPtr&)> heard =
+        [&delays, &numbers, number](const std_msgs::String::ConstPtr& message) {
+          uint64_t head[2];
+          std::memcpy(head, message->data.data(), sizeof head);
+          delays.push_back(now() - head[1]);
+          numbers.push_back(uint64_t(number));
+          numbers.push_back(head[0]);
+        };
     subscribers.push_back(node.subscribe<std_msgs::String>(
         topic(number), 100, heard, ros::VoidConstPtr(), ros::TransportHints().tcpNoDelay()));
   }
   report_ready();
   ros::spin();
+  std::ofstream(file, std::ios::binary)
+      .write(reinterpret_cast<const char*>(numbers.data()), std::streamsize(numbers.size() * sizeof numbers[0]));
   const size_t half = delays.size() / 2;
   if (half) std::nth_element(delays.begin(), delays.begin() + long(half), delays.end());
   report("heard", ", \"messages\": " + std::to_string(delays.size()) +
@@ -67,6 +75,6 @@ int main(int argc, char** argv) {
   if (given[0] == "talk") {
     talk(node, std::stoi(given[1]), std::stoul(given[2]), std::stod(given[3]));
   } else {
-    listen(node, std::stoi(given[1]));
+    listen(node, std::stoi(given[1]), given[2]);
   }
 }
