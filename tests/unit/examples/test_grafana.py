@@ -78,6 +78,25 @@ def test_panels_stand_beside_each_other() -> None:
     )
 
 
+# What Grafana's published schema (`grafana-foundation-sdk`, JSON) requires of the options of a panel.
+REQUIRED = {
+    "stat": {
+        "graphMode", "colorMode", "justifyMode", "textMode", "wideLayout", "showPercentChange", "reduceOptions",
+        "percentChangeColorMode", "orientation",
+    },
+    "timeseries": {"legend", "tooltip"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("panel", PANELS, ids=lambda panel: str(panel["title"]))
+def test_options_are_whole(panel: dict[str, Any]) -> None:
+    """As Grafana's schema wants them: an option that is left out is another one after each of its releases."""
+    options = panel["options"]
+    assert options.keys() == REQUIRED[panel["type"]]
+    if "legend" in options:
+        assert {"displayMode", "placement", "showLegend", "calcs"} == options["legend"].keys()
+
+
 def test_it_names_no_source_of_ours() -> None:
     """Which Prometheus and which appliance it shows is chosen at its head; it is imported as it is."""
     assert [one["name"] for one in DASHBOARD["templating"]["list"]] == ["source", "instance"]
