@@ -1,16 +1,22 @@
 """What one step of a monitor costs, per logic, on traces of a thousand and a million events.
 
-    python benchmarks/logic_steps.py [--long EVENTS]
+    python -m benchmarks.logic_steps [--long EVENTS] [--beside]
 
 The cost must not grow with the trace or with a time bound. The loop around the step is measured alone and subtracted.
-For monitors that are tables the cost of generated code that looks the tables up inline is shown as well.
+For monitors that are tables the cost of generated code that looks the tables up inline is shown as well. `--beside`
+measures formulas of `mtl` about the past beside reelay and rtamt: one event for each unit of time, the same verdicts,
+in this process, the call of a step included.
 """
 
 import argparse
 import gc
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from random import Random
+from typing import Any
+
+import reelay
+import rtamt
 
 from appliance.rosmop.logics.catalogue import compile_property
 from appliance.rosmop.logics.interface import CompiledProperty, FiniteProperty, Run
@@ -43,6 +49,14 @@ PROPERTIES = (
     ("pattern", "globally: a forbids c within 1ns", "mixed"),
     ("pattern", "after a until c: a causes b within 1h", "mixed"),
 )
+
+BESIDE = (
+    ("a => once[0,500ns] b", "({a} -> once[0:500] {b})", "((a >= 0) implies (once[0:500] (b >= 0)))"),
+    ("!c since[10ns,20ns] a", "((!{c}) since[10:20] {a})", "((not (c >= 0)) since[10:20] (a >= 0))"),
+    ("historically[0,50ns] (c => once[0,100ns] a)", "(historically[0:50] ({c} -> once[0:100] {a}))",
+     "(historically[0:50] ((c >= 0) implies (once[0:100] (a >= 0))))"),
+)  # fmt: skip
+"""A formula here, in reelay, and in rtamt."""
 
 
 def trace(kind: str, length: int) -> list[int]:
@@ -87,11 +101,50 @@ def inline_step(compiled: CompiledProperty, events: Sequence[int]) -> float | No
     return (spent - (time.perf_counter_ns() - start)) / len(events)
 
 
+def others(for_reelay: str, for_rtamt: str, events: Sequence[int]) -> tuple[Callable[[int], bool], ...]:
+    """A step of reelay and one of rtamt: whether the formula holds at this event."""
+    other: Any = reelay.discrete_timed_monitor(pattern=for_reelay, semantics="boolean", condense=False)
+    third = rtamt.StlDiscreteTimeSpecification()
+    for name in (*EVENTS, "out"):
+        third.declare_var(name, "float")
+    third.spec = f"out = {for_rtamt}"
+    third.parse()
+    told = [{name: number == event for number, name in enumerate(EVENTS)} for event in events]
+    signals = [[(name, 1.0 if so else -1.0) for name, so in one.items()] for one in told]
+    return (
+        lambda now: bool(other.update(told[now])["value"]),
+        lambda now: bool(third.update(now, signals[now]) > 0),
+    )
+
+
+def beside(events: Sequence[int]) -> None:
+    """Print what a step costs here, in reelay and in rtamt; raises `SystemExit` where a verdict differs."""
+    print(f"{'here':>8} {'reelay':>8} {'rtamt':>8}  ns/step, {len(events)} events")
+    for formula, for_reelay, for_rtamt in BESIDE:
+        compiled = compile_property("mtl", formula, EVENTS, Position("benchmark", 1, 1))
+        start = time.process_time_ns()
+        run = compiled.start(0)
+        verdicts = [[run.step(event, now) == ("validation",) for now, event in enumerate(events)]]
+        costs = [(time.process_time_ns() - start) / len(events)]
+        for step in others(for_reelay, for_rtamt, events):
+            start = time.process_time_ns()
+            verdicts.append([step(now) for now in range(len(events))])
+            costs.append((time.process_time_ns() - start) / len(events))
+        if not verdicts[0] == verdicts[1] == verdicts[2]:
+            raise SystemExit(f"{formula}: the verdicts differ")
+        print(f"{costs[0]:8.0f} {costs[1]:8.0f} {costs[2]:8.0f}  {formula}")
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--long", type=int, default=1_000_000, help="events of the long trace")
-    lengths = (1_000, parser.parse_args().long)
+    parser.add_argument("--beside", action="store_true", help="reelay and rtamt, on 20,000 events")
+    options = parser.parse_args()
+    if options.beside:
+        beside(trace("mixed", 20_000))
+        return
+    lengths = (1_000, options.long)
     print(f"{'logic':8} {'ns/step':>8} {'ns/step':>8} {'inline':>7}  formula (trace)")
     print(f"{'':8} {lengths[0]:>8} {lengths[1]:>8}")
     for logic, formula, kind in PROPERTIES:

@@ -4,6 +4,7 @@ from itertools import combinations_with_replacement, product
 from random import Random
 
 import pytest
+import rtamt
 
 from appliance.rosmop.logics import bounded
 from appliance.rosmop.logics.interface import RunFaultError
@@ -177,6 +178,50 @@ def test_random_formulas_by_definition() -> None:
         text, trace = PRINTER.show(tree, random), timed_trace(random, 7, 3)
         end = trace[-1][0] + 20
         assert told(text, trace, end) == expected(tree, trace, end), (text, trace)
+
+
+def rtamt_text(tree: Tree) -> str:
+    """The formula in the language of the other monitor, over signals that are 1 where the event is, else -1."""
+    operator, *rest = tree
+    if operator == "event":
+        return f"({rest[0]} >= 0)"
+    bounds = "[{}:{}]".format(*rest.pop()) if operator in (*PAST, *FUTURE) else ""
+    operands = [rtamt_text(operand) for operand in rest]
+    if len(operands) == 1:
+        return f"({operator}{bounds} {operands[0]})"
+    return f"({operands[0]} {operator}{bounds} {operands[1]})"
+
+
+def rtamt_knows(tree: Tree) -> bool:
+    """Whether it has all operators: `xor` and `iff` are distances there, and what is before the first event holds."""
+    if tree[0] == "event":
+        return True
+    endless = tree[0] in PAST and tree[-1][1] is None
+    if endless or tree[0] in ("true", "false", "previously", "next", "xor", "iff"):
+        return False
+    return all(rtamt_knows(part) for part in tree[1:] if isinstance(part[0], str))
+
+
+def test_against_another_monitor() -> None:
+    """With one event per unit of time, what a formula is worth once all is over is what another monitor says."""
+    random = seeded(44)
+    compared = 0
+    while compared < 60:
+        tree = with_bounds(draw(random, 3, (*PAST[1:], *FUTURE[1:]), ARITY, ("a", "b")), random)
+        if not (rtamt_knows(tree) and is_about_the_future(tree)):
+            continue
+        compared += 1
+        trace = [(time, random.choice(ABC)) for time in range(40)]
+        other = rtamt.StlDiscreteTimeSpecification()
+        for name in ("a", "b", "out"):
+            other.declare_var(name, "float")
+        other.spec = f"out = {rtamt_text(tree)}"
+        other.parse()
+        signals = {name: [1.0 if event == name else -1.0 for _, event in trace] for name in ("a", "b")}
+        theirs = [value > 0 for _, value in other.evaluate({"time": [*range(40)], **signals})]
+        # no formula of this depth looks further ahead than fifteen units
+        ours = [worth(tree, trace, place, 40) for place in range(25)]
+        assert ours == theirs[:25], PRINTER.show(tree, random)
 
 
 def test_no_verdict_is_taken_back() -> None:

@@ -135,6 +135,24 @@ def test_every_untimed_pattern_on_all_short_traces() -> None:
                 assert told_here[length - 1] == expected, (meaning.text(), trace[:length])
 
 
+def told_by(meaning: Meaning, trace: Timed, end: int) -> list[tuple[int, tuple[str, ...]]]:
+    """What is told when, by definition: at each instant before ``end`` what is certain."""
+    record = []
+    decided = bool(meaning.verdict((), 0, ("a", "b", "c"), 3))
+    seen: list[tuple[int, str]] = []
+    for instant in range(end):
+        for time, event in trace:
+            if time == instant:
+                seen.append((time, event))
+                verdict = meaning.verdict(tuple(seen), instant, ("a", "b", "c"), 3)
+                record.append((instant, verdict))
+                decided = bool(verdict)
+        if not decided and (passed := _deadline(meaning, tuple(seen), instant)):
+            record.append((instant, passed))
+            decided = True
+    return record
+
+
 def test_timed_patterns_event_by_event() -> None:
     """With time bounds, each verdict is the certain one at its instant, those of deadlines included."""
     random = seeded(16)
@@ -143,21 +161,8 @@ def test_timed_patterns_event_by_event() -> None:
         for _ in range(3):
             times = sorted(random.randint(0, 12) for _ in range(4))
             trace = tuple((time, random.choice("abc")) for time in times)
-            told_here = play(pattern.start(0), pattern.events, trace, 20)
-            record = []
-            decided = bool(meaning.verdict((), 0, pattern.events, 3))
-            seen: list[tuple[int, str]] = []
-            for instant in range(20):
-                for time, event in trace:
-                    if time == instant:
-                        seen.append((time, event))
-                        verdict = meaning.verdict(tuple(seen), instant, ("a", "b", "c"), 3)
-                        record.append((instant, verdict))
-                        decided = bool(verdict)
-                if not decided and (passed := _deadline(meaning, tuple(seen), instant)):
-                    record.append((instant, passed))
-                    decided = True
-            assert told_here == record, (meaning.text(), trace)
+            told_here = play(pattern.start(0), ("a", "b", "c"), trace, 20)
+            assert told_here == told_by(meaning, trace, 20), (meaning.text(), trace)
 
 
 def _deadline(meaning: Meaning, seen: Timed, instant: int) -> tuple[str, ...]:
