@@ -13,7 +13,6 @@ from appliance.config import Settings
 from appliance.policy import Known, PolicyError, judge
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.site_keys import read_signature
-from appliance.specifications.files import SpecificationsRefusedError, check, read_folder
 from appliance.supervisor.errors import StartError
 
 _DISK = "disk"
@@ -50,6 +49,12 @@ def _text(file: Path) -> str:
 
 
 def _require_specifications(folder: Path, site_keys: Sequence[str]) -> None:
+    from appliance.specifications.files import (  # noqa: PLC0415  the compiler: not where there are none
+        SpecificationsRefusedError,
+        check,
+        read_folder,
+    )
+
     try:
         check(read_folder(folder), site_keys)
     except SpecificationsRefusedError as error:

@@ -76,8 +76,8 @@ class IptablesBackend:
         self._in_tables(lambda table: table.replace(rendered))
 
     def remove(self) -> None:
-        """Unhook and delete the appliance's chains."""
-        self._in_tables(lambda table: table.replace([]))
+        """Unhook and delete the appliance's chains. A table that nobody has used is not made for that."""
+        _in_used_tables(self._namespace, "filter", lambda table: table.replace([]))
 
     def counters(self) -> tuple[RuleCounter, ...]:
         """Read the rules of the appliance's chains back from the kernel."""
@@ -119,18 +119,23 @@ def foreign_forward_drops(namespace: Namespace) -> tuple[str, ...]:
 
 def _foreign(namespace: Namespace, name: str, look: "Callable[[_Table], list[str]]") -> tuple[str, ...]:
     """What `look` finds in the table `name` of each family; nothing where nobody has used that table."""
+    found: list[str] = []
+    _in_used_tables(namespace, name, lambda table: found.extend(look(table)))
+    return tuple(found)
 
-    def inside() -> tuple[str, ...]:
+
+def _in_used_tables(namespace: Namespace, name: str, work: "Callable[[_Table], None]") -> None:
+    """Do `work` with the table `name` of each family where somebody has used it; the library is loaded only then."""
+
+    def inside() -> None:
         used = [family for family in _families() if name in _tables_in_use(family)]
-        found: list[str] = []
         if used:
             with _ONE_AT_A_TIME, _xtables_lock():
                 for family in used:
                     with _opened(family, name) as table:
-                        found += look(table)
-        return tuple(found)
+                        work(table)
 
-    return namespace.run(inside)
+    namespace.run(inside)
 
 
 def _tables_in_use(family: Family) -> list[str]:
