@@ -2,7 +2,8 @@
 
 A message on a topic of no monitor; the reference specification of the design (reads two fields, writes one, steps
 one state machine); the same with ten monitors on other topics; a string that grows; a copy of the whole message;
-the reference in the module, many at once and alone; and loading, with the module and without.
+the reference in the module, many at once and alone; a state machine with a timeout; and loading, with the module and
+without.
 Times are processor time, the median of the rounds, in microseconds for a message.
 """
 
@@ -38,6 +39,8 @@ SCAN = """scan() { double nearest = 0;
         nearest = found;
     }
 }"""
+WATCHED = """watched() { event e(double x) /cmd geometry_msgs/TwistStamped '{twist:{linear:{x:x}}}' { }
+    tfsm: quiet [ e -> moving ] moving [ e -> moving, timeout 500 ms -> quiet ] @timeout { ROS_WARN("silence"); } }"""
 WHOLE = "whole() { geometry_msgs::TwistStamped v; event e() /cmd geometry_msgs/TwistStamped '{}' { v = MESSAGE; } }"
 OTHERS = "".join(
     f"other{number}() {{ event e(int x) /other{number} std_msgs/Int32 '{{data:x}}' {{ x++; }} }}\n"
@@ -111,6 +114,10 @@ def main() -> None:
         ("reference, comes alone", 1, COMMAND),
     ):
         print(f"{name:32} {batched(messages, body):8.3f} µs")
+    watched = monitors(WATCHED)
+    row = microseconds(lambda: watched.process("/cmd", bytearray(COMMAND), 1), MESSAGES)
+    print(f"{'a tfsm, engine':32} {row:8.2f} µs")
+    print(f"{'a tfsm, 64 together':32} {batched(64, COMMAND, WATCHED):8.3f} µs")
     scans = monitors(SCAN)
     loop = microseconds(lambda: scans.process("/scan", LASER, 1), MESSAGES // 20)
     print(f"{'a loop over 100 numbers, engine':32} {loop:8.2f} µs")

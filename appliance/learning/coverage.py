@@ -20,6 +20,7 @@ from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run,
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.parser import parse
+from appliance.rosmop.why import history_of
 
 _MACHINES = frozenset({"fsm", "tfsm"})
 
@@ -159,7 +160,7 @@ def _watch(monitors: MonitorSet) -> list["_Watch"]:
             if running.code.property.logic in _MACHINES:
                 watch = _Watch(monitor.name, running.code.property)
                 running.code = replace(running.code, property=watch)
-                running.begin(0)
+                running.history = history_of(watch, 0)
                 watches.append(watch)
     return watches
 

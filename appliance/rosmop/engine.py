@@ -10,8 +10,8 @@ Theory of operation:
    ends its way; what faults drops it, too, or with `on_fault="pass"` is passed over.
 3. Time is what the caller says: nanoseconds, with every message. Ticks (`every`) up to and including the time of
    a message, and deadlines before it, happen first; `process` returns them in `before`. While no message comes,
-   the caller calls `advance` when `next_due` has come. Ticks that take longer than the caller's `patience` allows are
-   left out, and that is logged; deadlines wait for the next time.
+   the caller calls `advance` when `next_due` has come; a deadline may have been put off since. Ticks that take longer
+   than the caller's `patience` allows are left out, and that is logged; deadlines wait for the next time.
 4. `walker` offers, for most topics, a walk that does what `process` does to many messages at once (`walking.py`), as
    far as these need nothing that is recorded or explained. Whoever uses it must not see a difference but in time.
 5. `replaced` makes the set that follows: one swap between two messages. Specifications whose text is the same
@@ -298,7 +298,7 @@ class MonitorSet:
 
     def write_module(self) -> None:
         """Write the module that `walker` offers the walks of."""
-        self._walks = walks_of(self.compiled, self._monitors)
+        self._walks = walks_of(self.compiled, self._monitors, self._when_due)
 
     def explain_when(self, asked: Asked, tried: Asked) -> None:
         """Explain only verdicts that are asked for, by themselves and the source of the message; and those on trial."""
@@ -458,6 +458,7 @@ class MonitorSet:
             if wanted is monitor.enabled:
                 continue
             changed.append(monitor)
+            _come_home(monitor)
             monitor.enabled = wanted
             if wanted:
                 for timer in monitor.timers:
@@ -508,6 +509,7 @@ class MonitorSet:
         outcomes: list[Outcome] = []
         ticks: dict[int, int] = {}
         over = self.patience()
+        self._schedule()  # walks may have moved deadlines on
         while self._due is not None and self._due <= time_ns:
             timer = self._next_timer()
             deadline = self._next_deadline()
@@ -901,11 +903,18 @@ class MonitorSet:
         ]
         return min(timers, key=lambda timer: timer.due or 0, default=None)
 
+    def _when_due(self, *, anew: bool) -> int | None:
+        if anew:
+            self._schedule()
+        return self._due
+
     def _next_deadline(self) -> tuple[int, Monitor, RunningProperty] | None:
         found: tuple[int, Monitor, RunningProperty] | None = None
         for monitor in self._monitors:
             if monitor.enabled:
                 for running in monitor.properties:
+                    if running.code.property.timed:
+                        _come_home(monitor)
                     deadline = running.run.deadline
                     if deadline is not None and (found is None or deadline < found[0]):
                         found = (deadline, monitor, running)

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from appliance.rosmop.compile.events import EventCode
 from appliance.rosmop.compile.specification import Compiled, PropertyCode, SpecificationCode
-from appliance.rosmop.logics.interface import FiniteProperty, Run
+from appliance.rosmop.logics.interface import Run
 from appliance.rosmop.runtime.context import Context
 from appliance.rosmop.runtime.wire import Message
 from appliance.rosmop.slices import Slice, Slices
@@ -44,8 +44,7 @@ class RunningProperty:
     def begin(self, time_ns: int) -> None:
         """Begin anew."""
         self.run = self.code.property.start(time_ns)
-        if not (isinstance(self.history, Exits) and isinstance(self.code.property, FiniteProperty)):
-            self.history = history_of(self.code.property, time_ns)
+        self.history.begin(time_ns)
 
 
 @dataclass(eq=False, slots=True)

@@ -14,11 +14,11 @@ import struct
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from appliance.rosmop.compile.program import groups
 from appliance.rosmop.compile.specification import Compiled
-from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, POSITION, Feed, FeedModule, module_of
+from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, POSITION, SOONER, Feed, FeedModule, module_of
 from appliance.rosmop.ir.module import UNDO, Cells
 from appliance.rosmop.ir.values import Values, struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
@@ -27,7 +27,7 @@ from appliance.rosmop.runtime.context import Context
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
-from appliance.rosmop.why import Exits
+from appliance.rosmop.why import ClockedSteps, Exits
 
 FUEL = 50_000_000
 """Instructions of one call at most: some hundredths of a second. What a call leaves is for the next ones: setting it
@@ -44,6 +44,7 @@ _EFFECT = struct.Struct("<qq")
 _LOG = struct.Struct("<II8s")
 _PREPARED = struct.Struct("<qqq")
 _TIME = struct.Struct("<q")
+_CLOCK = struct.Struct("<qq")
 _NEVER = (1 << 63) - 1  # comes after every time, so that output is due
 
 
@@ -52,13 +53,15 @@ class Walked(NamedTuple):
 
     `position` is where the first message begins that is left; `run` where what goes on unchanged begins (behind the
     last dropped message). `dropped` are counts for each of the walker's events, if any was; `changed` has a set of
-    events (see `Walker.writers`) and how many messages they changed together, for each run of such messages.
+    events (see `Walker.writers`) and how many messages they changed together, for each run of such messages. `sooner`:
+    something is due earlier than it was.
     """
 
     position: int
     run: int
     dropped: Sequence[int]
     changed: Sequence[tuple[int, int]]
+    sooner: bool = False
 
 
 class Prepared(NamedTuple):
@@ -71,6 +74,13 @@ class Prepared(NamedTuple):
     enabled: int
 
 
+class Due(Protocol):
+    """Who knows when the next tick or deadline is due (ns; None: nothing is waited for)."""
+
+    def __call__(self, *, anew: bool) -> int | None:
+        """`anew`: find out, as there may be an earlier deadline."""
+
+
 class Home:
     """Where the state of specifications is that share topics or variables."""
 
@@ -81,6 +91,8 @@ class Home:
         namespace: dict[str, Any],
         running: Sequence[RunningProperty],
         throttles: Sequence[tuple[Context, int, int]],
+        *,
+        due: Due,
     ) -> None:
         """`throttles`: specification, site, and address of when output there was last due."""
         self.machine = machine
@@ -93,7 +105,9 @@ class Home:
         self._cells = struct.Struct(
             "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in cells.variables.values())
         )
-        self._source = cells.source
+        self._source, self._until = cells.source, cells.until
+        self._clocks = [(running[number], address) for number, address in cells.clocks.items()]
+        self._due = due
         self._inside = False
         self.prepared: Prepared | None = None
         """For whom the module was prepared last, with the state in its memory; None where that is with Python."""
@@ -114,7 +128,17 @@ class Home:
         self._cells.pack_into(self._memory, self._base, *states, *values)
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
+        for running, address in self._clocks:
+            run: Any = running.run
+            _CLOCK.pack_into(self._memory, address, run.since, run.now)
+        due = self._due(anew=False)
+        _TIME.pack_into(self._memory, self._until, _NEVER if due is None else min(due - 1, _NEVER))
         self._inside = True
+
+    def hasten(self) -> None:
+        """A deadline is earlier than what was due."""
+        self.leave()
+        self._due(anew=True)
 
     def leave(self) -> None:
         """Give it back to Python."""
@@ -124,6 +148,9 @@ class Home:
         values = self._cells.unpack_from(self._memory, self._base)
         for running, state in zip(self._running, values, strict=False):
             running.run.state = state  # type: ignore[attr-defined]  # of tables
+        for running, address in self._clocks:
+            run: Any = running.run
+            run.since, run.now = _CLOCK.unpack_from(self._memory, address)
         self._namespace.update(zip(self._names, values[len(self._running) :], strict=True))
 
 
@@ -224,8 +251,11 @@ class Walker:
                 if first > run:
                     pieces.append(view[run:first])
                 run = following
-            if answer >= LEFT or position == len(view):
-                return Walked(position, run, self._dropped() if run != begun else (), changed)
+            sooner = bool(answer & SOONER)
+            if answer >= LEFT or position == len(view) or sooner:
+                if sooner:
+                    self._home.hasten()
+                return Walked(position, run, self._dropped() if run != begun else (), changed, sooner)
 
     def take(self, message: Buffer, time_ns: int, source: int = 0) -> Sequence[str] | None:
         """Take a message of which nothing is to be told but which events happened: they. None if it is left.
@@ -250,7 +280,8 @@ class Walker:
         area = self._memory[self._frames : self._frames + BEGINNING]
         changed: list[tuple[int, int]] = []
         dropped: Sequence[int] = ()
-        while position < len(view):
+        sooner = False
+        while position < len(view) and not sooner:
             following = position + 4 + _LENGTH.unpack_from(view, position)[0]
             size = min(following - position, BEGINNING)
             area[:size] = view[position : position + size]
@@ -261,6 +292,7 @@ class Walker:
                 continue
             if not walked.position:
                 break
+            sooner = walked.sooner
             if walked.changed:
                 view[position + 4 : position + size] = area[4:size]
                 changed += walked.changed
@@ -270,7 +302,7 @@ class Walker:
                 run = following
                 dropped = [sum(counts) for counts in zip_longest(dropped, walked.dropped, fillvalue=0)]
             position = following
-        return Walked(position, run, dropped, changed)
+        return Walked(position, run, dropped, changed, sooner)
 
     def _carry_out(self, count: int, changed: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Note what was changed; from where to where frames were dropped."""
@@ -312,7 +344,7 @@ class Walks(NamedTuple):
     area: memoryview | None = None
 
 
-def walks_of(compiled: Compiled, monitors: Sequence[Monitor]) -> Walks:
+def walks_of(compiled: Compiled, monitors: Sequence[Monitor], due: Due) -> Walks:
     """The walkers of all topics that can have one; their monitors are told where their state is."""
     found = list(groups(compiled.specifications))
     components = [group.component for group in found]
@@ -325,7 +357,7 @@ def walks_of(compiled: Compiled, monitors: Sequence[Monitor]) -> Walks:
         running = [monitors[number].properties[index] for number, index in group.properties]
         for number, address in cells.exits.items():
             kept = running[number].history
-            assert isinstance(kept, Exits)  # noqa: S101  it has tables
+            assert isinstance(kept, Exits | ClockedSteps)  # noqa: S101  it has tables
             kept.move(machine, machine.memory[address:])
         contexts = {compiled.specifications[number].context for number in group.specifications}
         throttles = [
@@ -333,7 +365,7 @@ def walks_of(compiled: Compiled, monitors: Sequence[Monitor]) -> Walks:
             for (context, site), address in module.throttles.items()
             if context in contexts
         ]
-        home = Home(machine, cells, compiled.namespace, running, throttles)
+        home = Home(machine, cells, compiled.namespace, running, throttles, due=due)
         for number in group.specifications:
             monitors[number].home = home
         for (topic, _), events in zip(group.component.topics, group.events, strict=True):

@@ -6,9 +6,10 @@ Theory of operation:
    these lead to the present one, and each is later than the one before: the events so far without all that came back
    to where it had been. So nothing is cut, however long the trace; and since what happened before `__RESET;` is not on
    the way, it need not be forgotten either. The module keeps the same, in the same place.
-2. Of the others (`Steps`) the last events are kept, and the run as it was before them. Where they give the verdict to
-   a run that begins anew they explain it alone; where not, only to the run as it was before them, and that is said
-   (`Explanation.since`), or, where a run cannot be copied, nothing.
+2. Of the others (`Steps`; with a clock `ClockedSteps`, which the module keeps, too) the last events are kept, and the
+   run as it was before them. Where they give the verdict to a run that begins anew they explain it alone; where not,
+   only to the run as it was before them, and that is said (`Explanation.since`), or, where a run cannot be copied,
+   nothing.
 3. Of a parametric specification the last `TRAIL` events are kept with what they bound; those of the slice explain its
    verdict alone, or nothing does.
 4. An explanation is found by trying: what is named has given the verdict.
@@ -20,7 +21,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from appliance.rosmop.logics.automaton import Automaton
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty, Run, RunFaultError
+from appliance.rosmop.logics.interface import (
+    Categories,
+    ClockedProperty,
+    ClockedRun,
+    CompiledProperty,
+    FiniteProperty,
+    Run,
+    RunFaultError,
+)
 
 TRAIL = 4096
 """Events that are kept of a parametric specification, of all its slices together."""
@@ -31,9 +40,20 @@ KEPT = 64
 ENTRY = struct.Struct("<qqI4x")
 """How a state was left: time (ns); `Sender.source`, `Sender.kind` (from bit 24) and the event; `Sender.number`."""
 
+RUNS, RING = 4, 256
+"""Of a property with a clock: runs and steps that are kept, twice as many as are asked for. So what the module notes of
+a message that it leaves overwrites nothing that counts.
+"""
+
+_COUNT = struct.Struct("<q")
+_RUN = struct.Struct("<qqq")
+_EVENT = 0xFFFFFF
 _LONGEST = 300  # ways through an automaton that are shortened
 _MOST_STEPS = 5_000  # that are tried for one explanation: some milliseconds
 _DEADLINE = -1
+
+CLOCKED_ROOM = _COUNT.size + _RUN.size * RUNS + ENTRY.size * RING
+"""Bytes of `ClockedSteps.room`."""
 
 
 class Sender(NamedTuple):
@@ -106,6 +126,9 @@ class Exits:
         """Let the deadline of the run pass."""
         return run.expire()
 
+    def begin(self, time_ns: int) -> None:
+        """What happened before stays on no way: it need not be forgotten."""
+
     def move(self, owner: object, room: memoryview) -> None:
         """Keep it from now on where the owner has it."""
         self.room, self.owner = room[: len(self.room)], owner
@@ -176,6 +199,10 @@ class Steps:
 
     def __init__(self, compiled: CompiledProperty, time_ns: int) -> None:
         self._compiled = compiled
+        self.begin(time_ns)
+
+    def begin(self, time_ns: int) -> None:
+        """Forget everything: the run has begun anew."""
         self._started = time_ns
         self._steps: list[Happened] = []
         self._before: Run | None = None
@@ -202,6 +229,10 @@ class Steps:
         """Go on from what another has kept of the same property."""
         return earlier
 
+    def _kept(self) -> tuple[Sequence[Happened], Run | None]:
+        """The last steps, and the run before them if they are not all."""
+        return self._steps, self._before
+
     def _make_room(self, run: Run) -> None:
         if len(self._steps) == 2 * KEPT:
             del self._steps[:KEPT]
@@ -211,17 +242,87 @@ class Steps:
 
     def explain(self, category: str) -> Explanation | None:
         """What made the last step's verdict; None where that cannot be said."""
-        if not self._steps:
+        steps, earlier = self._kept()
+        if not steps:
             return None
-        last = self._steps[-1]
-        ended = last.time if last.event == _DEADLINE else None
-        events = [one for one in self._steps if one.event != _DEADLINE]
-        for before in (None, self._before) if self._before is not None else (None,):
+        ended = steps[-1].time if steps[-1].event == _DEADLINE else None
+        events = [one for one in steps if one.event != _DEADLINE]
+        for before in (None, earlier) if earlier is not None else (None,):
             tried = _Trial(self._compiled, before, self._started, category, ended)
             if tried.gives(events):
-                since = self._steps[0].time if before is not None else None
+                since = steps[0].time if before is not None else None
                 return Explanation(*tried.fewest(events), since=since)
         return None
+
+
+class ClockedSteps(Steps):
+    """The same of an automaton with a clock, in `room`, where the module notes it, too: how many steps there were
+    (i64), the runs before each `KEPT` of them (state, `since` and `now`; the last `RUNS`), and the last `RING` steps.
+    """
+
+    _compiled: ClockedProperty
+
+    def __init__(self, compiled: ClockedProperty, time_ns: int) -> None:
+        self.room = memoryview(bytearray(CLOCKED_ROOM))
+        self.owner: object = None
+        super().__init__(compiled, time_ns)
+
+    def begin(self, time_ns: int) -> None:
+        """Forget everything: the run has begun anew."""
+        self._started = time_ns
+        _COUNT.pack_into(self.room, 0, 0)
+
+    def step(self, run: Run, event: int, time_ns: int, sender: Sender) -> Categories:
+        """Let the run take the event."""
+        self._note(run, event, time_ns, sender)
+        return run.step(event, time_ns)
+
+    def expire(self, run: Run) -> Categories:
+        """Let the deadline of the run pass."""
+        self._note(run, _DEADLINE & _EVENT, run.deadline or 0, NOBODY)
+        return run.expire()
+
+    def move(self, owner: object, room: memoryview) -> None:
+        """Keep it from now on where the owner has it."""
+        self.room, self.owner = room[:CLOCKED_ROOM], owner
+
+    def follow(self, earlier: Exits | Steps) -> "ClockedSteps":
+        """Go on from what another has kept of the same property."""
+        assert isinstance(earlier, ClockedSteps)  # noqa: S101  it has the same tables
+        self._started = earlier._started
+        self.room[:] = bytes(earlier.room)
+        return self
+
+    def _note(self, run: Any, event: int, time_ns: int, sender: Sender) -> None:
+        (count,) = _COUNT.unpack_from(self.room)
+        if not count % KEPT:
+            _RUN.pack_into(self.room, _run_at(count // KEPT), run.state, run.since, run.now)
+        source, number, kind = sender
+        who = source << 32 | kind << 24 | event
+        ENTRY.pack_into(self.room, _step_at(count), time_ns, who, number & 0xFFFFFFFF)
+        _COUNT.pack_into(self.room, 0, count + 1)
+
+    def _kept(self) -> tuple[Sequence[Happened], Run | None]:
+        (count,) = _COUNT.unpack_from(self.room)
+        first = max((count - 1) // KEPT - 1, 0)
+        steps = []
+        for number in range(first * KEPT, count):
+            time, who, of_sender = ENTRY.unpack_from(self.room, _step_at(number))
+            event = _DEADLINE if who & _EVENT == _EVENT else who & _EVENT
+            steps.append(Happened(event, time, Sender(who >> 32, of_sender, who >> 24 & 0xFF)))
+        if not first:
+            return steps, None
+        run = ClockedRun(self._compiled, 0)
+        run.state, run.since, run.now = _RUN.unpack_from(self.room, _run_at(first))
+        return steps, run
+
+
+def _run_at(number: int) -> int:
+    return _COUNT.size + _RUN.size * (number % RUNS)
+
+
+def _step_at(number: int) -> int:
+    return _COUNT.size + _RUN.size * RUNS + ENTRY.size * (number % RING)
 
 
 class _Trial:
@@ -299,4 +400,6 @@ def _same(one: Any, other: Any) -> bool:
 
 def history_of(compiled: CompiledProperty, time_ns: int) -> Exits | Steps:
     """What is kept of a run that begins."""
+    if isinstance(compiled, ClockedProperty):
+        return ClockedSteps(compiled, time_ns)
     return Exits(compiled.automaton) if isinstance(compiled, FiniteProperty) else Steps(compiled, time_ns)

@@ -105,11 +105,13 @@ class Lane:
         if walked is None:
             return batch
         gone = self._counts.add(walked, now)
-        if walked.position == len(batch.view) and not gone:
+        if walked.position == len(batch.view) and not gone and not walked.sooner:
             return batch
         passage = Passage(batch, now)
         passage.pieces = pieces
         passage.walked(walked.position, walked.run, gone)
+        if walked.sooner:
+            middle.look_again()
         return self._through(batch, passage)
 
     def _failed(self, error: Exception, walker: Walker, now: int) -> None:
@@ -159,6 +161,8 @@ class Lane:
             passage.walked(passage.end, passage.run, 0)
             return True
         passage.walked(walked.position, walked.run, counts.add(walked, passage.time))
+        if walked.sooner:
+            middle.look_again()
         return passage.position == passage.end
 
     def _prepare(self, monitors: MonitorSet, walker: Walker) -> tuple[Prepared, Counts]:

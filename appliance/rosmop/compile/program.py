@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from appliance.rosmop.compile.specification import SpecificationCode
 from appliance.rosmop.ir import form
-from appliance.rosmop.logics.interface import FiniteProperty
+from appliance.rosmop.logics.interface import ClockedProperty, FiniteProperty
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
         properties += [
             (number, index)
             for index, each in enumerate(specification.properties)
-            if isinstance(each.property, FiniteProperty) and specification.slicing is None
+            if isinstance(each.property, FiniteProperty | ClockedProperty) and specification.slicing is None
         ]
         for index, event in enumerate(specification.events):
             if event.topic is not None and event.part is None:
@@ -97,11 +97,24 @@ def _event(
 ) -> form.Event:
     advances = []
     for each, code in enumerate(specifications[number].properties):
-        if isinstance(code.property, FiniteProperty):
-            automaton = code.property.automaton
-            handled = [bool(set(code.order) & set(verdict)) for verdict in automaton.verdicts]
-            table = tuple(-1 if handled[row[index]] else row[index] for row in automaton.table)
+        compiled, handlers = code.property, set(code.order)
+        if isinstance(compiled, FiniteProperty):
+            automaton = compiled.automaton
+            quiet = [handlers.isdisjoint(verdict) for verdict in automaton.verdicts]
+            table = tuple(row[index] if quiet[row[index]] else -1 for row in automaton.table)
             advances.append(form.Advance(properties.index((number, each)), table, index))
+        elif isinstance(compiled, ClockedProperty):
+            quiet = [handlers.isdisjoint(verdict) for verdict in compiled.verdicts]
+            table, late = (
+                tuple(
+                    2 * state + anew if quiet[state] else -1 for state, anew in (row[index] for row in moves)
+                )
+                for moves in (compiled.moves, compiled.late)
+            )
+            clock = form.Clock(
+                late, compiled.within, tuple(-1 if wait is None else wait.after for wait in compiled.waits)
+            )
+            advances.append(form.Advance(properties.index((number, each)), table, index, clock))
         else:
             advances.append(form.Advance(None, (-1,)))
     return form.Event(specifications[number].events[index].function, place, tuple(advances))

@@ -11,11 +11,13 @@ Python.
   a drop is left, and with `LOUD` a change is (*told*); bits of the topic's specifications (*enabled*).
 - An effect is 16 bytes: a set of events (i64) that changed so many (i64) messages on end, or -1 and from where to
   where (i32, i32) frames were dropped.
+- Where a message brings a property with a clock to a deadline before the time at `Cells.until`, the walk ends behind it
+  with `SOONER`.
 - An event that happened is counted at `Feed.counters`, its drops behind those of all.
 """
 
 import struct
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.rosmop.ir import form
@@ -39,6 +41,7 @@ from appliance.rosmop.ir.wasm import (
     IF,
     NOTHING,
     RETURN,
+    SELECT,
     constant,
     load,
     row,
@@ -47,7 +50,7 @@ from appliance.rosmop.ir.wasm import (
     unsigned,
 )
 from appliance.rosmop.runtime.context import BUDGET
-from appliance.rosmop.why import ENTRY, NO_NUMBER, SEQ
+from appliance.rosmop.why import CLOCKED_ROOM, ENTRY, KEPT, NO_NUMBER, RING, RUNS, SEQ
 
 POSITION, EFFECT = 0, 4
 """Where it stands which frame is looked at, and the address of the last effect."""
@@ -56,6 +59,7 @@ AREA = 512 << 10
 """Bytes of frames that are fed together: as many as one read takes."""
 
 LEFT = 1 << 62
+SOONER = 1 << 61
 LOUD = 1 << 63
 MAX_EVENTS = 63
 MAX_EFFECTS = 4096
@@ -118,8 +122,8 @@ def module_of(
     for component in components:
         variables = (*component.variables, *component.noted)
         room = component.properties + len(variables)
-        base, source = writer.take(8 * room), writer.take(24)
-        cells.append(Cells(base, component.properties, source, frozenset(component.noted)))
+        base, source, until = writer.take(8 * room), writer.take(24), writer.take(8)
+        cells.append(Cells(base, component.properties, source, frozenset(component.noted), until=until))
         shared |= dict.fromkeys(variables, cells[-1])
     effects = writer.take(16 * (MAX_EFFECTS + 2))
     feeds: dict[str, Feed] = {}
@@ -139,20 +143,24 @@ def module_of(
 
 
 class _Tables:
-    """The tables of properties: 2 bytes for each state."""
+    """The tables of properties: 2 bytes for each state; of times 8."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
-        self.known: dict[tuple[int, ...], int] = {}
+        self.known: dict[bytes, int] = {}
         self._size = 0
 
-    def address(self, table: tuple[int, ...]) -> int:
-        if table not in self.known:
-            self._size += 2 * len(table)
+    def address(self, table: tuple[int, ...], code: str = "h") -> int:
+        try:
+            raw = struct.pack(f"<{len(table)}{code}", *table)
+        except struct.error:
+            raise NotScalarError("a table of a property") from None
+        if raw not in self.known:
+            self._size += len(raw)
             if self._size > MAX_TABLES:
                 raise NotScalarError("tables of properties")
-            self.known[table] = self._writer.take(2 * len(table))
-        return self.known[table]
+            self.known[raw] = self._writer.take(len(raw))
+        return self.known[raw]
 
 
 _AT, _END, _NOW, _TOLD, _ENABLED = range(5)
@@ -187,6 +195,7 @@ class _Walk:
         self._events = events
         self._effects = effects
         self._written = [writer.event(event.function) for event in events]
+        self._known_tables = tables
         self._tables = [[tables.address(each.table) for each in event.advances] for event in events]
         for event, written in zip(events, self._written, strict=True):
             if not written.passes and any(max(each.table) < 0 for each in event.advances):
@@ -206,9 +215,16 @@ class _Walk:
         }
         for each in (each for event in events for each in event.advances):
             if each.property is not None and each.property not in cells.exits:
-                cells.exits[each.property] = writer.take(ENTRY.size * len(each.table))
+                room = ENTRY.size * len(each.table) if each.clock is None else CLOCKED_ROOM
+                cells.exits[each.property] = writer.take(room)
+                if each.clock is not None:
+                    cells.clocks[each.property] = writer.take(16)
         self._stamped = stamped
         self._following = _FIRST + len(events) + len(self._states)
+        self._sooner = self._following + 2
+        clocked = sorted(properties.intersection(cells.clocks))
+        self._clocks = {number: self._following + 3 + 3 * place for place, number in enumerate(clocked)}
+        """Of each property with a clock the locals for what stands at `Cells.clocks`, and its number of steps."""
 
     def feed(self, name: str) -> Feed:
         """What is said about it."""
@@ -232,6 +248,7 @@ class _Walk:
             _set(_TOLD, load(I64, self._cells.source + 8)),
             _set(_ENABLED, load(I64, self._cells.source + 16)),
             *(_set(local, load(I32, self._state(number))) for number, local in self._states.items()),
+            *(_set(local, load(I64, at)) for local, at in self._clock_cells()),
             self._begin(), _BLOCK, _BLOCK, _LOOP,
             self._frame(),
             _BLOCK, _BLOCK,
@@ -241,16 +258,24 @@ class _Walk:
             self._dropped(), END,
             self._done(),
             _BR + b"\x00", END, END,
-            here, RETURN, END,
+            here, _get(self._sooner), b"\xad", constant(I64, 61), _SHL64, _OR64, RETURN, END,
             here, constant(I64, LEFT), _OR64, END,
         ]  # fmt: skip
-        numbered = [I32] * (len(self._events) + len(self._states) + 2)
-        made = [I64, I64, I32, I32, I64, I32, *numbered]
+        numbered = [I32] * (len(self._events) + len(self._states) + 3)
+        made = [I64, I64, I32, I32, I64, I32, *numbered, *[I64] * 3 * len(self._clocks)]
         whole = row([b"\x01" + bytes((machine,)) for machine in made]) + b"".join(body)
         return unsigned(len(whole)) + whole
 
     def _state(self, number: int) -> int:
         return self._cells.base + 8 * number
+
+    def _clock_cells(self) -> Iterator[tuple[int, int]]:
+        """The locals of clocks, and where they stand."""
+        for number, local in self._clocks.items():
+            clock = self._cells.clocks[number]
+            yield from zip(
+                range(local, local + 3), (clock, clock + 8, self._cells.exits[number]), strict=True
+            )
 
     def _begin(self) -> bytes:
         """Nothing has happened to the frame at hand: the runtime stops, if it does, at calls and where loops begin."""
@@ -305,7 +330,7 @@ class _Walk:
         steps = [
             self._advance(each, table)
             for each, table in zip(event.advances, self._tables[number], strict=True)
-            if any(target != state for state, target in enumerate(each.table))
+            if each.clock is not None or any(target != state for state, target in enumerate(each.table))
         ]
         if steps:
             code += self._is(bits, HAPPENED) + IF + NOTHING + b"".join(steps) + END
@@ -318,6 +343,8 @@ class _Walk:
         left = b"\x06"
         if advance.property is None:
             return _BR + left
+        if advance.clock is not None:
+            return self._advance_clock(advance.property, advance.clock, advance.event, table)
         state = self._states[advance.property]
         following, room = self._following, self._following + 1
         code = _set(following, _get(state) + constant(I32, 1) + b"\x74\x2e\x00" + unsigned(table)) + _get(
@@ -333,6 +360,42 @@ class _Walk:
         if self._stamped:
             code += _get(room) + _get(_AT) + b"\x28\x00\x04\x36\x00" + unsigned(exits + 16)
         return code + _set(state, _get(following)) + END
+
+    def _advance_clock(self, number: int, clock: form.Clock, event: int, table: int) -> bytes:
+        """The same of a property with a clock, as `ClockedRun` and `ClockedSteps` do it."""
+        state, (since, now, count) = (
+            self._states[number],
+            range(self._clocks[number], self._clocks[number] + 3),
+        )
+        following, room, exits = self._following, self._following + 1, self._cells.exits[number]
+
+        def slot(entries: int, size: int, shift: int) -> bytes:
+            place = _get(count) + constant(I64, shift) + _SHR64 + constant(I64, entries - 1) + _AND64
+            return _set(room, place + b"\xa7" + constant(I32, size) + b"\x6c")
+
+        code = _get(count) + constant(I64, KEPT - 1) + _AND64 + _EQZ64 + IF + NOTHING
+        code += slot(RUNS, 24, KEPT.bit_length() - 1)
+        for place, value in enumerate((_get(state) + b"\xad", _get(since), _get(now))):
+            code += _get(room) + value + b"\x37\x00" + unsigned(exits + 8 + 8 * place)
+        code += END + slot(RING, ENTRY.size, 0)
+        kind = constant(I64, (SEQ if self._stamped else NO_NUMBER) << 24 | event)
+        for place, value in enumerate((_get(_NOW), load(I64, self._cells.source) + kind + _OR64)):
+            code += _get(room) + value + b"\x37\x00" + unsigned(exits + 8 + 24 * RUNS + 8 * place)
+        seq = _get(_AT) + b"\x28\x00\x04" if self._stamped else constant(I32, 0)
+        code += _get(room) + seq + b"\x36\x00" + unsigned(exits + 8 + 24 * RUNS + 16)
+        code += _set(count, _get(count) + constant(I64, 1) + b"\x7c")
+        code += _set(now, _get(_NOW) + _get(now) + _get(_NOW) + _get(now) + b"\x55" + SELECT)
+        late, waits = (self._known_tables.address(*each) for each in ((clock.late, "h"), (clock.waits, "q")))
+        is_late = _get(now) + _get(since) + b"\x7d" + constant(I64, clock.within) + b"\x55"
+        code += constant(I32, late) + constant(I32, table) + is_late + SELECT
+        code += _get(state) + constant(I32, 1) + b"\x74" + _ADD + b"\x2e\x00\x00"
+        code = _set(following, code) + _get(following) + constant(I32, 0) + b"\x48" + _BR_IF + b"\x06"
+        code += _get(following) + constant(I32, 1) + _AND + IF + NOTHING + _set(since, _get(now)) + END
+        code += _set(state, _get(following) + constant(I32, 1) + b"\x75")
+        wait = _get(state) + constant(I32, 3) + b"\x74\x29\x00" + unsigned(waits)
+        sooner = _get(since) + wait + b"\x7c" + load(I64, self._cells.until) + b"\x53"
+        code += wait + constant(I64, 0) + b"\x59" + sooner + _AND
+        return code + IF + NOTHING + _set(self._sooner, constant(I32, 1)) + END
 
     def _count(self, place: int, more: bytes) -> bytes:
         address = self._counters + 8 * place
@@ -400,7 +463,9 @@ class _Walk:
         code += b"".join(
             store(I32, self._state(number), _get(local)) for number, local in self._states.items()
         )
-        return code + _set(_AT, _get(_NEXT)) + self._begin()
+        code += b"".join(store(I64, at, _get(local)) for local, at in self._clock_cells())
+        code += _set(_AT, _get(_NEXT)) + self._begin()
+        return code + (_get(self._sooner) + _BR_IF + b"\x01" if self._clocks else b"")
 
 
 def _assembled(
@@ -417,8 +482,7 @@ def _assembled(
     ]
     pages = unsigned(memory // _PAGE)
     data = []
-    for table, address in tables.known.items():
-        raw = struct.pack(f"<{len(table)}h", *table)
+    for raw, address in tables.known.items():
         data.append(b"\x00" + constant(I32, address) + END + unsigned(len(raw)) + raw)
     sections = (
         (1, row(types)),

@@ -632,15 +632,28 @@ class Function:
 
 
 @dataclass(frozen=True, slots=True)
+class Clock:
+    """Of a property with a clock: the table where more than `within` ns have passed since it began, and for each state
+    how long after that its deadline is (-1: it has none).
+    """
+
+    late: tuple[int, ...]
+    within: int
+    waits: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Advance:
     """What an event does to a property: the next state for each of its states; -1 where a handler runs then, or where
     the property has no table of states. `property` is its number among those with tables; None without one. `event` is
-    the event's number in its specification.
+    the event's number in its specification. With a `clock` there is twice the next state, and one more where it begins
+    anew.
     """
 
     property: int | None
     table: tuple[int, ...]
     event: int = 0
+    clock: Clock | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -100,7 +100,11 @@ class Cells:
     """
     noted: frozenset[str] = frozenset()
     exits: dict[int, int] = field(default_factory=dict)
-    """Where it is kept how the states of a property were left (`why.Exits`), by its number."""
+    """Where it is kept how the states of a property were left (`why.Exits`, `why.ClockedSteps`), by its number."""
+    clocks: dict[int, int] = field(default_factory=dict)
+    """Where it stands when the clock of a property began, and its time (`ClockedRun`), by its number."""
+    until: int = 0
+    """Where it stands (i64) when the next is due that Python knows of: an earlier deadline is told."""
     variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
     """Where each stands, and its type; in the order of the places."""
 

@@ -16,13 +16,13 @@ Theory of operation for the caller of a run:
    After ``expire()`` handlers of the first category named run first (``timeout`` before the state entered).
 4. Times are integer nanoseconds and never run backwards; a time before the last one counts as the last one.
 
-A ``FiniteProperty`` offers its tables as well, so that generated code can step it inline.
+A ``FiniteProperty`` and a ``ClockedProperty`` offer their tables as well, so that a module can step them.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from appliance.rosmop.logics.automaton import Automaton
 from appliance.rosmop.positions import Finding, Position
@@ -166,6 +166,86 @@ class FiniteRun:
     def expire(self) -> Categories:
         """Never right: there is no deadline."""
         raise ValueError("this run has no deadline")
+
+
+Move = tuple[int, bool]
+"""The next state, and whether the clock begins anew."""
+
+
+class Wait(NamedTuple):
+    """What a state waits for: how long (ns) after the clock began its deadline is, and what follows then."""
+
+    after: int
+    move: Move
+    told: Categories
+
+
+class ClockedProperty(CompiledProperty):
+    """A property whose monitor is an automaton with one clock.
+
+    ``moves[state][event]`` is the move at an event, ``late`` the same where more than ``within`` (ns) has passed since
+    the clock began. ``verdicts`` are the categories after an event that leads to a state, ``waits`` what it waits for.
+    """
+
+    initial: int
+    moves: Sequence[Sequence[Move]]
+    late: Sequence[Sequence[Move]]
+    within: int
+    verdicts: Sequence[Categories]
+    waits: Sequence[Wait | None]
+
+    @property
+    def timed(self) -> bool:
+        """Always."""
+        return True
+
+    def start(self, time_ns: int) -> Run:
+        """A run whose clock begins at ``time_ns``."""
+        return ClockedRun(self, time_ns)
+
+
+class ClockedRun:
+    """A run over such tables: the state, when its clock began, and the time."""
+
+    __slots__ = ("_tables", "now", "since", "state")
+    __copy__ = twin
+
+    def __init__(self, tables: ClockedProperty, time_ns: int) -> None:
+        self._tables = tables
+        self.state = tables.initial
+        self.now = self.since = time_ns
+
+    @property
+    def deadline(self) -> int | None:
+        """When the wait of the state is over."""
+        wait = self._tables.waits[self.state]
+        return None if wait is None else self.since + wait.after
+
+    def step(self, event: int, time_ns: int) -> Categories:
+        """Take the event."""
+        tables = self._tables
+        if time_ns > self.now:
+            deadline = self.deadline
+            if deadline is not None and time_ns > deadline:
+                raise ValueError("the deadline has passed: expire the run first")
+            self.now = time_ns
+        moves = tables.late if self.now - self.since > tables.within else tables.moves
+        self._move(moves[self.state][event])
+        return tables.verdicts[self.state]
+
+    def expire(self) -> Categories:
+        """Let the deadline pass."""
+        wait = self._tables.waits[self.state]
+        if wait is None:
+            raise ValueError("this run has no deadline")
+        self.now = self.since + wait.after
+        self._move(wait.move)
+        return wait.told
+
+    def _move(self, move: Move) -> None:
+        self.state, restarts = move
+        if restarts:
+            self.since = self.now
 
 
 Compiler = Callable[[Source], CompiledProperty]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from appliance.rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty
-from appliance.rosmop.logics.pattern import MODES, TimedPattern
+from appliance.rosmop.logics.pattern import TimedPattern
 from appliance.rosmop.logics.tfsm import TimedMachine
 
 TIME = "<time>"
@@ -133,14 +133,14 @@ def _pattern_graph(compiled: TimedPattern) -> Graph:
     for mode, expiry in enumerate(compiled.expiries):
         row: list[tuple[tuple[str, ...], int]] = []
         for event, name in enumerate(compiled.events):
-            row.append(((name,), compiled.in_time[mode][event][0]))
+            row.append(((name,), compiled.moves[mode][event][0]))
             if expiry is None:
                 row.append(((TIME, name), compiled.late[mode][event][0]))
         if expiry is not None:
             row.append(((TIME,), size + expiry))
         edges.append(tuple(row))
     told = tuple((*compiled.at_expiry, *verdict) for verdict in compiled.verdicts)
-    initial = MODES.index(compiled.pattern.initial())
+    initial = compiled.initial
     if not size:
-        return Graph(initial, tuple(edges), compiled.verdicts)
+        return Graph(initial, tuple(edges), told)
     return Graph(initial, (*edges, *edges), (*compiled.verdicts, *told))

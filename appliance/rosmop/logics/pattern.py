@@ -36,7 +36,15 @@ from dataclasses import dataclass
 from typing import Literal
 
 from appliance.rosmop.logics.automaton import explore
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty, Run, Source, twin
+from appliance.rosmop.logics.interface import (
+    Categories,
+    ClockedProperty,
+    CompiledProperty,
+    FiniteProperty,
+    Move,
+    Source,
+    Wait,
+)
 from appliance.rosmop.logics.lexer import Token, TokenReader
 
 VIOLATION: Categories = ("violation",)
@@ -169,16 +177,11 @@ def _reachable(pattern: Pattern, mode: Mode, events: int) -> set[Mode]:
     return found
 
 
-Move = tuple[int, bool]
-"""The next mode (its number), and whether the clock restarts."""
+class TimedPattern(ClockedProperty):
+    """A pattern with a time bound, as tables: a state is a mode's number.
 
-
-class TimedPattern(CompiledProperty):
-    """A pattern with a time bound, as tables.
-
-    ``in_time[mode][event]`` is the move while at most ``pattern.within_ns`` has passed since the clock
-    started, ``late`` the move after that; ``expiries[mode]`` is the mode after the deadline, or None where
-    there is none; ``at_expiry`` is told then, before the verdict.
+    ``expiries[mode]`` is the mode after the deadline, or None where there is none; ``at_expiry`` is told then, before
+    the verdict.
     """
 
     def __init__(self, source: Source, pattern: Pattern, remedy: str | None) -> None:
@@ -186,16 +189,23 @@ class TimedPattern(CompiledProperty):
         super().__init__(source, ("violation", "validation", *self.at_expiry))
         self.remedy = remedy
         self.pattern = pattern
-        self.within_ns = pattern.within_ns or 0
+        self.within = pattern.within_ns or 0
+        self.initial = MODES.index(pattern.initial())
         known = verdicts(pattern, len(source.events))
         self.verdicts = tuple(known[mode] for mode in MODES)
-        self.in_time = self._moves(late=False)
+        self.moves = self._moves(late=False)
         self.late = self._moves(late=True)
         self.expiries = tuple(
             MODES.index(after)
             if (after := pattern.after_deadline(mode)) != mode and not known[mode]
             else None
             for mode in MODES
+        )
+        self.waits = tuple(
+            None
+            if mode is None
+            else Wait(self.within, (mode, False), (*self.at_expiry, *self.verdicts[mode]))
+            for mode in self.expiries
         )
 
     def _moves(self, *, late: bool) -> tuple[tuple[Move, ...], ...]:
@@ -208,15 +218,6 @@ class TimedPattern(CompiledProperty):
             table.append(tuple(row))
         return tuple(table)
 
-    @property
-    def timed(self) -> bool:
-        """Always."""
-        return True
-
-    def start(self, time_ns: int) -> Run:
-        """A run whose scope, if nothing has to open it, opens at ``time_ns``."""
-        return TimedPatternRun(self, time_ns)
-
     def blocking_refused(self, category: str) -> str | None:
         """What a deadline decides is decided when no message comes."""
         super().blocking_refused(category)
@@ -228,52 +229,6 @@ class TimedPattern(CompiledProperty):
             f"`{kind} … within` is decided by a deadline, when the message that would have to be stopped "
             "has long been passed on"
         )
-
-
-class TimedPatternRun:
-    """A run: the mode, and the instant that the time bound counts from."""
-
-    __slots__ = (
-        "_at_expiry", "_expiries", "_in_time", "_late", "_verdicts", "_within", "deadline", "mode", "now", "since",
-    )  # fmt: skip
-    __copy__ = twin
-
-    def __init__(self, compiled: TimedPattern, time_ns: int) -> None:
-        self._verdicts = compiled.verdicts
-        self._in_time = compiled.in_time
-        self._late = compiled.late
-        self._expiries = compiled.expiries
-        self._at_expiry = compiled.at_expiry
-        self._within = compiled.within_ns
-        self.now = self.since = time_ns
-        self.deadline: int | None = None
-        self._enter(MODES.index(compiled.pattern.initial()))
-
-    def _enter(self, mode: int) -> None:
-        self.mode = mode
-        self.deadline = None if self._expiries[mode] is None else self.since + self._within
-
-    def step(self, event: int, time_ns: int) -> Categories:
-        """Take the event."""
-        if self.now < time_ns:
-            if self.deadline is not None and time_ns > self.deadline:
-                raise ValueError("the deadline has passed: expire the run first")
-            self.now = time_ns
-        moves = self._late if self.now - self.since > self._within else self._in_time
-        mode, restarts = moves[self.mode][event]
-        if restarts:
-            self.since = self.now
-        self._enter(mode)
-        return self._verdicts[mode]
-
-    def expire(self) -> Categories:
-        """Let the deadline pass."""
-        mode = self._expiries[self.mode]
-        if mode is None or self.deadline is None:
-            raise ValueError("this run has no deadline")
-        self.now = self.deadline
-        self._enter(mode)
-        return (*self._at_expiry, *self._verdicts[mode])
 
 
 def compile_pattern(source: Source) -> CompiledProperty:

@@ -11,17 +11,18 @@ second passes after an event without another; the state stays.
 
 from appliance.rosmop.logics.automaton import Automaton
 from appliance.rosmop.logics.fsm import FAIL, TIMEOUT, machine_automaton, read_machine
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, Source, twin
+from appliance.rosmop.logics.interface import ClockedProperty, Source, Wait
 
 SILENCE_NS = 10**9
 """How long a machine without timeout clauses waits for the next event."""
 
 
-class TimedMachine(CompiledProperty):
+class TimedMachine(ClockedProperty):
     """A compiled ``tfsm``.
 
     ``automaton`` has the transitions on events; ``timeouts[state]`` is (nanoseconds, next state) or None.
-    With ``silence_ns`` set there are no timeout clauses, and the clock runs after each event.
+    With ``silence_ns`` set there are no timeout clauses, and the clock runs after each event: each state is
+    there twice, as it is after an event and, behind those, as it is where nothing is waited for.
     """
 
     expiry = TIMEOUT
@@ -37,15 +38,20 @@ class TimedMachine(CompiledProperty):
         self.automaton = automaton
         self.timeouts = timeouts
         self.silence_ns = None if any(timeouts) else SILENCE_NS
-
-    @property
-    def timed(self) -> bool:
-        """Always."""
-        return True
-
-    def start(self, time_ns: int) -> Run:
-        """A run whose initial state is entered at ``time_ns``."""
-        return _ClockRun(self, time_ns) if self.silence_ns is None else _SilenceRun(self, time_ns)
+        size, self.within = len(automaton), 0
+        self.initial, self.verdicts = automaton.initial, automaton.verdicts
+        self.moves = self.late = tuple(tuple((target, True) for target in row) for row in automaton.table)
+        self.waits = tuple(
+            None
+            if timeout is None
+            else Wait(timeout[0], (timeout[1], True), (TIMEOUT, *automaton.verdicts[timeout[1]]))
+            for timeout in timeouts
+        )
+        if self.silence_ns is not None:
+            self.initial += size
+            self.verdicts, self.moves, self.late = 2 * self.verdicts, 2 * self.moves, 2 * self.late
+            silent = [Wait(self.silence_ns, (size + state, True), (TIMEOUT,)) for state in range(size)]
+            self.waits = (*silent, *[None] * size)
 
     def categories_after(self, event: int) -> frozenset[str]:
         """The categories of the states this event leads to (``timeout`` needs no event)."""
@@ -71,68 +77,3 @@ def compile_tfsm(source: Source) -> TimedMachine:
     timeouts.append(None)
     categories = [*machine.states, *machine.aliases, FAIL, TIMEOUT]
     return TimedMachine(source, categories, machine_automaton(source, machine), tuple(timeouts))
-
-
-class _ClockRun:
-    """A run of a machine with timeout clauses: the deadline is that of the state."""
-
-    __slots__ = ("_table", "_timeouts", "_verdicts", "deadline", "now", "state")
-    __copy__ = twin
-
-    def __init__(self, machine: TimedMachine, time_ns: int) -> None:
-        self._table = machine.automaton.table
-        self._verdicts = machine.automaton.verdicts
-        self._timeouts = machine.timeouts
-        self.now = time_ns
-        self.deadline: int | None = None
-        self._enter(machine.automaton.initial)
-
-    def _enter(self, state: int) -> None:
-        self.state = state
-        timeout = self._timeouts[state]
-        self.deadline = None if timeout is None else self.now + timeout[0]
-
-    def step(self, event: int, time_ns: int) -> Categories:
-        if time_ns > self.now:
-            if self.deadline is not None and time_ns > self.deadline:
-                raise ValueError("the deadline has passed: expire the run first")
-            self.now = time_ns
-        self._enter(self._table[self.state][event])
-        return self._verdicts[self.state]
-
-    def expire(self) -> Categories:
-        timeout = self._timeouts[self.state]
-        if timeout is None or self.deadline is None:
-            raise ValueError("this run has no deadline")
-        self.now = self.deadline
-        self._enter(timeout[1])
-        return (TIMEOUT, *self._verdicts[self.state])
-
-
-class _SilenceRun:
-    """A run of a machine without timeout clauses: a second of silence after an event is told once."""
-
-    __slots__ = ("_table", "_verdicts", "deadline", "now", "state")
-    __copy__ = twin
-
-    def __init__(self, machine: TimedMachine, time_ns: int) -> None:
-        self._table = machine.automaton.table
-        self._verdicts = machine.automaton.verdicts
-        self.now = time_ns
-        self.state = machine.automaton.initial
-        self.deadline: int | None = None
-
-    def step(self, event: int, time_ns: int) -> Categories:
-        if time_ns > self.now:
-            if self.deadline is not None and time_ns > self.deadline:
-                raise ValueError("the deadline has passed: expire the run first")
-            self.now = time_ns
-        self.deadline = self.now + SILENCE_NS
-        self.state = self._table[self.state][event]
-        return self._verdicts[self.state]
-
-    def expire(self) -> Categories:
-        if self.deadline is None:
-            raise ValueError("this run has no deadline")
-        self.now, self.deadline = self.deadline, None
-        return (TIMEOUT,)

@@ -29,6 +29,13 @@ _LOGICS = (
     "ptltl: e0 -> (*) (e0 or e1){violation}{validation}",
     "cfg: S -> e0 S e1 | epsilon{match}{fail}",
     "mtl: once[0,1ms] e0{violation}",
+    "tfsm: here [ e0 -> there, default here ] there [ e1 -> here, timeout 1500us -> three, default there ]"
+    " three [ default here, timeout 1ms -> here ]{here}{three}",
+    "tfsm: here [ default there ] there [ default here ]{there}{timeout}",
+    "pattern: globally: e0 causes e1 within 2ms{violation}",
+    "pattern: after e0 until e1: no e0 within 1ms{violation}",
+    "pattern: globally: e1 requires e0 within 800us{violation}{validation}",
+    "pattern: globally: e0 forbids e1 within 800us{violation}",
 )
 _HANDLERS = (*[""] * 8, "@{} {{ }}", '@{} {{ ROS_WARN("{}"); }}', "@{} {{ DROP; }}", "@{} {{ __RESET; }}",
              "@{} {{ total = total + 1; }}")  # fmt: skip
@@ -104,7 +111,7 @@ class Specifications:
     def _property(self) -> str:
         logic = self._random.choice(_LOGICS)
         found: dict[str, str] = {}
-        for category in ("here", "there", "three", "match", "fail", "violation", "validation"):
+        for category in ("here", "there", "three", "match", "fail", "violation", "validation", "timeout"):
             handler = self._random.choice(_HANDLERS)
             found[category] = "\n" + handler.format(category, category)
         text = logic.format(**found)

@@ -13,8 +13,8 @@ from appliance.rosmop import walking
 from appliance.rosmop.engine import MonitorSet, OnFault
 from appliance.rosmop.ir.feed import AREA, MAX_EFFECTS
 from appliance.rosmop.ir.module import MOST_TEXTS
-from appliance.rosmop.logics.interface import FiniteRun
-from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.logics.interface import ClockedRun, FiniteRun
+from appliance.rosmop.outcomes import Outcome, Verdict
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walking import BEGINNING, Walker
@@ -50,6 +50,10 @@ class Fed:
             for monitor in one.monitors:
                 monitor.seen = True
         self.came: Counter[str] = Counter()
+        self.told: list[Verdict] = []
+        """Each verdict, and why, in order."""
+        self.interpreted: list[Verdict] = []
+        """The same of the interpreter."""
         self._inside = False
         """Whether messages stand in the module's memory, every other time."""
 
@@ -64,6 +68,7 @@ class Fed:
         expected = []
         for body in bodies:
             outcome = self.interpreter.process(topic, bytearray(body), time)
+            self.interpreted += (one for each in (*outcome.before, outcome) for one in each.verdicts)
             self.came[outcome.result if not outcome.faults else "fault"] += 1
             if outcome.result != "dropped":
                 expected.append(bytes(outcome.buffer))
@@ -95,6 +100,7 @@ class Fed:
             first = position + 4
             following = first + int.from_bytes(view[position:first], "little")
             outcome = self.monitors.process(topic, view[first:following], time)
+            self.told += (one for each in (*outcome.before, outcome) for one in each.verdicts)
             if outcome.result == "dropped":
                 pieces.append(view[run:position])
                 run = following
@@ -111,6 +117,8 @@ def _state(monitors: MonitorSet) -> list[str]:
         names = monitors.compiled.namespace
         state += [f"{name} {names.get(code)!r}" for name, code in monitor.code.variables.items()]
         state += [str(one.run.state) for one in monitor.properties if isinstance(one.run, FiniteRun)]
+        clocked = [one.run for one in monitor.properties if isinstance(one.run, ClockedRun)]
+        state += [f"{run.state} since {run.since} at {run.now}" for run in clocked]
     return [*state, *map(str, monitors.take_margins())]
 
 
@@ -559,6 +567,58 @@ def test_walks_wait_while_something_is_due() -> None:
     assert not fed.monitors.walks(fed.walker(), 2_000_000)
     fed.check([plain()], time=1_500_000)
     assert fed.state() == ["n 31"]
+
+
+CLOCKED = (
+    "tfsm: a [ e -> b, o -> a ] b [ e -> a, o -> b, timeout 3ms -> c ] c [ default a, timeout 1ms -> a ]"
+    " @c { n++; } @timeout { m++; }",
+    "tfsm: a [ e -> b, o -> a ] b [ default a ] @timeout { n++; }",
+    "pattern: globally: e causes o within 3ms @violation { n++; __RESET; }",
+    "pattern: after e until o: some e within 2ms @violation { n++; __RESET; } @validation { m++; }",
+    "pattern: globally: e requires o within 2ms @violation { n++; __RESET; }",
+    "pattern: globally: o forbids e within 2ms @violation { n++; __RESET; }",
+    "pattern: until o: no e within 2ms @violation { n++; __RESET; } @validation { m++; }",
+)
+
+
+@pytest.mark.parametrize("text", CLOCKED)
+def test_properties_with_clocks(text: str) -> None:
+    """States, clocks, deadlines, handlers and explanations, as of the interpreter; far more steps than are kept.
+
+    Where a message brings an earlier deadline, that is due before the next one.
+    """
+    fed = Fed(
+        f"""s() {{ int n = 0; int m = 0; int k = 0;
+        event e(int c) /plain own/Plain '{{count:c}}' when (c % 3 == 0) {{ if (c == 9) {{ k = 1 / (k - k); }} }}
+        event o(int c) /plain own/Plain '{{count:c}}' when (c % 3 == 1) {{ k++; }} {text} }}"""
+    )
+    random, time = Random(3), 0  # noqa: S311  draws examples, not keys
+    for number in range(150):
+        time += random.choice((0, 300_000, 900_000, 2_000_000, 4_000_000, 1_100_000_000))
+        quiet = number // 40 % 2
+        bodies = [
+            plain(random.choice((0, 1) if number % 9 else (0, 1, 2, 9)))
+            for _ in range(random.choice((1, 1, 2, 40 * quiet + 1)))
+        ]
+        fed.check(bodies, time=time)
+    assert fed.came["together"] > 10
+    assert fed.told == fed.interpreted
+    assert len(fed.told) > 5
+    assert all(one.why for one in fed.told)
+
+
+def test_a_deadline_that_comes_in_a_walk_is_known_at_once() -> None:
+    """Whoever asks, when is the next due; one that is put off is due again when it was."""
+    fed = Fed("""s() { event a() /plain own/Plain '{count:1}' { } event b() /plain own/Plain '{count:2}' { }
+        event tick() every 1s { } pattern: globally: a causes b within 1ms @violation { } }""")
+    fed.check([plain(1)], time=5_000_000)
+    fed.check([plain(2)], time=5_000_500)
+    fed.check([plain(3), plain(1), plain(3)], time=5_000_700)
+    assert fed.came["together"] == 3
+    assert fed.monitors.next_due == 6_000_001
+    assert [one.timer for one in fed.monitors.advance(6_000_001)] == []
+    assert fed.monitors.next_due == 6_000_701
+    assert [one.timer for one in fed.monitors.advance(6_000_701)] == ["s.deadline"]
 
 
 def test_a_disabled_monitor_has_no_part_in_a_walk() -> None:

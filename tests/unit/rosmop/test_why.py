@@ -14,8 +14,8 @@ from appliance.rosmop.deciding import Meaning, deciding
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics import mtl, ptcaret, ptltl
 from appliance.rosmop.logics.formula import read_formula
-from appliance.rosmop.logics.interface import CompiledProperty, FormulaError, Run
-from appliance.rosmop.why import NOBODY, SEQ, Explanation, Happened, Sender, Steps, history_of
+from appliance.rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError, Run
+from appliance.rosmop.why import NOBODY, SEQ, ClockedSteps, Explanation, Happened, Sender, Steps, history_of
 from tests.unit.rosmop.acting import definitions, message
 from tests.unit.rosmop.logics.driving import compiled, seeded
 from tests.unit.rosmop.logics.temporal import ARITY, BOOLEAN, Printer, draw
@@ -176,6 +176,32 @@ def explained(
         event = random.randrange(len(made.events))
         note(event, now, number, history.step(run, event, now, Sender(7, number, SEQ)))
     return found
+
+
+@pytest.mark.parametrize("logic", ["tfsm", "pattern"])
+def test_what_is_kept_of_a_clock_is_what_steps_keep(logic: str) -> None:
+    """In a room of fixed size, whatever the length of the trace."""
+    random, compared = seeded(43), 0
+    for _ in range(12):
+        made = compiled(logic, MAKERS[logic](random), EVENTS)
+        if not isinstance(made, ClockedProperty):
+            continue
+        ways = [(made.start(0), kept(made, 0)) for kept in (Steps, ClockedSteps)]
+        now = 0
+        for number in range(400):
+            now += random.randrange(1, 3) * MILLISECOND
+            event, told = random.randrange(len(made.events)), []
+            for run, history in ways:
+                said = []
+                while (deadline := run.deadline) is not None and deadline < now:
+                    said += [history.explain(one) for one in history.expire(run)]
+                categories = history.step(run, event, now, Sender(7, number, SEQ))
+                if number % 7 == 0:
+                    said += [history.explain(one) for one in categories]
+                told.append(said)
+            assert told[0] == told[1]
+            compared += len(told[0])
+    assert compared > 50
 
 
 @pytest.mark.parametrize("logic", MAKERS)

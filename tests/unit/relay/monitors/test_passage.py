@@ -20,7 +20,7 @@ from appliance.relay.monitors.places import Place
 from appliance.relay.report import Reporter
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.logics.interface import FiniteRun
+from appliance.rosmop.logics.interface import ClockedRun, FiniteRun
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walking import Walked
 from tests.support.relay_memory import share
@@ -110,13 +110,16 @@ class Monitored:
         return self.middle.telling.rows(self.set.monitors, self.middle.now())
 
     def state(self) -> list[object]:
-        """Variables, states of properties, what is due."""
-        state: list[object] = [self.set.next_due]
+        """Variables, states of properties, what is due (`next_due` may be too early: what moves on is asked later)."""
+        state: list[object] = []
         for monitor in self.set.monitors:
             state.append((monitor.name, monitor.seen, monitor.faults, monitor.held))
             names = self.set.compiled.namespace
             state += [(name, repr(names.get(code))) for name, code in monitor.code.variables.items()]
-            state += [one.run.state for one in monitor.properties if isinstance(one.run, FiniteRun)]
+            state += [
+                one.run.state for one in monitor.properties if isinstance(one.run, FiniteRun | ClockedRun)
+            ]
+            state += [timer.due for timer in monitor.timers]
             state += [one.run.deadline for one in monitor.properties]
         return state
 
