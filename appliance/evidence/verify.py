@@ -84,11 +84,8 @@ def opened(place: Path) -> tuple[list[str], Opener]:
         archive = zipfile.ZipFile(place)
         return archive.namelist(), archive.open
     paths = [path for path in place.rglob("*") if path.is_symlink() or not path.is_dir()]
-    ours = {path: path.relative_to(place).as_posix() for path in paths}
-    names = [
-        f"{ours[path]}" if path.is_file() and not path.is_symlink() else f"{ours[path]} (no file)"
-        for path in paths
-    ]
+    strange = {path: "" if path.is_file() and not path.is_symlink() else " (no file)" for path in paths}
+    names = [path.relative_to(place).as_posix() + strange[path] for path in paths]
     return names, lambda name: (place / name).open("rb")
 
 
@@ -248,11 +245,8 @@ class Verifier:
     def look_at_checkpoint(self, checkpoint: dict[str, Any], sequence: int, digest: str) -> None:
         """Whether the key signed it, it seals these records, and it is the one that another machine has."""
         number = checkpoint["number"]
-        if (checkpoint["log"], checkpoint["sequence"], checkpoint["hash"]) != (
-            self.manifest["log"],
-            sequence,
-            digest,
-        ):
+        sealed = checkpoint["log"], checkpoint["sequence"], checkpoint["hash"]
+        if sealed != (self.manifest["log"], sequence, digest):
             self.findings.append(f"checkpoint {number}: seals other records than those up to {sequence} here")
         if not self.is_signed(checkpoint) or {*checkpoint} - {*SEALED, "signature", "key"}:
             self.findings.append(f"checkpoint {number}: is not signed with the key")
@@ -269,18 +263,9 @@ class Verifier:
         text, signature = (self.key.with_name(name) for name in ("text", "signature"))
         text.write_bytes(f"rosrv audit checkpoint {version}\n{''.join(fields)}".encode())
         signature.write_bytes(unhexed(checkpoint["signature"]))
-        order = [
-            "openssl",
-            "pkeyutl",
-            "-verify",
-            "-rawin",
-            "-pubin",
-            "-inkey",
-            str(self.key),
-            "-in",
-            str(text),
-        ]
-        right = subprocess.run([*order, "-sigfile", str(signature)], capture_output=True).returncode == 0
+        order = ["openssl", "pkeyutl", "-verify", "-rawin", "-pubin", "-inkey"]
+        files = [str(self.key), "-in", str(text), "-sigfile", str(signature)]
+        right = subprocess.run([*order, *files], capture_output=True).returncode == 0
         return right and checkpoint["key"] == self.raw_key
 
 
@@ -312,18 +297,9 @@ def main(arguments: list[str]) -> int:
     findings = [*dict.fromkeys(map(printable, verifier.findings))]
     notes = [*map(printable, verifier.notes)]
     if given.json:
+        said = {"ok": not findings, "findings": findings, "unproven": notes, "key": verifier.raw_key}
         counts = {"checkpoints": verifier.checkpoints, "kept_elsewhere": verifier.agreeing}
-        print(
-            json.dumps(
-                {
-                    "ok": not findings,
-                    "findings": findings,
-                    "unproven": notes,
-                    "key": verifier.raw_key,
-                    **counts,
-                }
-            )
-        )
+        print(json.dumps({**said, **counts}))
         return 1 if findings else 0
     for finding in findings:
         print(f"WRONG     {finding}")

@@ -84,11 +84,15 @@ def fetched(appliance: Appliance, recording: str, folder: Path) -> Path:
 
 
 def said(ros: RosSession, bag: Path, topic: str) -> list[str]:
-    """The strings of a topic, as Debian's rosbag reads them."""
+    """The strings of a topic, as Debian's rosbag reads them, one after the other and (as rqt_bag does) by the index."""
     program = (
         "import rosbag, sys\n"
-        "for _topic, message, _time in rosbag.Bag(sys.argv[1]).read_messages([sys.argv[2]]):\n"
-        "    print(message.data)"
+        "bag, topics = rosbag.Bag(sys.argv[1]), [sys.argv[2]]\n"
+        "said = [message.data for _topic, message, _time in bag.read_messages(topics)]\n"
+        "entries = bag._get_entries(list(bag._get_connections(topics)))\n"
+        "assert [bag._read_message(entry.position).message.data for entry in entries] == said\n"
+        "for text in said:\n"
+        "    print(text)"
     )
     return ros.run("/usr/bin/python3", "-c", program, str(bag), topic).stdout.splitlines()
 
