@@ -2,7 +2,7 @@
 
 from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.routing import APIRoute
+from fastapi.routing import iter_route_contexts
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
@@ -118,14 +118,17 @@ async def _of_http(request: Request, error: Exception) -> Response:
 
 def _methods(request: Request) -> set[str]:
     """What can be done at a path; pages outside the contract are only read."""
-    path = request.url.path
     matching = [
-        route for route in request.app.routes if isinstance(route, APIRoute) and route.path_regex.match(path)
+        route
+        for route in iter_route_contexts(request.app.routes)
+        if route.path_regex is not None
+        and route.path is not None
+        and route.path_regex.match(request.url.path)
     ]
     if not matching:
         return {"GET"}
     # A path that is written out goes before a name.
-    here = min((route.path for route in matching), key=lambda path: path.count("{"))
+    here = min((str(route.path) for route in matching), key=lambda path: path.count("{"))
     return {method for route in matching if route.path == here for method in route.methods or ()}
 
 

@@ -3,8 +3,10 @@
 import asyncio
 from typing import Any
 
+import httpx
 import jsonschema_rs
 import pytest
+from fastapi import FastAPI
 
 from appliance.api.access import Doorkeeper
 from appliance.api.app import build_app
@@ -33,14 +35,19 @@ _IN_WORDS = (
 
 
 @pytest.fixture(scope="module")
-def contract() -> dict[str, Any]:
-    """The document."""
+def app() -> FastAPI:
+    """The interface, of an appliance that says nothing."""
 
     async def nothing() -> Measures:
         return example(Measures)
 
     control, journal = ControlLink(lambda _tokens: None, lambda: None), Journal(lambda _call: None)
-    app = build_app(Services(Settings(), control, Doorkeeper(1), journal, asyncio.Event(), History(nothing)))
+    return build_app(Services(Settings(), control, Doorkeeper(1), journal, asyncio.Event(), History(nothing)))
+
+
+@pytest.fixture(scope="module")
+def contract(app: FastAPI) -> dict[str, Any]:
+    """The document."""
     return app.openapi()
 
 
@@ -54,6 +61,19 @@ def _kinds(schema: dict[str, Any]) -> set[str]:
 def _words(schema: dict[str, Any]) -> str:
     """All that is said of a property."""
     return " ".join([schema.get("description", ""), *map(_words, schema.get("anyOf", ()))])
+
+
+def test_a_wrong_method_is_told_the_right_ones(app: FastAPI, contract: dict[str, Any]) -> None:
+    """Those of the contract, at every path that is written out, and at one with a name."""
+    paths = [*(path for path in contract["paths"] if "{" not in path), "/v1/tokens/{name}"]
+
+    async def allowed() -> list[tuple[int, str]]:
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://a") as client:
+            answers = [await client.request("TRACE", path.format(name="mallory")) for path in paths]
+        return [(answer.status_code, answer.headers["allow"]) for answer in answers]
+
+    told = [", ".join(sorted(method.upper() for method in contract["paths"][path])) for path in paths]
+    assert asyncio.run(allowed()) == [(405, methods) for methods in told]
 
 
 def test_times_have_units(contract: dict[str, Any]) -> None:
