@@ -243,3 +243,21 @@ def test_grant_this_leads_to_the_editor(
     page.get_by_role("button", name="Open in the editor").click()
     expect(page.locator(".cm-content")).to_contain_text("/guarded = 10.9.9.9 robot")
     assert appliance.status()["policy"]["revision"] == 1
+
+
+def test_grant_this_does_not_take_the_place_of_a_text_that_is_written(
+    opened: Callable[..., Reader], attempt: Callable[..., Any], appliance: Appliance
+) -> None:
+    """The text in the editor stays until the person says that it may go."""
+    attempt("registerPublisher", "/hasty", "/guarded", "std_msgs/String", "http://127.0.0.1:4002/")
+    appliance.recorded("--event", "decision", "--deny", resource="/guarded", caller_id="/hasty")
+    reader = opened()
+    page = reader.go("policy")
+    reader.write("# half a thought")
+    page.get_by_role("navigation").get_by_role("link", name="Audit").first.click()
+    page.get_by_role("row", name="/hasty").first.click()
+    page.get_by_role("button", name="Grant this").click()
+    page.get_by_role("button", name="Open in the editor").click()
+    expect(page.get_by_text("a text that is not loaded")).to_be_visible()
+    page.get_by_role("button", name="Replace that text").click()
+    expect(reader.editor()).to_contain_text("/guarded = 10.9.9.9 robot")

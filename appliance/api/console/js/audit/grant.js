@@ -4,13 +4,14 @@ import { html, useState } from "../html.js";
 import { Button } from "../parts/button.js";
 import { Given } from "../parts/given.js";
 import { Failure } from "../parts/notice.js";
-import { look, write } from "../policy/draft.js";
+import { discard, draft, look, write } from "../policy/draft.js";
 import { get } from "../rest.js";
 import { go } from "../router.js";
 
 /** @param {{id: string}} given */
 export function Grant({ id }) {
   const [found, setFound] = useState(/** @type {any} */ (null));
+  const [unsaved, setUnsaved] = useState(false); // the editor has a text that this one would replace
   const [error, setError] = useState(/** @type {unknown} */ (null));
   const ask = async () => {
     setError(null);
@@ -22,6 +23,10 @@ export function Grant({ id }) {
   };
   const edit = async () => {
     await look();
+    const { live, text, base } = draft.get();
+    if (live?.revision !== found.revision) return ask(); // it was worked out for another policy
+    if (text !== base && text !== found.text && !unsaved) return setUnsaved(true);
+    discard();
     write(found.text);
     go("/console/policy");
   };
@@ -30,5 +35,5 @@ export function Grant({ id }) {
   if (!found.added.length) return html`<p role="status">The policy in force grants it: it was refused for another reason, or before this revision.</p>`;
   return html`<section class="stack-tight" aria-label="What would grant it"><pre class="bytes"><${Given} value=${found.diff.join("\n")} most=${4000} /></pre>
     ${found.findings.length > 0 && html`<p>The policy's tests refuse it:</p><ul class="plain-list">${found.findings.map((/** @type {string} */ one) => html`<li key=${one}><${Given} value=${one} most=${300} mono /></li>`)}</ul>`}
-    <div class="row"><${Button} role="operator" tone="primary" onClick=${edit}>Open in the editor</${Button}><span class="muted small">A dry run there says whom it touches; load it on trial.</span></div></section>`;
+    <div class="row"><${Button} role="operator" tone="primary" onClick=${edit}>${unsaved ? "Replace that text" : "Open in the editor"}</${Button}><span class="muted small" role="status">${unsaved ? "The editor has a text that is not loaded; it would be lost." : "A dry run there says whom it touches; load it on trial."}</span></div></section>`;
 }
