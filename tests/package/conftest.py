@@ -25,15 +25,10 @@ SLOW_SECONDS = 1200.0  # of what is over in seconds on a machine of its own
 @pytest.fixture(scope="session")
 def package() -> Path:
     """dist/rosrv_VERSION_amd64.deb, built now by the one command."""
-    return built("amd64")
-
-
-def built(architecture: str) -> Path:
-    """The package of an architecture, built now."""
     for program, debian in (("dh", "debhelper"), ("dpkg-buildpackage", "dpkg-dev"), ("lintian", "lintian")):
         need_program(program, debian)
     done = subprocess.run(
-        [sys.executable, "-m", "distribution.deb", architecture],
+        [sys.executable, "-m", "distribution.deb", "amd64"],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -41,15 +36,6 @@ def built(architecture: str) -> Path:
     )
     assert done.returncode == 0, done.stderr[-3000:]
     return ROOT / done.stdout.split()[0]
-
-
-def stands_on(package: Path) -> tuple[str, ...]:
-    """The Debian packages that a machine has before ours comes: those that it depends on, and nodes to try it with."""
-    depends = subprocess.run(
-        ["dpkg-deb", "--field", str(package), "Depends"], capture_output=True, text=True, check=True
-    ).stdout
-    named = {entry.split("|")[0].split("(")[0].strip() for entry in depends.split(",")} - {"systemd"}
-    return (*sorted(named), *_NODE_PACKAGES)
 
 
 def clean_machine(
@@ -64,6 +50,10 @@ def clean_machine(
 
     `more` are further Debian packages that it has; such a machine has a `name` of its own.
     """
+    depends = subprocess.run(
+        ["dpkg-deb", "--field", str(package), "Depends"], capture_output=True, text=True, check=True
+    ).stdout
+    named = {entry.split("|")[0].split("(")[0].strip() for entry in depends.split(",")} - {"systemd"}
 
     def freight(path: Path) -> None:
         with tarfile.open(path, "w") as archive:
@@ -71,6 +61,6 @@ def clean_machine(
                 archive.add(file, there)
 
     disk = directory / "disk.ext4"
-    image = clean_disk(newest_kernel(), (*stands_on(package), *more), name=name)
+    image = clean_disk(newest_kernel(), (*sorted(named), *_NODE_PACKAGES, *more), name=name)
     subprocess.run(["cp", "--sparse=always", str(image), str(disk)], check=True)
     return Machine(directory, disk=disk, freight=freight)

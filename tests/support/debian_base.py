@@ -12,19 +12,16 @@ import hashlib
 import os
 import shutil
 import subprocess
-import sys
 import urllib.request
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.support.requirements import need_program, need_root, needs
+from tests.support.requirements import need_program, need_root
 
 ROOT = Path(__file__).parents[2]
 SUITE = "bookworm"
-NATIVE = "amd64"
-MINUTES = 40  # where each program of a foreign architecture is emulated; else two or three
-FOREIGN = (sys.executable, str(Path(__file__).with_name("foreign.py")))
+MINUTES = 15
 _CERTIFICATES = Path("etc/ssl/certs/ca-certificates.crt")
 # What apt must know to fetch here; the rest of its settings is the tree's own.
 _APT_KEYS = (
@@ -35,22 +32,11 @@ _APT_KEYS = (
     "Acquire::Retries",
 )
 _PIP_KEYS = ("index-url", "extra-index-url", "trusted-host", "timeout", "default-timeout")
-# Of a foreign architecture the packages are set up by its own programs; mknod is for this machine's root alone.
-_SECOND_STAGE = """
-cat >> "$root/debootstrap/functions" <<'END'
-mknod () { : > "$1"; }
-mknod_if_needed () { : ; }
-check_sane_mount () { : ; }
-END
-chroot "$root" /debootstrap/debootstrap --second-stage
-"""
-_MOUNTS = """
+_IN_TREE = """
 set -eu
 root=$1; shift
 mount -t proc proc "$root/proc"
 mount --rbind /dev "$root/dev"
-"""
-_IN_TREE = """\
 printf 'exit 101\\n' > "$root/usr/sbin/policy-rc.d"
 chmod 755 "$root/usr/sbin/policy-rc.d"
 chroot "$root" apt-get update -q
@@ -74,14 +60,12 @@ class MachineSettings:
     files: Mapping[str, str]  # path in the tree -> text
 
 
-def make_base(
-    directory: Path, packages: Sequence[str] = (), *, suite: str = SUITE, architecture: str = NATIVE
-) -> Path:
+def make_base(directory: Path, packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
     """Make `directory` a Debian root file system with these packages, the caller's to change; returns it.
 
     Needs root, debootstrap and the machine's Debian mirror. Raises `DebianBaseError`.
     """
-    archive = base_archive(packages, suite=suite, architecture=architecture)
+    archive = base_archive(packages, suite=suite)
     directory.mkdir(parents=True, exist_ok=True)
     _run(
         "tar",
@@ -96,21 +80,18 @@ def make_base(
     return directory
 
 
-def base_archive(packages: Sequence[str] = (), *, suite: str = SUITE, architecture: str = NATIVE) -> Path:
+def base_archive(packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
     """The tar archive that `make_base` unpacks, made now if there is none; for `docker import`, too."""
     need_root()
     need_program("debootstrap", "debootstrap")
-    if architecture != NATIVE:
-        need_foreign()
     settings = machine_settings(suite)
     folder = ROOT / "build" / "debian"
     folder.mkdir(parents=True, exist_ok=True)
-    kind = suite if architecture == NATIVE else f"{suite}-{architecture}"
-    archive = folder / f"{kind}-{_key(packages, settings)}.tar"
-    with archive.with_suffix(".lock").open("w") as lock:
+    archive = folder / f"{suite}-{_key(packages, settings)}.tar"
+    with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # one at a time; the second finds what the first has made
         if not archive.exists():
-            _make(archive, packages, suite, settings, architecture)
+            _make(archive, packages, suite, settings)
     return archive
 
 
@@ -174,36 +155,18 @@ def pip_settings(listed: str) -> str:
     return "\n".join(["[global]", *(f"{key} = {value}" for key, value in kept.items()), ""])
 
 
-def need_foreign() -> None:
-    """Programs for arm64 run here (tests/support/foreign.py)."""
-    need_program("qemu-aarch64-static", "qemu-user-static")
-    tried = subprocess.run([*FOREIGN, "true"], capture_output=True, text=True, check=False)
-    needs(tried.returncode == 0, f"binfmt_misc in user namespaces (Linux 6.7): {tried.stderr.strip()}")
-
-
-def in_tree(tree: Path, script: str, *arguments: str, architecture: str = NATIVE) -> str:
-    """What a shell script says that has the tree as `$root`, and mounts that end with it whatever happens.
-
-    `$@` are the arguments. Raises `DebianBaseError`.
-    """
-    apart = FOREIGN if architecture != NATIVE else ("unshare", "--mount", "--propagation", "private")
-    return _run(*apart, "sh", "-c", _MOUNTS + script, "sh", str(tree), *arguments)
-
-
-def _make(
-    archive: Path, packages: Iterable[str], suite: str, settings: MachineSettings, architecture: str
-) -> None:
+def _make(archive: Path, packages: Iterable[str], suite: str, settings: MachineSettings) -> None:
     tree = archive.with_suffix(f".{os.getpid()}.tree")
-    foreign = ("--foreign", f"--arch={architecture}") if architecture != NATIVE else ()
     try:
-        _run("debootstrap", *foreign, "--variant=minbase", suite, str(tree), settings.mirror)
-        if foreign:
-            in_tree(tree, _SECOND_STAGE, architecture=architecture)
+        _run("debootstrap", "--variant=minbase", suite, str(tree), settings.mirror)
         for name, text in settings.files.items():
             path = tree / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
-        in_tree(tree, _IN_TREE, *packages, architecture=architecture)
+        # Mounts of its own, which end with it whatever happens.
+        _run(
+            "unshare", "--mount", "--propagation", "private", "sh", "-c", _IN_TREE, "sh", str(tree), *packages
+        )
         making = archive.with_suffix(".making")
         _run(
             "tar",
@@ -223,7 +186,7 @@ def _make(
 
 def _key(packages: Iterable[str], settings: MachineSettings) -> str:
     """Names the archive by all that it was made from."""
-    parts = [_MOUNTS + _IN_TREE, settings.mirror, *sorted(packages)]
+    parts = [_IN_TREE, settings.mirror, *sorted(packages)]
     parts += [text for one in sorted(settings.files.items()) for text in one]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
 
@@ -232,7 +195,7 @@ def _output(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=True).stdout
 
 
-def _run(*command: str) -> str:
+def _run(*command: str) -> None:
     environment = os.environ | {"LC_ALL": "C", "DEBIAN_FRONTEND": "noninteractive"}
     done = subprocess.run(
         command,
@@ -248,4 +211,3 @@ def _run(*command: str) -> str:
     if done.returncode:
         words = "\n  ".join(done.stdout.strip().splitlines()[-15:])
         raise DebianBaseError(f"{' '.join(command[:4])} … ended with status {done.returncode}:\n  {words}")
-    return done.stdout
