@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -32,6 +33,35 @@ import re
 for found in distributions():
     print(re.sub(r"[-_.]+", "-", found.name).lower(), found.version)
 """
+# Files that neither dpkg nor Python's installer knows of; links of Debian's alternatives are left out.
+NOBODYS = r"""
+import os, re, sys
+from importlib.metadata import distributions
+from pathlib import Path
+
+def real(path):
+    return os.path.join(os.path.realpath(os.path.dirname(path)), os.path.basename(path))
+
+owned = {real(line) for lists in Path("/var/lib/dpkg/info").glob("*.list") for line in lists.read_text().splitlines()}
+owned |= {real(os.path.abspath(found.locate_file(one))) for found in distributions() for one in found.files or ()}
+device = os.stat("/").st_dev
+for folder, folders, files in os.walk("/"):
+    folders[:] = [name for name in folders if os.stat(os.path.join(folder, name)).st_dev == device]
+    for name in files:
+        path = os.path.join(folder, name)
+        if os.path.islink(path) and os.readlink(path).startswith("/etc/alternatives/"):
+            continue
+        source = re.sub(r"/__pycache__/([^/]+)\.cpython-\d+\.pyc$", r"/\1.py", path)
+        if real(path) not in owned and real(source) not in owned and os.lstat(path).st_dev == device:
+            print(path)
+"""
+# Of those, what is there all the same: our own part, what the build wrote, what packages write when they are set up.
+EXPECTED = re.compile(
+    r"/opt/rosrv/lib/python3\.11/site-packages/appliance/.+|/opt/rosrv/share/rosrv/(build|sbom\.cdx)\.json"
+    r"|/opt/rosrv/(bin/(python\S*|rosrv)|pyvenv\.cfg|lib64)|/etc/.+|/usr/local/share/ca-certificates/.+\.crt"
+    r"|/var/lib/(apt|dpkg|pam|python|sgml-base|systemd|xml-core)/.+|/var/lib/shells\.state|/usr/share/info/dir"
+    r"|/root/\.(bashrc|profile)|/\.dockerenv"
+)
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +116,18 @@ def test_every_part_is_in_the_list(engine: Engine, unpacked: Path, parts: list[d
         (one["name"], one["version"]) for file in manifest["files"].values() for one in file["packages"]
     }
     assert of(parts, "npm") == bundled
+
+
+def test_no_file_is_of_no_part(engine: Engine, unpacked: Path) -> None:
+    """Each file of the image belongs to a part of the list; one that was put beside them is found."""
+    python = ("/opt/rosrv/bin/python", "-P", "-")
+    assert [
+        one for one in run(engine, *python, text=NOBODYS).splitlines() if not EXPECTED.fullmatch(one)
+    ] == []
+    ours = "/opt/rosrv/lib/python3.11/site-packages"
+    spy = f"touch /usr/bin/spy {ours}/spy.py; exec {' '.join(python)}"
+    found = run(engine, "sh", "-c", spy, text=NOBODYS).splitlines()
+    assert {one for one in found if not EXPECTED.fullmatch(one)} == {"/usr/bin/spy", f"{ours}/spy.py"}
 
 
 def test_every_part_has_a_licence(parts: list[dict[str, Any]]) -> None:

@@ -1,4 +1,4 @@
-"""Machines of Noetic's generation beside the appliance: docs/noetic-robot.md.
+"""Robot and laptop of Noetic's generation beside the appliance in its container: docs/noetic-robot.md.
 
 Ubuntu is not to be had from Debian's archive. Debian 11 is of its age: ROS 1.15, Python 3.9, OpenSSL 1.1.1, nftables
 0.9, strongSwan 5.9. Each machine here is such a system, in a mount namespace and a host of the lab.
@@ -13,6 +13,7 @@ import pytest
 
 from examples.landshark.lab import Lab
 from tests.support.debian_base import make_base
+from tests.support.docker import APPLIANCE, Engine, MachineInside, builder, project
 from tests.support.nodes import RosSession
 from tests.support.script_host import ScriptHost
 from tests.support.tunnel_site import MASTER, MIDDLE, OWN, POLICY, TunnelSite
@@ -21,6 +22,7 @@ from tests.support.tunnels import need_strongswan
 pytestmark = pytest.mark.timeout(2400)  # the system is fetched, and the image is built
 SUITE = "bullseye"
 PACKAGES = (
+    # A robot's: unmodified nodes, rospy's and roscpp's, and what `rosrv protect` writes for.
     *("python3-rospy", "python3-rostopic", "python3-std-msgs", "topic-tools"),
     # What a kit takes.
     *("charon-systemd", "strongswan-swanctl", "libcharon-extra-plugins", "libstrongswan-standard-plugins"),
@@ -35,6 +37,33 @@ TALKER = ("rostopic", "pub", "--rate=10", "/chatter", "std_msgs/String", "data: 
 def system(tmp_path: Path) -> Path:
     """The root of a Debian 11, to be changed."""
     return make_base(tmp_path / "system", PACKAGES, suite=SUITE)
+
+
+def test_a_robot_beside_the_container(system: Path, tmp_path: Path) -> None:
+    """Its nodes, rospy's and roscpp's, talk through the appliance; its ports are closed by its own nftables."""
+    with builder() as engine:
+        engine.build("appliance", APPLIANCE)
+    (tmp_path / "project").mkdir()
+    with Lab("rosrv-noetic") as lab:
+        machine = lab.host("machine", "10.79.0.1/24")
+        with Engine(machine) as engine, ScriptHost(machine, tmp_path / "robot", root=system) as robot:
+            robot.address = MachineInside.address
+            assert " 3.9." in robot.run("python3", "--version").stdout
+            files = ("compose.yaml", "compose.host.yaml")
+            compose = engine.compose(project(tmp_path / "project"), "noetic", *files)
+            try:
+                compose("up", "--detach", "--no-build")
+                compose.wait_healthy()
+                rules = compose.exec("appliance", "rosrv", "protect", "--appliance", "172.29.76.2").stdout
+                robot.run("sh", "-c", 'printf %s "$1" | nft -f -', "sh", rules)
+                with RosSession("http://172.29.76.2:11311", tmp_path, robot) as ros:
+                    ros.start(TALKER)
+                    ros.start(["/usr/lib/topic_tools/relay", "/chatter", "/heard"])
+                    assert "hello" in ros.run("rostopic", "echo", "-n", "1", "/heard", timeout=60).stdout
+                hosts = {(one["category"], one["host"]) for one in compose.audit("--event", "registered")}
+                assert ("publication", robot.address) in hosts
+            finally:
+                compose("down", "--volumes", "--timeout", "5")
 
 
 @pytest.fixture
