@@ -1,10 +1,11 @@
 """``mtl`` about the future: against its definition in three values, and against what really came of it."""
 
+import importlib
+import sys
 from itertools import combinations_with_replacement, product
 from random import Random
 
 import pytest
-import rtamt
 
 from appliance.rosmop.logics import bounded
 from appliance.rosmop.logics.interface import RunFaultError
@@ -202,8 +203,12 @@ def rtamt_knows(tree: Tree) -> bool:
     return all(rtamt_knows(part) for part in tree[1:] if isinstance(part[0], str))
 
 
+@pytest.mark.skipif(
+    sys.version_info >= (3, 12), reason="the parser of rtamt needs typing.io, which Python 3.12 has not"
+)
 def test_against_another_monitor() -> None:
     """With one event per unit of time, what a formula is worth once all is over is what another monitor says."""
+    rtamt = importlib.import_module("rtamt")
     random = seeded(44)
     compared = 0
     while compared < 60:
