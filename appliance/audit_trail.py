@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from appliance.audit.log import AuditLog
-from appliance.audit.record import Record, RuleReference, Severity
+from appliance.audit.record import Record, Repeated, RuleReference, Severity
 from appliance.metrics import Meter
 from appliance.policy.model import Decision, Rule
 from appliance.shares.pool import Standing
@@ -79,37 +79,63 @@ class AuditTrail:
 
         `reads`: the call changes nothing, so that its repetitions are counted when it is allowed.
         """
-        record_id = self._ids.next()
-        word = decision.word
+        record = self._of_decision(
+            asker, method, category, resource, decision, reads=reads, asked_of=asked_of
+        )
         duration = time.monotonic_ns() - asker.arrived
-        self.meter.decided(category, word, duration / 1e9)
+        self.meter.decided(category, decision.word, duration / 1e9)
+        self._log.record(record)
+        return record.id
+
+    def _of_decision(
+        self,
+        asker: Asker,
+        method: str,
+        category: str,
+        resource: str,
+        decision: Decision,
+        *,
+        reads: bool,
+        asked_of: Mapping[str, str],
+    ) -> Record:
+        word = decision.word
         detail: dict[str, Any] = {"call": method, **asked_of}
         if asker.node is not None:
             detail["node"] = asker.node
         if decision.needs:
             detail["needs"] = decision.needs
-        stranger = self._marked(asker.host, word, detail)
-        self._log.record(
-            Record(
-                id=record_id,
-                time=time.time_ns(),
-                event="decision",
-                severity=Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING,
-                decision=word,
-                host=asker.host,
-                caller_id=asker.caller_id,
-                category=category,
-                resource=resource,
-                rule=rule_reference(decision.rule),
-                revision=self.revision,
-                reason=decision.reason,
-                duration_us=duration // 1000,
-                detail=detail,
-                stranger=stranger,
-                folds=reads and word == "allow",
-            )
+        return Record(
+            id=self._ids.next(),
+            time=time.time_ns(),
+            event="decision",
+            severity=Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING,
+            decision=word,
+            host=asker.host,
+            caller_id=asker.caller_id,
+            category=category,
+            resource=resource,
+            rule=rule_reference(decision.rule),
+            revision=self.revision,
+            reason=decision.reason,
+            duration_us=(time.monotonic_ns() - asker.arrived) // 1000,
+            stranger=self._marked(asker.host, word, detail),
+            detail=detail,
+            folds=reads and word == "allow",
         )
-        return record_id
+
+    def repeatable(
+        self, asker: Asker, method: str, category: str, resource: str, decision: Decision, **asked_of: str
+    ) -> Repeated:
+        """A read that was allowed, to be counted when the same is decided again; it records nothing."""
+        return Repeated(
+            self._of_decision(asker, method, category, resource, decision, reads=True, asked_of=asked_of)
+        )
+
+    def decided_again(self, same: Repeated, arrived: int) -> None:
+        """Count a decision that is the same in all that is recorded of it; `arrived` as `Asker` has it."""
+        duration = time.monotonic_ns() - arrived
+        self.meter.decided(same.record.category or "", "allow", duration / 1e9)
+        self._log.repeated(same, duration // 1000)
 
     def happened(
         self,

@@ -1,9 +1,11 @@
-"""RVMaster beside plain `rosmaster`: `python -m benchmarks.control_plane [--seconds 3] [--rounds 3]`.
+"""RVMaster beside plain `rosmaster`: `python -m benchmarks.control_plane [--seconds 2] [--rounds 3] [--only CALL]`.
 
-Both run at once; in every round they take turns at every load, so that whatever else the machine does falls on both.
-Cells are medians of the rounds; the ratio is the median of the rounds' ratios, `added` the difference of the medians
-of the delay of one call. The load is one process with one loop: it sends requests that were built before and reads
-answers by their length, so it costs little beside what it measures.
+Both run at once, the appliance as `rosrv up` runs it for users: each process as its own user, with policy, audit log
+and metrics. In every round they take turns at every load, so that whatever else the machine does falls on both. Cells
+are medians of the rounds; the ratio is the median of the rounds' ratios, `added` the difference of the medians
+of the delay of one call, and processor time is that of the plain master, and of RVMaster with the one it hides. The
+load is one process with one loop: it sends requests that were built before and reads answers by their length, so it
+costs little beside what it measures.
 """
 
 import argparse
@@ -19,7 +21,7 @@ import time
 import xmlrpc.client
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -36,7 +38,16 @@ default = here
 [Commands]
 default = here
 """
-OPERATIONS = ("getSystemState", "register/unregister", "setParam/getParam", "multicall of 20")
+READS: dict[str, tuple[Any, ...]] = {
+    "getParam": ("/bench/read",),
+    "hasParam": ("/bench/read",),
+    "lookupNode": ("/bench_node_7",),
+    "getSystemState": (),
+    "getPublishedTopics": ("",),
+    "getTopicTypes": (),
+}
+OPERATIONS = (*READS, "register/unregister", "setParam/getParam", "20 getParam as one", "20 setParam as one")
+NODES, TOPICS = 20, 5  # what is registered while it is measured: nodes, topics of each
 LOADS = ((1, True), (1, False), (16, True), (16, False))
 
 
@@ -52,8 +63,8 @@ def requests(operation: str, client: int, keep: bool) -> list[bytes]:
     """What one client sends, over and over."""
     me, api = f"/bench_{client}", f"http://127.0.0.1:{40000 + client}/"
     topic, key = f"/bench/topic_{client}", f"/bench/key_{client}"
-    if operation == "getSystemState":
-        return [request("getSystemState", me, keep=keep)]
+    if operation in READS:
+        return [request(operation, me, *READS[operation], keep=keep)]
     if operation == "register/unregister":
         return [
             request("registerPublisher", me, topic, "std_msgs/String", api, keep=keep),
@@ -61,8 +72,27 @@ def requests(operation: str, client: int, keep: bool) -> list[bytes]:
         ]
     if operation == "setParam/getParam":
         return [request("setParam", me, key, 42, keep=keep), request("getParam", me, key, keep=keep)]
-    parts = [{"methodName": "setParam", "params": [me, f"{key}_{one}", one]} for one in range(20)]
+    method = operation.split()[1]
+    params = [[me, f"{key}_{one}", one][: 2 if method == "getParam" else 3] for one in range(20)]
+    parts = [{"methodName": method, "params": one} for one in params]
     return [request("system.multicall", parts, keep=keep)]
+
+
+def furnish(port: int) -> None:
+    """Nodes, topics and parameters, as a small robot has them."""
+    with xmlrpc.client.ServerProxy(f"http://127.0.0.1:{port}/") as master:
+        for node in range(NODES):
+            for topic in range(TOPICS):
+                what = (
+                    f"/robot/part_{node}/topic_{topic}",
+                    "std_msgs/String",
+                    f"http://127.0.0.1:{41000 + node}/",
+                )
+                master.registerPublisher(f"/bench_node_{node}", *what)
+        master.setParam("/bench", "/bench/read", 42)
+        for client in range(16):
+            for one in range(20):
+                master.setParam("/bench", f"/bench/key_{client}_{one}", one)
 
 
 class Client:
@@ -155,27 +185,67 @@ def await_port(port: int) -> None:
     raise TimeoutError(f"nobody listens on port {port}")
 
 
-def measure(rosmaster: int, rvmaster: int, seconds: float, rounds: int) -> Table:
+def processor_seconds(pids: list[int]) -> float:
+    """What these processes have used."""
+    ticks = 0
+    for pid in pids:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        ticks += int(fields[11]) + int(fields[12])
+    return ticks / os.sysconf("SC_CLK_TCK")
+
+
+def descendants(pid: int) -> list[int]:
+    """A process and all that it started."""
+    found = [pid]
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        for child in (task / "children").read_text(encoding="utf-8").split():
+            found += descendants(int(child))
+    return found
+
+
+class Master(NamedTuple):
+    """One of the two: where it listens, and its processes."""
+
+    port: int
+    pids: list[int]
+
+    def under(self, operation: str, clients: int, keep: bool, seconds: float) -> tuple[float, float, float]:
+        """Calls per second, median delay of a call and processor time of a call, both in microseconds."""
+        before = processor_seconds(self.pids)
+        began = time.perf_counter()
+        rate, delay = load(self.port, operation, clients, keep, seconds)
+        used = processor_seconds(self.pids) - before
+        return rate, delay, used / (rate * (time.perf_counter() - began)) * 1e6
+
+
+def measure(plain: Master, ours: Master, seconds: float, rounds: int, only: str) -> Table:
     """The table of all operations under all loads."""
-    table = Table(
-        "call", "clients", "connections", "rosmaster calls/s", "RVMaster calls/s", "ratio", "added µs"
-    )
+    columns = ("call", "clients", "connections", "rosmaster calls/s", "RVMaster calls/s", "ratio", "added µs")
+    table = Table(*columns, "processor µs")
     for operation in OPERATIONS:
+        if only not in operation:
+            continue
         for clients, keep in LOADS:
-            plain, ours = [], []
-            for _ in range(rounds):
-                plain.append(load(rosmaster, operation, clients, keep, seconds))
-                ours.append(load(rvmaster, operation, clients, keep, seconds))
-            ratio = statistics.median(b[0] / a[0] for a, b in zip(plain, ours, strict=True))
-            added = statistics.median(one[1] for one in ours) - statistics.median(one[1] for one in plain)
+            runs = [
+                (
+                    plain.under(operation, clients, keep, seconds),
+                    ours.under(operation, clients, keep, seconds),
+                )
+                for _ in range(rounds)
+            ]
+            (rate, delay, used), (our_rate, our_delay, our_used) = (
+                [statistics.median(values) for values in zip(*side, strict=True)]
+                for side in zip(*runs, strict=True)
+            )
             table.add_row(
                 operation,
                 str(clients),
                 "kept" if keep else "new",
-                f"{statistics.median(one[0] for one in plain):,.0f}",
-                f"{statistics.median(one[0] for one in ours):,.0f}",
-                f"{ratio:.2f}",
-                f"{added:+,.0f}",
+                f"{rate:,.0f}",
+                f"{our_rate:,.0f}",
+                f"{statistics.median(b[0] / a[0] for a, b in runs):.2f}",
+                f"{our_delay - delay:+,.0f}",
+                f"{used:,.0f} / {our_used:,.0f}",
             )
     return table
 
@@ -185,6 +255,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--only", default="", help="calls that have this in their name")
     given = parser.parse_args()
     port = free_port()
     with tempfile.TemporaryDirectory() as folder:
@@ -222,7 +293,13 @@ def main() -> None:
             assert appliance.stdout is not None
             ready = json.loads(appliance.stdout.readline())
             await_port(port)
-            table = measure(port, int(ready["master"].rpartition(":")[2]), given.seconds, given.rounds)
+            masters = (
+                Master(port, [rosmaster.pid]),
+                Master(int(ready["master"].rpartition(":")[2]), descendants(appliance.pid)),
+            )
+            for master in masters:
+                furnish(master.port)
+            table = measure(*masters, given.seconds, given.rounds, given.only)
         finally:
             for process in (appliance, rosmaster):
                 process.terminate()

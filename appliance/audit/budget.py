@@ -87,6 +87,8 @@ class Budget:
 
     def owing(self, host: str) -> str:
         """Why calls of this host have to wait, in words for it; empty when they need not."""
+        if self._left is None and not self._changes and not self.owed.held(host):
+            return ""
         self._pay()
         self.owed.bounds = self._plenty if self._left is None else self._scarce
         return self.owed.refusal(host, 0)

@@ -31,6 +31,7 @@ from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.calls.parameters import ParameterCalls, ParameterSearch
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
+from appliance.master.calls.repetition import Repetitions
 from appliance.master.calls.table import MASTER_CALLS, master_table
 from appliance.master.graph.effects import Effects
 from appliance.master.graph.grants import Grants
@@ -285,7 +286,6 @@ class Parts:
         """The calls, and what they are carried out with."""
         base, settings, port = self._base, self._base.settings, self._base.port(RVMASTER)
         lookups = LookupCalls(
-            self.rosmaster,
             self.registry,
             self.graph,
             self.enactor,
@@ -330,6 +330,15 @@ class Parts:
         self.pipeline = Pipeline(
             execution,
             Multicall(execution, parameters, self.trail, offload=self._offload),
+            repetitions=Repetitions(
+                self._gate,
+                self.registry,
+                self.parameters,
+                rosmaster=self.rosmaster,
+                addresses=self._addresses,
+                policy=self._policy,
+                trail=self.trail,
+            ),
             addresses=self._addresses,
             trail=self.trail,
             limits=self._limits,

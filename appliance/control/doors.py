@@ -16,7 +16,7 @@ from appliance.policy import Policy
 from appliance.policy.model import Address
 from appliance.ros.xmlrpc import Limits, build_fault
 from appliance.rpc.front import HttpLimits
-from appliance.rpc.server import Handler, HttpServer, Peer, Refusal
+from appliance.rpc.server import AtOnce, Handler, HttpServer, Peer, Refusal, not_at_once
 from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Visitors
 from appliance.shares.descriptors import connections_within
@@ -57,11 +57,14 @@ class Doors:
         self._unhidden = ""
         self._servers: list[HttpServer] = []
 
-    async def open(self, sock: socket.socket, handler: Handler, *, guarded: bool) -> None:
+    async def open(
+        self, sock: socket.socket, handler: Handler, *, guarded: bool, at_once: AtOnce = not_at_once
+    ) -> None:
         """Serve a listener; one that is not `guarded` is reached by the appliance's own processes only."""
         server = HttpServer(
             sock.dup(),
             handler,
+            at_once=at_once,
             limits=self.http,
             visitors=self.visitors if guarded else self._own_visitors,
             turns=self.turns if guarded else self._own_turns,

@@ -218,7 +218,12 @@ class _Control:
     async def _serve(self) -> None:
         base, parts, sockets = self._base, self._parts, self._base.sockets
         doors = base.doors
-        await doors.open(sockets[RVMASTER], parts.pipeline.handler(parts.table), guarded=True)
+        await doors.open(
+            sockets[RVMASTER],
+            parts.pipeline.handler(parts.table),
+            guarded=True,
+            at_once=parts.pipeline.repetitions.answer,
+        )
         await doors.open(sockets[_OWN], parts.pipeline.handler(parts.table, own=True), guarded=False)
         await doors.open(sockets[INNER], parts.inner.handle, guarded=False)
         self._tokens = Tokens(base.store, base.trail, lambda: self._rest.state_tokens())  # noqa: PLW0108 - made below

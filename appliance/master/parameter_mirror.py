@@ -42,7 +42,8 @@ class ParameterMirror:
         self.tree = tree
         self.charges = charges
         self.weight = 0
-        self._changed = changed
+        self.version = 0  # another after every change
+        self._told_of_change = changed
         self._note = note
         self._depth_limit = depth_limit
         for key, value in since:
@@ -112,6 +113,10 @@ class ParameterMirror:
         self.weight -= before
         self._note(key, None)
         self._changed()
+
+    def _changed(self) -> None:
+        self.version += 1
+        self._told_of_change()
 
     def _recount(self, *, final: bool) -> None:
         self.weight = measure(self.tree)[0]

@@ -20,7 +20,7 @@ import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from typing import cast
+from typing import NamedTuple, cast
 
 import structlog
 
@@ -58,8 +58,7 @@ class Peer:
         object.__setattr__(self, "here", self.host.is_loopback or self.text == self.local)
 
 
-@dataclass(frozen=True, slots=True)
-class HttpRequest:
+class HttpRequest(NamedTuple):
     """A whole POST: the path asked for, the body, and when its last byte arrived (monotonic ns)."""
 
     peer: Peer
@@ -70,8 +69,16 @@ class HttpRequest:
 
 Handler = Callable[[HttpRequest], Awaitable[bytes]]
 
+AtOnce = Callable[[HttpRequest], bytes | None]
+"""Answers a request where that takes no time and waits for nothing; else None, and the handler has it."""
+
 Refusal = Callable[[bytes], bytes]
 """Makes the answer to a request that is not served, of the beginning of its body."""
+
+
+def not_at_once(_request: HttpRequest) -> bytes | None:
+    """Of a server whose handler has every request."""
+    return None
 
 
 class NoAnswerError(Exception):
@@ -91,6 +98,7 @@ class HttpServer:
         sock: socket.socket,
         handler: Handler,
         *,
+        at_once: AtOnce = not_at_once,
         limits: HttpLimits,
         visitors: Visitors[Address],
         turns: Turns,
@@ -99,6 +107,7 @@ class HttpServer:
     ) -> None:
         self.socket = sock
         self.handler = handler
+        self.at_once = at_once
         self.limits = limits
         self.visitors = visitors
         self.turns = turns
@@ -134,6 +143,7 @@ class _Connection(Front):
         self._waiting = False  # for its turn
         self._pending: deque[tuple[HttpRequest, bool]] = deque()
         self._body = bytearray()
+        self._held = 0  # bytes of it that are counted
         self._unsent = 0  # bytes of an answer that the peer does not take, as they were counted
         self._refusal: Refusal | None = None
         self._patience: asyncio.TimerHandle | None = None  # until that answer waits for the body no longer
@@ -160,6 +170,8 @@ class _Connection(Front):
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
         if self.closing or not (self.in_request and self.head_done):
+            return
+        if not self._body_is_held():
             return
         if self.received - len(self._body) > self.limits.framing_bytes:
             self.reject(b"400 Bad Request", "sent more chunk sizes and trailers than a request may have")
@@ -236,10 +248,6 @@ class _Connection(Front):
         if len(self._body) + len(piece) > self.limits.body_bytes:
             self.reject(b"413 Content Too Large", f"sent a body beyond {self.limits.body_bytes} bytes")
             return
-        too_much = self.visitors.hold(self.peer.host, len(piece))
-        if too_much:
-            self.reject(b"503 Service Unavailable", f"sent a body while {too_much}")
-            return
         self._body += piece
         if self._refusal is not None and len(self._body) >= _BEGINNING:
             self._refuse_request(self._refusal)
@@ -250,18 +258,36 @@ class _Connection(Front):
         if self._refusal is not None:
             self._refuse_request(self._refusal)
             return
+        keep = self.parser.should_keep_alive()
+        request = HttpRequest(self.peer, self._url.decode("latin-1"), bytes(self._body), time.monotonic_ns())
+        if self.is_quiet and not self._pending and self._answered_at_once(request, keep=keep):
+            if self._held:
+                self._release(self._held)
+            self._body, self._held = bytearray(), 0
+            return
+        if not self._body_is_held():
+            return
         too_much = self.visitors.hold(self.peer.host, _REQUEST_BYTES + len(self._url))
         if too_much:
             self.reject(b"503 Service Unavailable", f"sent a request while {too_much}")
             return
         super().on_message_complete()
-        body, self._body = bytes(self._body), bytearray()
-        request = HttpRequest(self.peer, self._url.decode("latin-1"), body, time.monotonic_ns())
-        self._pending.append((request, self.parser.should_keep_alive()))
+        self._body, self._held = bytearray(), 0
+        self._pending.append((request, keep))
         if self.is_quiet:
             self._serve_next()
         else:
             self.transport.pause_reading()
+
+    def _body_is_held(self) -> bool:
+        """Count what came of the body; False (and it is refused) where that is too much."""
+        unheld = len(self._body) - self._held
+        too_much = self.visitors.hold(self.peer.host, unheld) if unheld else ""
+        if too_much:
+            self.reject(b"503 Service Unavailable", f"sent a body while {too_much}")
+            return False
+        self._held += unheld
+        return True
 
     def _refuse_request(self, refusal: Refusal) -> None:
         """Answer without having read more than the beginning of the body."""
@@ -272,7 +298,7 @@ class _Connection(Front):
     @property
     def holding(self) -> int:
         """Bytes that are held for it and that its end sets free: not those of a request that is being served."""
-        return len(self._body) + self._unsent + sum(_held_by(request) for request, _ in self._pending)
+        return self._held + self._unsent + sum(_held_by(request) for request, _ in self._pending)
 
     def leave(self) -> None:
         """Count for nothing any more, once; what is being served goes on, and its answer is thrown away."""
@@ -282,7 +308,7 @@ class _Connection(Front):
         if self._counted:
             self._counted = False
             self._release(self.holding)
-            self._body, self._unsent = bytearray(), 0
+            self._body, self._held, self._unsent = bytearray(), 0, 0
         super().leave()
         self._pending.clear()
         if self._busy is not None and self._waiting:
@@ -300,6 +326,18 @@ class _Connection(Front):
                 self.visitors.file(self, Stage.IDLE)
             self.transport.resume_reading()
 
+    def _answered_at_once(self, request: HttpRequest, *, keep: bool) -> bool:
+        """Answer without a task, while nobody waits for a turn: this takes none from anybody."""
+        turns = self.server.turns
+        if turns.waiting or turns.pause(request.peer.text):
+            return False
+        answer = self.server.at_once(request)
+        if answer is None:
+            return False
+        super().on_message_complete()
+        self._sent(b"200 OK", answer, keep=keep)
+        return True
+
     def _serve_next(self) -> None:
         request, keep = self._pending.popleft()
         self.deadline = float("inf")  # the handler has limits of its own
@@ -314,8 +352,11 @@ class _Connection(Front):
         finally:
             self._busy = None
             self._release(_held_by(request))
-        if self.closing:
-            return
+        if not self.closing:
+            self._sent(status, body, keep=keep)
+
+    def _sent(self, status: bytes, body: bytes, *, keep: bool) -> None:
+        """Send an answer, and go on once it is taken."""
         self._write(status, body, keep=keep)
         if not self._writable:
             self._hold_unsent()
@@ -366,8 +407,8 @@ class _Connection(Front):
             return
         self.closing = True
         if unread:
-            self._release(len(self._body))
-            self._body = bytearray()
+            self._release(self._held)
+            self._body, self._held = bytearray(), 0
             self.allow(self.limits.linger_seconds)
             self.transport.write_eof()
         else:

@@ -39,7 +39,7 @@ class Turns:
     ) -> None:
         self.slots: Pool[Address] = Pool("requests being served", bounds, standing)
         self._alike = alike
-        self._pause = pause
+        self.pause = pause
         self._together = max(bounds.host, bounds.whole // 2)
         self._taken: Counter[Hashable] = Counter()  # by hosts that are alike
         self._taken_as: dict[Address, Hashable] = {}
@@ -47,7 +47,7 @@ class Turns:
 
     async def enter(self, host: Address) -> None:
         """Take a slot, once this host's records are paid, waiting for its turn when there is none."""
-        while seconds := self._pause(str(host)):
+        while seconds := self.pause(str(host)):
             await asyncio.sleep(seconds)
         kind = self._alike(host)
         if self._take(host, kind):

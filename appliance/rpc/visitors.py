@@ -84,6 +84,7 @@ class Visitors(Generic[Holder]):
         self.farewells: Pool[Holder] = Pool("connections that are turned away", farewells, standing)
         self._of: dict[Connection, tuple[Holder, Pool[Holder]]] = {}
         self._queues: dict[Stage, Queue[Holder, Connection]] = {stage: Queue(standing) for stage in Stage}
+        self._stages: dict[Connection, Stage] = {}
 
     @property
     def connections(self) -> frozenset[Connection]:
@@ -107,8 +108,8 @@ class Visitors(Generic[Holder]):
 
     def leave(self, connection: Connection) -> None:
         """Count a connection out, if it is in."""
-        for queue in self._queues.values():
-            queue.remove(connection)
+        if connection in self._stages:
+            self._queues[self._stages.pop(connection)].remove(connection)
         host, pool = self._of.pop(connection, (None, self.connected))
         if host is not None:
             pool.give_back(host)
@@ -118,8 +119,10 @@ class Visitors(Generic[Holder]):
         host, pool = self._of.get(connection, (None, self.farewells))
         if host is None or pool is not self.connected:
             return
-        for queue in self._queues.values():
-            queue.remove(connection)
+        before = self._stages.get(connection)
+        if before is not None:
+            self._queues[before].remove(connection)
+        self._stages[connection] = stage
         self._queues[stage].put(connection, host, self._clock())
 
     def hold(self, host: Holder, size: int) -> str:

@@ -54,6 +54,7 @@ class Records:
         self.events: list[tuple[str, str | None]] = []
 
         self.strict = False
+        self.revision = 1
         self.obstacle: str | None = None
         self.debt = ""
         self.meter = Meter()
@@ -72,6 +73,16 @@ class Records:
         """As `AuditTrail`."""
         self.events.append(("allow" if decision.allowed else "deny", resource))
         return "id"
+
+    def repeatable(
+        self, _caller: Any, _method: str, _category: str, resource: str, _decision: Decision, **_more: str
+    ) -> str:
+        """As `AuditTrail`: what `decided_again` is given."""
+        return resource
+
+    def decided_again(self, same: str, _arrived: int) -> None:
+        """As `AuditTrail`."""
+        self.events.append(("allow", same))
 
     def happened(self, event: str, _reason: str, *, resource: str | None = None, **_detail: Any) -> str:
         """As `AuditTrail`."""
@@ -147,6 +158,7 @@ class HiddenMaster:
             "subscribeParam": self.parameters.get(asked[1:], {}) if asked != "/" else dict(self.parameters),
             "unsubscribeParam": 1,
             "setParam": 0,
+            "deleteParam": 0,
         }
         return [1, "", values[method]]
 
@@ -235,6 +247,8 @@ class Clients:
 
 class Modes:
     """Everything is relayed under stand-ins."""
+
+    stand_ins = True
 
     def hides_publishers(self, _topic: str) -> bool:
         """As `Mediation`."""
@@ -396,11 +410,17 @@ class ControlParts:
         host: str = str(HOST),
         target: Incarnation | None = None,
         own: bool = False,
+        spaces: int = 0,
     ) -> Value:
-        """A call that a node (our `own`) at `host` makes of RVMaster, or of the face of `target`, as it is answered."""
+        """A call that a node (our `own`) at `host` makes of RVMaster, or of the face of `target`, as it is answered.
+
+        `spaces` follow it: the same question in other words.
+        """
         peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
         serve = self._serving(own=own, target=target) if own or target is not None else self._serve
-        return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
+        return parse_response(
+            await serve(HttpRequest(peer, "/", build_call(method, params) + b" " * spaces, 0))
+        )
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "t") -> None:
         """ROSMaster takes a registration, and control writes it down."""

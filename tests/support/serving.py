@@ -13,13 +13,14 @@ from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
 from appliance.master.calls.parameters import ParameterCalls, ParameterSearch
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
+from appliance.master.calls.repetition import Repetitions
 from appliance.master.calls.table import master_table
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy import Policy
 from appliance.ros.xmlrpc import Limits
 from appliance.rpc.bulk import bulk_turns
-from appliance.rpc.server import Handler
+from appliance.rpc.server import Handler, HttpRequest
 from appliance.shares.pool import Standing
 
 
@@ -63,6 +64,9 @@ def serving(
     pipeline = Pipeline(
         execution,
         Multicall(execution, parameters, trail, offload=offload),
+        repetitions=Repetitions(
+            gate, registry, mirror, rosmaster=rosmaster, addresses=addresses, policy=policy, trail=trail
+        ),
         addresses=addresses,
         trail=trail,
         limits=Limits(),
@@ -75,13 +79,12 @@ def serving(
             registry, graph, enactor, relay, mediation, addresses, nodes, liveness, gate, 11311
         )
         return pipeline.handler(served(NODE_CALLS.values(), node_calls), target=target)
-    return pipeline.handler(
+    handler = pipeline.handler(
         master_table(
             RegistrationCalls(
                 rosmaster, registry, graph, enactor, faces, arrivals, relay, mediation, gate, rights
             ),
             LookupCalls(
-                rosmaster,
                 registry,
                 graph,
                 enactor,
@@ -97,3 +100,8 @@ def serving(
         ),
         own=own,
     )
+
+    async def serve(request: HttpRequest) -> bytes:
+        return (None if own else pipeline.repetitions.answer(request)) or await handler(request)
+
+    return serve

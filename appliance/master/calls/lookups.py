@@ -10,7 +10,6 @@ from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.reach.places import Addresses
 from appliance.master.reach.relays import RelayControl
-from appliance.master.rosmaster import RosMaster
 from appliance.master.upkeep.enactor import Enactor
 from appliance.ros.uris import node_uri, service_uri
 from appliance.ros.xmlrpc import Value
@@ -20,13 +19,11 @@ from appliance.ros.xmlrpc import Value
 class LookupCalls:
     """Answers from the registry, with what stands for nodes and services.
 
-    That has what ROSMaster took and the policy leaves, and is there while ROSMaster is not. Only `getTopicTypes` is
-    ROSMaster's, which remembers the types of topics that nobody has any more.
+    That has what ROSMaster took and the policy leaves, and is there while ROSMaster is not.
 
     `port` is RVMaster's, `stop(reason)` ends the appliance. `unseen` is a publisher that `getSystemState` leaves out.
     """
 
-    rosmaster: RosMaster
     registry: Registry
     graph: Graph
     enactor: Enactor
@@ -81,9 +78,9 @@ class LookupCalls:
         ]
         return [1, "current topics", topics]
 
-    async def get_topic_types(self, caller: Caller) -> Answer:
+    async def get_topic_types(self, _caller: Caller) -> Answer:
         """`getTopicTypes(caller_id)`."""
-        return await self.rosmaster.call("getTopicTypes", caller.caller_id)
+        return [1, "current system state", [[topic, told] for topic, told in self.registry.types()]]
 
     async def get_uri(self, caller: Caller) -> Answer:
         """`getUri(caller_id)` → RVMaster's own, at the address the caller knows it by."""

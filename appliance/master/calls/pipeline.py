@@ -14,6 +14,7 @@ from appliance.master.caller import Caller
 from appliance.master.calls.call import Attempt, Table
 from appliance.master.calls.execution import Execution, Visit
 from appliance.master.calls.multicall import LIMIT_FAULT, MULTICALL, PARSE_FAULT, Multicall
+from appliance.master.calls.repetition import Repetitions
 from appliance.master.graph.registry import Incarnation
 from appliance.master.reach.places import Addresses
 from appliance.policy.model import Category
@@ -39,6 +40,7 @@ class Pipeline:
         execution: Execution,
         multicall: Multicall,
         *,
+        repetitions: Repetitions,
         addresses: Addresses,
         trail: AuditTrail,
         limits: Limits,
@@ -47,6 +49,7 @@ class Pipeline:
     ) -> None:
         self._execution = execution
         self._multicall = multicall
+        self.repetitions = repetitions
         self._addresses = addresses
         self._trail = trail
         self._limits = limits
@@ -59,31 +62,38 @@ class Pipeline:
         async def handle(request: HttpRequest) -> bytes:
             await self._addresses.learn(request.peer)
             caller = Caller(request.peer, "", request.arrived, own=own, target=target)
+            before = self.repetitions.state
             async with Bulk(self._bulk, caller.peer.host) as bulk:
-                return await self._serve(Visit(table, caller, bulk), request.body)
+                call, answer = await self._serve(Visit(table, caller, bulk), request.body)
+            if call is not None and not own and target is None:
+                self.repetitions.note(table, request, call, answer, before=before)
+            return answer
 
         return handle
 
-    async def _serve(self, visit: Visit, body: bytes) -> bytes:
+    async def _serve(self, visit: Visit, body: bytes) -> tuple[MethodCall | None, bytes]:
+        """The call, if it was understood, and the answer."""
         try:
             if len(body) <= self._offload:
                 call = parse_call(body, self._limits)
             else:
                 call = await self._parse_large(body, visit.bulk)
         except PeerError as error:
-            return self._not_understood(visit.caller, body, error)
+            return None, self._not_understood(visit.caller, body, error)
         try:
             answer = await self._answer(visit, call)
             known = call.method in visit.table or call.method == MULTICALL
             seconds = (time.monotonic_ns() - visit.caller.arrived) / 1e9
             self._trail.meter.called(call.method if known else "unknown", seconds)
             if weigh(answer, self._offload) < self._offload:
-                return build_response(answer)
+                return call, build_response(answer)
             await visit.bulk.take()
-            return await asyncio.to_thread(build_response, answer)
+            return call, await asyncio.to_thread(build_response, answer)
         except EncodingError as error:
             _log.error("answer cannot be written", call=call.method, error=str(error))
-            return build_fault(_INTERNAL_FAULT, f"the answer to {call.method} cannot be written: {error}")
+            return None, build_fault(
+                _INTERNAL_FAULT, f"the answer to {call.method} cannot be written: {error}"
+            )
 
     async def _answer(self, visit: Visit, call: MethodCall) -> Value:
         if call.method == MULTICALL and visit.caller.target is None:

@@ -106,7 +106,9 @@ _REGISTRATION: tuple[Call[RegistrationCalls], ...] = (
 )
 
 _LOOKUPS: tuple[Call[LookupCalls], ...] = (
-    Call("lookupNode", method(LookupCalls.lookup_node, NODE), Verb.READ, denial="", small=True),
+    Call(
+        "lookupNode", method(LookupCalls.lookup_node, NODE), Verb.READ, denial="", small=True, mirrored=True
+    ),
     Call(
         "lookupService",
         method(LookupCalls.lookup_service, SERVICE),
@@ -115,9 +117,17 @@ _LOOKUPS: tuple[Call[LookupCalls], ...] = (
         denial="",
         small=True,
     ),
-    Call("getSystemState", method(LookupCalls.get_system_state), Verb.READ, denial=[[], [], []]),
-    Call("getPublishedTopics", method(LookupCalls.get_published_topics, SUBGRAPH), Verb.READ, denial=[]),
-    Call("getTopicTypes", method(LookupCalls.get_topic_types), Verb.READ, denial=[]),
+    Call(
+        "getSystemState", method(LookupCalls.get_system_state), Verb.READ, denial=[[], [], []], mirrored=True
+    ),
+    Call(
+        "getPublishedTopics",
+        method(LookupCalls.get_published_topics, SUBGRAPH),
+        Verb.READ,
+        denial=[],
+        mirrored=True,
+    ),
+    Call("getTopicTypes", method(LookupCalls.get_topic_types), Verb.READ, denial=[], mirrored=True),
     Call("getUri", method(LookupCalls.get_uri), Verb.READ, denial=""),
     Call("getPid", method(LookupCalls.get_pid), Verb.READ, denial=-1),
     Call("shutdown", method(LookupCalls.shutdown_master, MESSAGE), Verb.DO, command="shutdownMaster"),
@@ -130,6 +140,7 @@ _PARAMETERS: tuple[Call[ParameterCalls], ...] = (
         Verb.READ,
         Kind.PARAMETER,
         tells=True,
+        mirrored=True,
         in_run=True,
     ),
     Call(
@@ -139,6 +150,7 @@ _PARAMETERS: tuple[Call[ParameterCalls], ...] = (
         Kind.PARAMETER,
         denial=False,
         small=True,
+        mirrored=True,
         in_run=True,
     ),
     Call("setParam", method(ParameterCalls.set_param, KEY, VALUE), Verb.WRITE, Kind.PARAMETER, in_run=True),

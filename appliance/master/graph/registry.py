@@ -28,6 +28,9 @@ from appliance.ros.uris import NodeUri, node_uri
 ANY_TYPE = "*"
 """The type of a topic for who takes any."""
 
+_MOST_UNUSED_TYPES = 10_000
+"""Topics that nobody has whose types are known: names without end are no way to take memory."""
+
 PUBLISHER_PATH = "/publisher/"
 """The path of the API of the appliance's own publisher, on the listener of the inner faces."""
 
@@ -183,11 +186,13 @@ class Registry:
         self._known: dict[tuple[str, Address, str], Incarnation] = {}
         self._live: dict[str, Incarnation] = {}
         self._topics: dict[tuple[Kind, str], dict[str, Incarnation]] = {}
-        self._types: dict[str, str] = {}  # of topics that somebody has, as ROSMaster has them
+        self._types: dict[str, str] = {}  # of topics, as ROSMaster has them
+        self._unused_types: dict[str, None] = {}  # of topics that nobody has any more, the oldest first
         self._subscribed_keys: list[str] = []  # the parameters of `_topics`, sorted
         self._nodes_of: Counter[Address] = Counter()
         self._registrations_of: Counter[Address] = Counter()
         self._order = 0
+        self.version = 0  # another after every change
 
     # --- looking ---
 
@@ -227,8 +232,12 @@ class Registry:
         return ((kind, resource, holders.values()) for (kind, resource), holders in self._topics.items())
 
     def type_of(self, topic: str) -> str:
-        """The type of a topic that somebody has: what the last publisher said, else the first subscriber."""
-        return self._types[topic]
+        """The type of a topic: what the last publisher said, else the first subscriber that named one."""
+        return self._types.get(topic, ANY_TYPE)
+
+    def types(self) -> Iterable[tuple[str, str]]:
+        """Every topic and its type; also of topics that nobody has any more, as ROSMaster remembers them."""
+        return self._types.items()
 
     def subscribed_below(self, key: str) -> list[str]:
         """The keys of parameters below `key` that live incarnations subscribed to, sorted."""
@@ -286,6 +295,7 @@ class Registry:
 
     def add(self, incarnation: Incarnation) -> list[Durable]:
         """Make a new incarnation known; it holds nothing yet."""
+        self.version += 1
         self._by_key[incarnation.key] = incarnation
         self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
         self._nodes_of[incarnation.host] += 1
@@ -293,6 +303,7 @@ class Registry:
 
     def restore(self, incarnation: Incarnation) -> None:
         """Put back an incarnation that was read from the store, with its registrations."""
+        self.version += 1
         self._by_key[incarnation.key] = incarnation
         self._known[incarnation.name, incarnation.host, incarnation.api_text] = incarnation
         self._nodes_of[incarnation.host] += 1
@@ -308,6 +319,7 @@ class Registry:
     def register(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> list[Durable]:
         """Record that ROSMaster took this registration."""
         kept: list[Durable] = []
+        self.version += 1
         if incarnation.life is Life.SHADOW:  # it was lost while its call was under way
             kept += self.revive(incarnation, incarnation.changed)
         self._live[incarnation.name] = incarnation
@@ -337,6 +349,7 @@ class Registry:
         """Record that a registration is gone; nothing to be kept if there was none."""
         if incarnation.registrations.pop((kind, resource), None) is None:
             return []
+        self.version += 1
         self._registrations_of[incarnation.host] -= 1
         self._unindex(incarnation, kind, resource)
         return [EraseRegistration(incarnation.key, kind, resource)]
@@ -358,6 +371,7 @@ class Registry:
 
     def revive(self, incarnation: Incarnation, when: float) -> list[Durable]:
         """A shadow answers again and its name is free: it is live as before."""
+        self.version += 1
         incarnation.life, incarnation.changed = Life.LIVE, when
         self._live[incarnation.name] = incarnation
         for registration in incarnation.registrations.values():
@@ -366,6 +380,7 @@ class Registry:
 
     def forget(self, incarnation: Incarnation) -> list[Durable]:
         """Drop an incarnation for good; its ports may go to another."""
+        self.version += 1
         for kind, resource in incarnation.registrations:
             self._unindex(incarnation, kind, resource)
         if self._live.get(incarnation.name) is incarnation:
@@ -379,6 +394,7 @@ class Registry:
         return [EraseNode(incarnation.key)]
 
     def _retire(self, incarnation: Incarnation, life: Life, when: float) -> list[Durable]:
+        self.version += 1
         incarnation.life, incarnation.changed = life, when
         incarnation.told_lists.clear()
         if self._live.get(incarnation.name) is incarnation:
@@ -393,11 +409,39 @@ class Registry:
         self._note_type(registration)
 
     def _note_type(self, registration: Registration) -> None:
-        """Take a topic's type as ROSMaster does: `*` and a subscriber's count where there is none yet."""
+        """Take a topic's type as ROSMaster does: a publisher's, or a subscriber's and `*` where there is none yet."""
         kind, topic, told = registration.kind, registration.resource, registration.detail
-        known = self._types.get(topic, ANY_TYPE)
-        if (kind is Kind.PUBLICATION and told != ANY_TYPE) or (kind in _OF_TOPICS and known == ANY_TYPE):
+        if kind not in _OF_TOPICS:
+            return
+        self._unused_types.pop(topic, None)
+        publishes, known = kind is Kind.PUBLICATION, topic in self._types
+        if (publishes or not known) if told != ANY_TYPE else (publishes and not known):
             self._types[topic] = told
+
+    def adopt_types(self, types: Iterable[tuple[str, str]]) -> None:
+        """Take what ROSMaster remembers: of topics from before control began."""
+        self.version += 1
+        for topic, told in types:
+            self._types[topic] = told
+            if not self._has_topic(topic):
+                self._remember_unused(topic)
+
+    def forget_types(self) -> None:
+        """A new ROSMaster knows nothing of topics that nobody has."""
+        self.version += 1
+        for topic in self._unused_types:
+            self._types.pop(topic, None)
+        self._unused_types.clear()
+
+    def _remember_unused(self, topic: str) -> None:
+        self._unused_types[topic] = None
+        if len(self._unused_types) > _MOST_UNUSED_TYPES:
+            oldest = next(iter(self._unused_types))
+            del self._unused_types[oldest]
+            self._types.pop(oldest, None)
+
+    def _has_topic(self, topic: str) -> bool:
+        return any((kind, topic) in self._topics for kind in _OF_TOPICS)
 
     def _unindex(self, incarnation: Incarnation, kind: Kind, resource: str) -> None:
         holders = self._topics.get((kind, resource))
@@ -405,8 +449,8 @@ class Registry:
             holders.pop(incarnation.key, None)
             if not holders:
                 del self._topics[kind, resource]
-                if not any((other, resource) in self._topics for other in _OF_TOPICS):
-                    self._types.pop(resource, None)
+                if kind in _OF_TOPICS and not self._has_topic(resource):
+                    self._remember_unused(resource)
                 if kind is Kind.PARAMETER:
                     del self._subscribed_keys[bisect_left(self._subscribed_keys, resource)]
 

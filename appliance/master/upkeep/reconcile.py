@@ -100,6 +100,8 @@ class Reconciler:
             ):
                 tree = (await self._rosmaster.call_now("getParam", NAME, "/"))[2]
                 self._parameters.replace(cast(Tree, tree))
+                types = (await self._rosmaster.call_now("getTopicTypes", NAME))[2]
+                self._registry.adopt_types(cast(list[tuple[str, str]], types))
                 await self._compare()
                 self._tell_parameters()
             else:
@@ -120,6 +122,7 @@ class Reconciler:
         tree = {**self._own_parameters(), **self._parameters.tree}
         await self._rosmaster.call_now("setParam", NAME, "/", tree)
         self._parameters.replace(tree)
+        self._registry.forget_types()
         made = 0
         for incarnation, registration in self._registry.in_order():
             await self._entries.make(incarnation, registration)

@@ -16,12 +16,14 @@ from appliance.policy.model import Address
 from appliance.ros.xmlrpc import FaultReceived, parse_response
 from appliance.rpc.front import HttpLimits, plain_address
 from appliance.rpc.server import (
+    AtOnce,
     Handler,
     HttpRequest,
     HttpServer,
     NoAnswerError,
     Peer,
     listen,
+    not_at_once,
 )
 from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Visitors
@@ -116,6 +118,7 @@ class Server:
         self, handler: Handler | None, limits: HttpLimits, refusal: bytes | None, shares: "Shares"
     ) -> None:
         self.requests: list[HttpRequest] = []
+        self.at_once: AtOnce = not_at_once
         self.troubles: list[str] = []
         self.visitors: Visitors[Address] = Visitors(
             _named, connections=shares.connections, held=shares.held, farewells=shares.farewells
@@ -128,6 +131,7 @@ class Server:
         self.http = HttpServer(
             self.socket,
             self._handle,
+            at_once=lambda request: self.at_once(request),  # noqa: PLW0108 - the one of that moment
             limits=limits,
             visitors=self.visitors,
             turns=self.turns,
@@ -270,6 +274,56 @@ def test_pipelined_requests() -> None:
             for number in range(500):
                 assert (await client.response())[2] == b"answer to %d" % number
             assert len(server.requests) == 500
+
+    run(test())
+
+
+@pytest.mark.parametrize("together", [False, True], ids=["one by one", "in one piece"])
+def test_what_can_be_answered_at_once(together: bool) -> None:
+    """Such requests and others on one connection are answered in their order, whole or in pieces; nothing is kept."""
+
+    async def slowly(request: HttpRequest) -> bytes:
+        await asyncio.sleep(0)
+        return b"known" if b"known" in request.body else request.body
+
+    async def test() -> None:
+        async with serving(slowly) as server:
+            server.at_once = lambda request: b"known" if b"known" in request.body else None
+            client = await server.connect()
+            bodies = [b"known", b"new", b"known 2" + b"x" * 100_000, b"new 2", b"known 3", *[b"known"] * 300]
+            if together:
+                await client.send(b"".join(post(body) for body in bodies))
+            for body in bodies:
+                if not together:
+                    await client.send(post(body))
+                status, _headers, answer = await client.response()
+                assert (status, answer) == (200, b"known" if b"known" in body else body)
+            assert [request.body for request in server.requests] == [b"new", b"new 2"] or together
+
+    run(test())
+
+
+def test_nobody_is_answered_at_once_while_others_wait() -> None:
+    """While a host waits for its turn, who comes later waits, too, also with what takes no time."""
+
+    async def test() -> None:
+        go = asyncio.Event()
+
+        async def slow(request: HttpRequest) -> bytes:
+            await go.wait()
+            return request.body
+
+        async with serving(slow, shares=Shares(requests=Bounds(1, 1, 1, 0))) as server:
+            server.at_once = lambda request: b"at once" if request.body == b"known" else None
+            first, second, third = [await server.connect() for _ in range(3)]
+            await first.send(post(b"one"))
+            await until(lambda: bool(server.requests))
+            await second.send(post(b"two"))
+            await until(lambda: bool(server.turns.waiting))
+            await third.send(post(b"known"))
+            await until(lambda: server.visitors.held.total > 3 * 4096)
+            go.set()
+            assert [(await one.response())[2] for one in (first, second, third)] == [b"one", b"two", b"known"]
 
     run(test())
 

@@ -8,6 +8,7 @@ import pytest
 
 from appliance.master.caller import Caller
 from appliance.master.calls.lookups import LookupCalls
+from appliance.master.graph import registry
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.ros.uris import parse_node_uri
 
@@ -24,7 +25,6 @@ class Site:
         self.registry = Registry()
         self.granted: list[Incarnation] = []
         parts: dict[str, Any] = {
-            "rosmaster": None,
             "registry": self.registry,
             "mediation": SimpleNamespace(carries_service=lambda _name: True, stand_ins=True),
             "graph": self,
@@ -111,7 +111,26 @@ async def test_a_type_is_taken_as_rosmaster_does() -> None:
     for node, kind in ((one, Kind.SUBSCRIPTION), (two, Kind.PUBLICATION)):
         site.registry.unregister(node, kind, "/x")
     site.registry.register(one, Kind.PUBLICATION, "/x", "*")
-    assert await site.types() == [["/x", "*"]], "nobody had it: nothing is kept"
+    assert await site.types() == [["/x", "p/Last"]], "it is remembered when nobody has it"
+    site.registry.register(one, Kind.SUBSCRIPTION, "/never", "*")
+    site.registry.register(two, Kind.PUBLICATION, "/any", "*")
+    every = [["/x", "p/Last"], ["/any", "*"]]
+    assert (await site.calls.get_topic_types(CALLER))[2] == every
+
+
+def test_types_of_topics_that_nobody_has_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest goes; what ROSMaster remembers is adopted, and a new ROSMaster remembers nothing."""
+    monkeypatch.setattr(registry, "_MOST_UNUSED_TYPES", 2)
+    site = Site()
+    node = site.node("/a", 4000)
+    site.registry.register(node, Kind.PUBLICATION, "/kept", "p/Kept")
+    site.registry.adopt_types([("/1", "p/One"), ("/kept", "p/Kept")])
+    for topic in ("/2", "/3"):
+        site.registry.register(node, Kind.PUBLICATION, topic, "p/Type")
+        site.registry.unregister(node, Kind.PUBLICATION, topic)
+    assert dict(site.registry.types()) == {"/kept": "p/Kept", "/2": "p/Type", "/3": "p/Type"}
+    site.registry.forget_types()
+    assert dict(site.registry.types()) == {"/kept": "p/Kept"}
 
 
 async def test_only_what_is_below() -> None:

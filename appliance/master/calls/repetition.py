@@ -1,0 +1,195 @@
+"""Questions that are asked again, word for word: they get the answer they got before, while that is still right.
+
+Most of what nodes and tools ask is what they asked a moment ago. Each such call has its decision and its record like
+any other, but is neither parsed, nor decided, nor written anew where nothing can be different. Invariants:
+
+1. Remembered is only what was allowed and reads what control has itself (`Call.mirrored`); of a multicall, if each part
+   does.
+2. An answer holds while everything is the same that decision, record and answer are made of: host and words, the policy
+   and its revision, who holds the claimed name, the appliance's address that the host is told, and the registry, or the
+   value of the parameter.
+3. What can refuse a call whatever it asks (an audit log that cannot be written, a disk that is nearly full) is asked
+   each time; and where the answer waits for its record, nothing is answered from here.
+4. What is remembered is bounded: so many questions, so many bytes.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from appliance.audit.record import Repeated
+from appliance.audit_trail import AuditTrail
+from appliance.master.caller import Caller
+from appliance.master.calls.call import Attempt, Table
+from appliance.master.calls.gate import Gate
+from appliance.master.calls.multicall import MULTICALL
+from appliance.master.graph.registry import Incarnation, Registry
+from appliance.master.parameter_mirror import ParameterMirror
+from appliance.master.reach.places import Addresses
+from appliance.master.rosmaster import RosMaster
+from appliance.policy import Policy
+from appliance.policy.model import Decision
+from appliance.ros.errors import PeerError
+from appliance.ros.parameter_tree import standing_at
+from appliance.ros.xmlrpc import MethodCall, Value
+from appliance.rpc.server import HttpRequest, Peer
+
+_LARGEST_QUESTION, _LARGEST_ANSWER = 8 << 10, 256 << 10  # bytes of each that are remembered
+_MOST_QUESTIONS, _MOST_BYTES = 4096, 16 << 20
+
+
+@dataclass(slots=True)
+class _Part:
+    """One call: whose it is said to be, who held that name, the parameter and what it had (`key` is empty: none)."""
+
+    caller_id: str
+    holder: Incarnation | None
+    key: str
+    value: Value
+    same: Repeated
+
+
+@dataclass(slots=True)
+class _Question:
+    """A question whose answer is known, and what that was made of; `call` is its name in the metrics."""
+
+    call: str
+    parts: list[_Part]
+    answer: bytes
+    policy: Policy
+    revision: int
+    told: str
+    seen: tuple[int, int]
+
+
+class Repetitions:
+    """What was asked at RVMaster's listener, by host and words."""
+
+    def __init__(
+        self,
+        gate: Gate,
+        registry: Registry,
+        mirror: ParameterMirror,
+        *,
+        rosmaster: RosMaster,
+        addresses: Addresses,
+        policy: Callable[[], Policy],
+        trail: AuditTrail,
+    ) -> None:
+        self._gate = gate
+        self._registry = registry
+        self._mirror = mirror
+        self._rosmaster = rosmaster
+        self._addresses = addresses
+        self._policy = policy
+        self._trail = trail
+        self._questions: dict[tuple[str, bytes], _Question | None] = {}  # None: asked once
+        self._bytes = 0
+
+    @property
+    def state(self) -> tuple[int, int]:
+        """Registry and parameters: another after every change."""
+        return self._registry.version, self._mirror.version
+
+    def answer(self, request: HttpRequest) -> bytes | None:
+        """The answer to a question that was asked before, decided and recorded once more; None for any other."""
+        peer = request.peer
+        question = self._questions.get((peer.text, request.body))
+        if question is None:
+            return None
+        trail = self._trail
+        if trail.strict or trail.obstacle or trail.shut_out(peer.text) or not self._holds(question, peer):
+            return None
+        for part in question.parts:
+            trail.decided_again(part.same, request.arrived)
+        trail.meter.called(question.call, (time.monotonic_ns() - request.arrived) / 1e9)
+        return question.answer
+
+    def _holds(self, question: _Question, peer: Peer) -> bool:
+        if (
+            question.policy is not self._policy()
+            or question.revision != self._trail.revision
+            or not self._rosmaster.reachable
+            or question.told != self._addresses.told_to(peer)
+        ):
+            return False
+        state = self.state
+        if question.seen == state:
+            return True
+        if not all(self._same(part) for part in question.parts):
+            return False
+        question.seen = state
+        return True
+
+    def _same(self, part: _Part) -> bool:
+        """Whether a part holds after a change: if it is about a parameter that has the same value (no namespace)."""
+        return (
+            part.key != ""
+            and self._registry.holder(part.caller_id) is part.holder
+            and not isinstance(part.value, dict)
+            and standing_at(self._mirror.tree, part.key)[0] is part.value
+        )
+
+    def note(
+        self, table: Table, request: HttpRequest, call: MethodCall, answer: bytes, *, before: tuple[int, int]
+    ) -> None:
+        """This was answered so, and all was as it is now when it began (`before`); remembered the second time."""
+        caller, body = Caller(request.peer, "", request.arrived), request.body
+        key = caller.peer.text, body
+        if len(body) > _LARGEST_QUESTION or len(answer) > _LARGEST_ANSWER or before != self.state:
+            return
+        if not self._rosmaster.reachable:
+            return
+        if key not in self._questions:
+            self._put(key, None)
+            return
+        parts = self._parts(table, caller, call)
+        if parts is None:
+            return
+        told = self._addresses.told_to(caller.peer)
+        self._put(
+            key, _Question(call.method, parts, answer, self._policy(), self._trail.revision, told, before)
+        )
+
+    def _put(self, key: tuple[str, bytes], question: _Question | None) -> None:
+        self._bytes += len(key[1]) + (0 if question is None else len(question.answer))
+        if len(self._questions) >= _MOST_QUESTIONS or self._bytes > _MOST_BYTES:
+            self._questions.clear()
+            self._bytes = 0
+        self._questions[key] = question
+
+    def _parts(self, table: Table, caller: Caller, call: MethodCall) -> list[_Part] | None:
+        """The calls of a question; None if one of them is not to be remembered."""
+        calls: Sequence[Value] = [{"methodName": call.method, "params": list(call.params)}]
+        if call.method == MULTICALL:
+            calls = call.params[0] if call.params and isinstance(call.params[0], list) else []
+        parts: list[_Part] = []
+        for one in calls:
+            match one:
+                case {"methodName": str(method), "params": list(params)} if (
+                    method in table and table[method].call.mirrored
+                ):
+                    part = self._part(table[method].call.attempt, caller, params)
+                    if part is None:
+                        return None
+                    parts.append(part)
+                case _:
+                    return None
+        return parts
+
+    def _part(
+        self, attempt_of: Callable[[Caller, Sequence[Value]], Attempt], caller: Caller, params: list[Value]
+    ) -> _Part | None:
+        try:
+            attempt = attempt_of(caller, params)
+        except PeerError:
+            return None
+        decision = self._gate.decide(attempt, self._mirror.tree)
+        if not isinstance(decision, Decision) or decision.word != "allow":
+            return None
+        request, asker = attempt.request, attempt.caller.asker
+        same = self._trail.repeatable(
+            asker, attempt.call.name, request.category.value, request.resource, decision, **attempt.about
+        )
+        value = standing_at(self._mirror.tree, attempt.resource)[0] if attempt.resource else None
+        return _Part(asker.caller_id, self._registry.holder(asker.caller_id), attempt.resource, value, same)
