@@ -36,6 +36,7 @@ from appliance.rpc.server import HttpRequest, Peer
 
 _LARGEST_QUESTION, _LARGEST_ANSWER = 8 << 10, 256 << 10  # bytes of each that are remembered
 _MOST_QUESTIONS, _MOST_BYTES = 4096, 16 << 20
+State = tuple[int, int, bool]
 
 
 @dataclass(slots=True)
@@ -59,7 +60,7 @@ class _Question:
     policy: Policy
     revision: int
     told: str
-    seen: tuple[int, int]
+    seen: State
 
 
 class Repetitions:
@@ -87,9 +88,9 @@ class Repetitions:
         self._bytes = 0
 
     @property
-    def state(self) -> tuple[int, int]:
-        """Registry and parameters: another after every change."""
-        return self._registry.version, self._mirror.version
+    def state(self) -> State:
+        """Registry and parameters, another after every change; and whether ROSMaster is there, and whole."""
+        return self._registry.version, self._mirror.version, self._rosmaster.reachable
 
     def answer(self, request: HttpRequest) -> bytes | None:
         """The answer to a question that was asked before, decided and recorded once more; None for any other."""
@@ -131,7 +132,7 @@ class Repetitions:
         )
 
     def note(
-        self, table: Table, request: HttpRequest, call: MethodCall, answer: bytes, *, before: tuple[int, int]
+        self, table: Table, request: HttpRequest, call: MethodCall, answer: bytes, *, before: State
     ) -> None:
         """This was answered so, and all was as it is now when it began (`before`); remembered the second time."""
         caller, body = Caller(request.peer, "", request.arrived), request.body

@@ -113,8 +113,11 @@ class MasterSide:
         if uri.startswith(self.nodes.base):
             return f"<{uri.removeprefix(self.nodes.base).split('-')[0]}>"
         if uri not in self._names:
-            with xmlrpc.client.ServerProxy(uri) as node:
-                answer: Any = node.getName(TESTER)
+            try:
+                with xmlrpc.client.ServerProxy(uri) as node:
+                    answer: Any = node.getName(TESTER)
+            except ConnectionRefusedError:  # a list from before its node was replaced
+                return "<gone>"
             self._names[uri] = f"<{answer[2].rpartition('/')[2]}>"
         return self._names[uri]
 
