@@ -61,9 +61,9 @@ async def test_a_reload_is_obeyed_at_the_next_question() -> None:
     """What was answered a moment ago is denied by the policy that is in force now."""
     world = await begun()
     for _ in range(3):
-        assert (await world.ask("getSystemState", "/ear"))[0] == 1  # type: ignore[index]
+        assert (await world.ask("getSystemState", "/ear"))[0] == 1  # type: ignore[index]  # an answer is a list
     world.reload(OPEN.replace("[Commands]\n", "[Commands]\ngetSystemState=\n"))
-    assert (await world.ask("getSystemState", "/ear"))[0] == 0  # type: ignore[index]
+    assert (await world.ask("getSystemState", "/ear"))[0] == 0  # type: ignore[index]  # an answer is a list
 
 
 async def test_a_name_that_another_host_took_is_not_spoken_for() -> None:
@@ -71,9 +71,9 @@ async def test_a_name_that_another_host_took_is_not_spoken_for() -> None:
     world = await begun()
     asking = ("getParam", "/late", "/arm/max")
     for _ in range(3):
-        assert (await world.ask(*asking, host="10.0.0.9"))[0] == 1  # type: ignore[index]
+        assert (await world.ask(*asking, host="10.0.0.9"))[0] == 1  # type: ignore[index]  # an answer is a list
     await world.register(world.node("/late", 5), Kind.PUBLICATION, "/x")
-    assert (await world.ask(*asking, host="10.0.0.9"))[0] == 0  # type: ignore[index]
+    assert (await world.ask(*asking, host="10.0.0.9"))[0] == 0  # type: ignore[index]  # an answer is a list
 
 
 @pytest.mark.parametrize("obstacle", ["strict", "shut out", "no log"])
@@ -93,7 +93,7 @@ async def test_what_refuses_a_call_whatever_it_asks(obstacle: str, monkeypatch: 
         monkeypatch.setattr(world.records, "shut_out", lambda _host: "the disk is nearly full")
     else:
         monkeypatch.setattr(world.records, "obstacle", "the log cannot be written")
-    assert (await world.ask("getSystemState", "/ear"))[0] == 0  # type: ignore[index]
+    assert (await world.ask("getSystemState", "/ear"))[0] == 0  # type: ignore[index]  # an answer is a list
 
 
 @pytest.mark.parametrize("seed", range(10))
