@@ -77,7 +77,7 @@ class Subscriber:
         except BlockingIOError:
             sent = 0
         except OSError as error:
-            self.cut(f"cannot be written to: {error.strerror}")
+            self._cut_by(error, "cannot be written to")
             return False
         if sent < len(data):
             self._outbox.begin(memoryview(data)[sent:])
@@ -106,7 +106,7 @@ class Subscriber:
             except BlockingIOError:
                 sent = 0
             except OSError as error:
-                self.cut(f"cannot be written to: {error.strerror}")
+                self._cut_by(error, "cannot be written to")
                 return 0
             if sent == len(view):
                 return 0
@@ -159,6 +159,12 @@ class Subscriber:
             self._reporter.closed(self._number, reason)
             self._ended()
 
+    def _cut_by(self, error: OSError, what: str) -> None:
+        """Who ends with messages unread resets the connection, and a write may notice before a read: its own end."""
+        self.cut(
+            "" if isinstance(error, BrokenPipeError | ConnectionResetError) else f"{what}: {error.strerror}"
+        )
+
     def _ready(self, events: int) -> None:
         if events & WRITE:
             self._flush()
@@ -172,7 +178,7 @@ class Subscriber:
         except BlockingIOError:
             return
         except OSError as error:
-            self.cut(f"cannot be written to: {error.strerror}")
+            self._cut_by(error, "cannot be written to")
             return
         outbox.advance(sent)
         if not outbox:
@@ -186,7 +192,7 @@ class Subscriber:
         except BlockingIOError:
             return
         except OSError as error:
-            self.cut(f"broke: {error.strerror}")
+            self._cut_by(error, "broke")
             return
         if not data:
             self.cut("")
