@@ -142,6 +142,6 @@ def main(checkout: Path) -> int:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        raise SystemExit(__doc__)
-    sys.exit(main(Path(sys.argv[1])))
+    if len(sys.argv) == 2:
+        sys.exit(main(Path(sys.argv[1])))
+    print(f"Nothing is compared without a checkout.\n\n{__doc__}")
