@@ -6,7 +6,9 @@ waits a moment and is then told to come back.
 
 import asyncio
 import contextlib
+import itertools
 import json
+import pathlib
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -19,19 +21,19 @@ from appliance.api.access import Bearer
 from appliance.api.judgement import explained, granted, is_refusal
 from appliance.api.moments import given
 from appliance.api.problems import ProblemError
-from appliance.api.roles import OPERATOR, VIEWER, Reader, Viewer, ask, reads_contents
+from appliance.api.roles import OPERATOR, VIEWER, Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.api.streams import Held, Streams, peer_of, turn
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.database import LogUnreadableError
-from appliance.audit.evidence import Chain, evidence, evidence_line
+from appliance.audit.evidence import evidence, evidence_line
 from appliance.audit.findings import Verification
 from appliance.audit.output import Entry, as_json, as_object, without_contents
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
 from appliance.audit.schema import json_schema
-from appliance.audit.search import Follower, search, show
+from appliance.audit.search import Follower, export, search, show
 from appliance.audit.signatures import KeyUnreadableError
 from appliance.audit.verify import verify
 from appliance.channel.admin import PolicyWanted
@@ -223,15 +225,16 @@ def routes(services: Services) -> Routes:
         responses=_text("application/x-ndjson", "A record a line."),
         response_class=Response,
     )
-    async def export_audit(request: Request, bearer: Reader, wanted: Wanted) -> Response:
-        """All records that match, oldest first, one JSON object a line. For investigators, operators and admins.
+    async def export_audit(request: Request, bearer: Viewer, wanted: Wanted) -> Response:
+        """All records that match, oldest first, one JSON object a line.
 
         Each has in `chain` its place in the hash chain, as far as a signed checkpoint: `rosrv audit verify --export`
-        proves it on any machine, with the appliance's public key.
+        proves it on any machine, with the appliance's public key. Viewers get records as a search shows them to
+        viewers, without what messages said and without `chain`: only what is whole can be proven.
         """
-        entries = await desk.read(lambda: _begun(evidence(desk.path, wanted)))
+        found = await desk.read(_exported, desk.path, wanted, bearer)
         give_back = services.exports.take(bearer, peer_of(request), "exports")
-        return Held(StreamingResponse(_lines(entries), media_type="application/x-ndjson"), give_back)
+        return Held(StreamingResponse(_pieces(found), media_type="application/x-ndjson"), give_back)
 
     @router.get("/{record_id}", operation_id="audit_record", responses=_json(_ONE) | _UNKNOWN)
     async def audit_record(
@@ -301,8 +304,7 @@ async def _follow(
         entries = await desk.in_thread(follower.poll, _STREAM_PAGE)
         for entry in entries:
             for record in _shown([entry], bearer, text):
-                data = json.dumps(record, separators=(",", ":"))
-                yield ServerSentEvent(event="record", id=str(entry.sequence), data=data)
+                yield ServerSentEvent(event="record", id=str(entry.sequence), data=_as_line(record))
         if not entries:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(services.stopping.wait(), _POLL_SECONDS)
@@ -323,6 +325,13 @@ def _readable(entry: Entry, bearer: Bearer) -> Entry:
     return entry if reads_contents(bearer) else without_contents(entry)
 
 
+def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer) -> Iterator[str]:
+    if reads_contents(bearer):
+        return _begun(evidence_line(*one) for one in evidence(path, wanted))
+    shown = (_shown([entry], bearer, wanted.text) for entry in export(path, wanted))
+    return _begun(_as_line(record) for records in shown for record in records)
+
+
 def _begun(entries: Iterator[_T]) -> Iterator[_T]:
     """The same entries, the first of them read: what is wrong with a search is known before the answer begins."""
     first = next(entries, None)
@@ -334,15 +343,14 @@ def _chain(first: _T, rest: Iterator[_T]) -> Iterator[_T]:
     yield from rest
 
 
-async def _lines(entries: Iterator[tuple[Entry, Chain]]) -> AsyncIterator[str]:
-    while piece := await asyncio.to_thread(_piece, entries):
+async def _pieces(lines: Iterator[str]) -> AsyncIterator[str]:
+    while piece := await asyncio.to_thread(_piece, lines):
         yield piece
 
 
-def _piece(entries: Iterator[tuple[Entry, Chain]]) -> str:
-    lines = []
-    for entry, chain in entries:
-        lines.append(evidence_line(entry, chain) + "\n")
-        if len(lines) == _STREAM_PAGE:
-            break
-    return "".join(lines)
+def _piece(lines: Iterator[str]) -> str:
+    return "".join(f"{line}\n" for line in itertools.islice(lines, _STREAM_PAGE))
+
+
+def _as_line(record: dict[str, Any]) -> str:
+    return json.dumps(record, separators=(",", ":"))
