@@ -95,6 +95,8 @@ class Repetitions:
     def answer(self, request: HttpRequest) -> bytes | None:
         """The answer to a question that was asked before, decided and recorded once more; None for any other."""
         peer = request.peer
+        if len(request.body) > _LARGEST_QUESTION:
+            return None
         question = self._questions.get((peer.text, request.body))
         if question is None:
             return None
