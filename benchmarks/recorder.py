@@ -9,7 +9,8 @@ recorded until the whole file is there. Of the machine: processor time of the re
 publisher to subscriber.
 
 *killed* is the appliance with the recorder, whose relay, control and recorder get SIGKILL together in the middle of
-what is recorded. What is missing there is what the subscriber heard and the recording has not.
+what is recorded. What is missing there is what the subscriber heard in the time that the recording says it has, and the
+recording has not.
 """
 
 import argparse
@@ -97,11 +98,15 @@ class Load:
         self._talker.stop()
         return float(heard["p50_us"])
 
-    def heard(self) -> dict[str, set[int]]:
-        """The numbers of the messages that the listener had when it ended, by topic."""
+    def heard(self, began: int, ended: int) -> dict[str, set[int]]:
+        """The numbers of the messages that the listener had from `began` to `ended` (ns since the epoch), by topic.
+
+        Not those of the first second: what is heard then may have been published before.
+        """
         numbers: dict[str, set[int]] = {}
-        for topic, number in struct.iter_unpack("=QQ", self._heard.read_bytes()):
-            numbers.setdefault(f"/load/t{topic}", set()).add(number)
+        for topic, number, when in struct.iter_unpack("=QQQ", self._heard.read_bytes()):
+            if began + 1e9 < when < ended:
+                numbers.setdefault(f"/load/t{topic}", set()).add(number)
         return numbers
 
 
@@ -116,7 +121,7 @@ def measured(pids: Mapping[str, int], seconds: float, into: dict[str, float]) ->
 def counted(path: Path, closed: float, heard: dict[str, set[int]] | None = None) -> Bag:
     """How many messages of the load a bag has, and how many are missing between the first and the last of a topic.
 
-    Of those that were `heard`, where it is given; a topic that the bag has not is missing as a whole.
+    Of those that were `heard`, where it is given: all that the bag has not.
     """
     numbers: dict[str, set[int]] = {}
     with Reader(path) as reader:
@@ -126,14 +131,8 @@ def counted(path: Path, closed: float, heard: dict[str, set[int]] | None = None)
     if heard is None:
         lost = sum(max(seen) - min(seen) + 1 - len(seen) for seen in numbers.values())
     else:
-        lost = sum(len(missing(numbers.get(topic, set()), told)) for topic, told in heard.items())
+        lost = sum(len(told - numbers.get(topic, set())) for topic, told in heard.items())
     return Bag(sum(map(len, numbers.values())), lost, closed)
-
-
-def missing(recorded: set[int], heard: set[int]) -> set[int]:
-    """What was heard and not recorded, of the time that the recording has."""
-    first, last = (min(recorded), max(recorded)) if recorded else (min(heard), max(heard))
-    return {number for number in heard if first <= number <= last} - recorded
 
 
 def snapshot_program() -> Path | None:
@@ -209,7 +208,9 @@ def at_appliance(
             eventually(bag.exists, appliance.story, 120)
             closed = time.time() - begun["ends"] / 1e9
         p50 = running.end()
-        return Result(p50, counted(bag, closed, running.heard() if kills else None), cpu)
+        [row] = map(json.loads, appliance.rosrv("record", "list", "--json").stdout.splitlines())
+        heard = running.heard(row["began"], row["ended"]) if kills else None
+        return Result(p50, counted(bag, closed, heard), cpu)
 
 
 def main() -> None:

@@ -1,5 +1,5 @@
 // A robot that talks and one that listens: `talk TOPICS BYTES HERTZ`, `listen TOPICS FILE`.
-// FILE gets for each message that was heard its topic and its number, 8 bytes each.
+// FILE gets for each message that was heard its topic, its number and when that was (ns since the epoch), 8 bytes each.
 // A message begins with its number on its topic (from 0) and when it was published (CLOCK_MONOTONIC, ns), 8 bytes each.
 #include <ros/ros.h>
 #include <std_msgs/String.h>
@@ -13,9 +13,9 @@
 
 #include "../../tests/support/roscpp_nodes/report.hpp"
 
-static uint64_t now() {
+static uint64_t now(clockid_t clock = CLOCK_MONOTONIC) {
   timespec time;
-  clock_gettime(CLOCK_MONOTONIC, &time);
+  clock_gettime(clock, &time);
   return uint64_t(time.tv_sec) * 1000000000u + uint64_t(time.tv_nsec);
 }
 
@@ -54,6 +54,7 @@ static void listen(ros::NodeHandle& node, int topics, const std::string& file) {
           delays.push_back(now() - head[1]);
           numbers.push_back(uint64_t(number));
           numbers.push_back(head[0]);
+          numbers.push_back(now(CLOCK_REALTIME));
         };
     subscribers.push_back(node.subscribe<std_msgs::String>(
         topic(number), 100, heard, ros::VoidConstPtr(), ros::TransportHints().tcpNoDelay()));
