@@ -29,7 +29,7 @@ def in_full(value: Any) -> Any:
         fields: dict[str, Any] = {}
         for name in value.__struct_fields__:
             fields[name] = in_full(getattr(value, name))
-            if name in units:
+            if name in units and fields[name] is not None:
                 fields[name + _UTC] = _text(fields[name], units[name])
         return fields
     if isinstance(value, Mapping):
@@ -45,10 +45,9 @@ def describe(schema: dict[str, Any]) -> None:
     for name, field in schema.get("properties", {}).items():
         fields[name] = field
         if _unit(field) is not None:
-            text = {"type": "string", "format": "date-time", "description": f"`{name}` as RFC 3339, UTC"}
-            nothing = [{"type": "null"}] if "anyOf" in field else []
-            fields[name + _UTC] = {"anyOf": [text, *nothing]} if nothing else text
-            if name in schema.get("required", ()):
+            text = f"`{name}` as RFC 3339, UTC" + ("; absent where that is null" if "anyOf" in field else "")
+            fields[name + _UTC] = {"type": "string", "format": "date-time", "description": text}
+            if name in schema.get("required", ()) and "anyOf" not in field:
                 schema["required"].append(name + _UTC)
     if fields:
         schema["properties"] = fields
@@ -62,9 +61,7 @@ def given(text: str) -> int:
         raise ProblemError(422, "bad-input", str(error)) from error
 
 
-def _text(moment: float | None, unit: str) -> str | None:
-    if moment is None:
-        return None
+def _text(moment: float, unit: str) -> str:
     return rfc3339(int(moment) if unit == "nanoseconds" else round(moment * _OF_A_SECOND) * 1_000)
 
 

@@ -57,7 +57,8 @@ def asked(rest: Rest, call: str, body: Any = None) -> Any:
 def differences(given: Any, shown: Any, place: str, *, whole: bool = True) -> list[str]:
     """Where an answer is not of the form of an example; below its own fields they may have others of each kind."""
     if isinstance(given, dict) and isinstance(shown, dict):
-        found = [f"{place}: {name}" for name in given.keys() ^ shown.keys() if whole]
+        nowhen = {f"{name}_utc" for one in (given, shown) for name, value in one.items() if value is None}
+        found = [f"{place}: {name}" for name in (given.keys() ^ shown.keys()) - nowhen if whole]
         for name in given.keys() & shown.keys():
             found += differences(given[name], shown[name], f"{place}.{name}", whole=False)
         return found
