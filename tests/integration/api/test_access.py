@@ -162,9 +162,11 @@ def test_a_body_too_large_is_refused_unread(rest: Rest) -> None:
     assert rest.get("/v1/status").status == 200
 
 
-def test_a_flood_of_one_host_is_slowed_down() -> None:
+def test_a_flood_of_one_host_is_slowed_down(tmp_path: Path) -> None:
     """Beyond the burst a host is told to come back later (429, Retry-After); and so is one that guesses tokens."""
-    with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off")) as appliance:
+    config = tmp_path / "appliance.yaml"
+    config.write_text("api: 127.0.0.1:0\napi_tls: off\napi_limits: {requests_per_second: 1, burst: 100}\n")
+    with Appliance(options=("--config", str(config))) as appliance:
         rest = appliance.rest()
         stranger = rest.with_token(None)
         statuses = [
