@@ -208,6 +208,7 @@ class Liveness:
     async def revive(self, incarnation: Incarnation) -> None:
         """A shadow registers: it is there again, and so is all it had."""
         self._answered[incarnation.key] = time.monotonic()
+        self._processes.pop(incarnation.key, None)
         await self._bring_back(incarnation)
 
     async def _bring_back(self, incarnation: Incarnation) -> None:

@@ -78,11 +78,21 @@ async def test_the_answer_of_another_process_is_no_life_of_the_dead() -> None:
     for node in (dead, heir, dead):
         await street.look(node)
     assert (dead.life, heir.life) == (Life.SHADOW, Life.LIVE)
-    dead.touched += 1  # as `Arrivals` does at each registering call
-    await street.register(dead, Kind.SUBSCRIPTION, "/t")
+    await street.liveness.revive(dead)
     await street.look(dead)
     await street.look(dead)
     assert dead.life is Life.LIVE
+
+
+async def test_a_node_that_was_started_again_at_its_address() -> None:
+    """It registers, and is there: another process than before is the node now."""
+    street = Street()
+    node, _other = await street.two_at_one_address()
+    street.process = 2
+    node.touched += 1  # as at each registering call
+    await street.look(node)
+    await street.look(node)
+    assert node.life is Life.LIVE
 
 
 @pytest.mark.parametrize(
