@@ -62,9 +62,14 @@ class Faces:
         return self._registry.by_key(text.rstrip("/").rpartition("/")[2])
 
     async def open(self, incarnation: Incarnation) -> None:
-        """Serve the outer face."""
+        """Serve the outer face. Raises `NoPortError`; the ports are closed then."""
+        try:
+            sock = self.places.socket(incarnation.outer_port).dup()
+        except OSError as error:
+            self.places.close(incarnation)
+            raise NoPortError(f"no face for {incarnation.name}: {error.strerror}") from error
         server = HttpServer(
-            self.places.socket(incarnation.outer_port).dup(),
+            sock,
             self._serve(incarnation),
             limits=self._limits,
             visitors=self._visitors,

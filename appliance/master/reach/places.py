@@ -187,11 +187,11 @@ class Places:
             try:
                 return listen(self._host, port)
             except OSError as error:
-                if error.errno not in (errno.EADDRINUSE, errno.EACCES):
+                self.unused.append(port)
+                if error.errno not in (errno.EADDRINUSE, errno.EACCES):  # another program has it for now
                     raise NoPortError(
                         f"port {port} on {self._host} cannot be opened: {error.strerror}"
                     ) from error
-                self.unused.append(port)  # another program has it for now
         raise NoPortError(
             f"all ports {self._range.start}-{self._range.stop - 1} are in use"
             f" ({self._each} per node); widen [Ports] range"

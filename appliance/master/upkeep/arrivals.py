@@ -47,7 +47,7 @@ class Arrivals:
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
         """The incarnation that calls; made, with its ports and durably, when it is new.
 
-        Raises `NoPortError` when the range of ports is exhausted.
+        Raises `NoPortError` when the range of ports is exhausted, or control has no descriptors; nothing stays then.
         """
         identity = (caller.caller_id, caller.peer.host, api.text)
         incarnation = self._registry.find(*identity)
@@ -64,8 +64,12 @@ class Arrivals:
             # Another took its name meanwhile: it begins anew.
             self._enactor.carry_out(self._graph.forgotten(incarnation))
         incarnation = self._make(caller, api)
-        with making_room_for_nobody(incarnation):
-            await self._faces.open(incarnation)
+        try:
+            with making_room_for_nobody(incarnation):
+                await self._faces.open(incarnation)
+        except NoPortError:
+            self._enactor.carry_out(self._graph.forgotten(incarnation))
+            raise
         return incarnation
 
     def _make(self, caller: Caller, api: ApiUri) -> Incarnation:

@@ -1,6 +1,8 @@
 """The ports of incarnations: kept over a restart, and not given to another while somebody may knock there."""
 
+import errno
 import ipaddress
+import os
 import socket
 from collections.abc import Iterator
 
@@ -118,6 +120,21 @@ def test_other_relays_after_a_restart_of_the_appliance(first: int) -> None:
     assert fewer.reopen(node)
     assert node.ports == had[:2]
     fewer.close_unclaimed(set())
+
+
+def test_no_port_is_lost_while_none_can_be_opened(first: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without descriptors a node hears so; once there are some the whole range is there."""
+    held = places(first)
+
+    def exhausted(_host: str, _port: int) -> socket.socket:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("appliance.master.reach.places.listen", exhausted)
+        for _try in range(20):
+            with pytest.raises(NoPortError, match="Too many open files"):
+                held.open(HOSTS[0])
+    assert sorted(held.unused) == list(range(first, first + 8))
 
 
 def test_a_port_of_another_range_is_not_given_out(first: int) -> None:

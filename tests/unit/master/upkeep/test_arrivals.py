@@ -39,9 +39,16 @@ class SlowFaces:
             await asyncio.sleep(0)
 
 
-@pytest.mark.parametrize("count", [2, 4, 8])
-async def test_who_comes_takes_no_room_from_who_comes_at_the_same_time(count: int) -> None:
-    """Where one more has room one more gets it, and the others hear that there is none."""
+class NoFaces:
+    """Faces of a control that has no descriptor left."""
+
+    async def open(self, incarnation: Incarnation) -> None:
+        """As `Faces`."""
+        raise NoPortError(f"no face for {incarnation.name}: Too many open files")
+
+
+async def world_with(faces: NoFaces | SlowFaces) -> ControlParts:
+    """Control with room for `_NODES` nodes."""
     world = await ControlParts.begun()
     arrivals = Arrivals(
         world.registry,
@@ -49,10 +56,25 @@ async def test_who_comes_takes_no_room_from_who_comes_at_the_same_time(count: in
         world.enactor,
         world.liveness,
         places=cast(Any, FewPorts(world.registry)),
-        faces=cast(Any, SlowFaces()),
+        faces=cast(Any, faces),
         addresses=cast(Any, world.addresses),
     )
     cast(Any, world.faces).incarnation_for = arrivals.incarnation_for
+    return world
+
+
+async def test_a_node_that_gets_no_face_is_not_there() -> None:
+    """It hears why, and may try again; nothing of it stays."""
+    world = await world_with(NoFaces())
+    answer: Any = await world.ask("registerPublisher", "/n", "/t", "std_msgs/String", "http://10.0.0.5:4000/")
+    assert (answer[0], "no face for /n: Too many open files" in answer[1]) == (0, True)
+    assert world.registry.all() == []
+
+
+@pytest.mark.parametrize("count", [2, 4, 8])
+async def test_who_comes_takes_no_room_from_who_comes_at_the_same_time(count: int) -> None:
+    """Where one more has room one more gets it, and the others hear that there is none."""
+    world = await world_with(SlowFaces())
 
     async def come(number: int) -> Any:
         uri = f"http://10.0.0.5:{4000 + number}/"
