@@ -43,7 +43,7 @@ LOADS = {"fifty topics, 20 MB/s": (50, 8192, 50), "five topics, 0.1 MB/s": (5, 1
 _SOURCE = Path(__file__).parent / "nodes" / "recorder_load.cpp"
 _PROGRAM = ROOT / "build" / "benchmarks" / "recorder_load"
 _HEAD = struct.Struct("<4xQ")  # of a std_msgs/String: its length, the number
-_WARM_SECONDS = 3.0
+_WARM_SECONDS, _AFTER_SECONDS = 3.0, 5.0
 _CONFIGURATION = """
 recorder: {{enabled: {enabled}, memory: 512MiB, before: {seconds}, disk: 8GiB, triggers: []}}
 audit: {{reserve_bytes: 1MiB}}
@@ -175,7 +175,7 @@ def at_plain_master(
 def at_appliance(
     folder: Path, load: tuple[int, int, int], seconds: float, *, recorder: bool, kills: bool = False
 ) -> Result:
-    """Without and with the recorder, which is asked at the end for the seconds before; with kills in the middle."""
+    """Without and with the recorder, which is asked at the end for the seconds before and some after; with kills."""
     configuration = folder / "appliance.yaml"
     configuration.write_text(_CONFIGURATION.format(enabled=str(recorder).lower(), seconds=seconds))
     options = ("--config", str(configuration))
@@ -200,9 +200,17 @@ def at_appliance(
                     os.kill(row["pid"], signal.SIGKILL)
             running.last(seconds / 2)
             pids = {}
-        with measured(pids, seconds, cpu):
+        with measured(pids, seconds + _AFTER_SECONDS, cpu):
             running.last(0 if kills else seconds)
-            order = ("record", "now", "--before", f"{seconds:g}s", "--after", "1s", "--json")
+            order = (
+                "record",
+                "now",
+                "--before",
+                f"{seconds:g}s",
+                "--after",
+                f"{_AFTER_SECONDS:g}s",
+                "--json",
+            )
             begun = json.loads(appliance.rosrv(*order).stdout)
             bag = appliance.state / "recordings" / begun["id"] / "recording.bag"
             eventually(bag.exists, appliance.story, 120)
