@@ -142,9 +142,8 @@ class Liveness:
         self._settings = settings
         self._nodes = nodes
         self._answered: dict[str, float] = {}
-        self._processes: dict[
-            str, tuple[float, int]
-        ] = {}  # when it had registered last, and the process then
+        # Of each node when it had registered last, and the process that answered then.
+        self._processes: dict[str, tuple[float, int]] = {}
         self._looks: dict[str, asyncio.Task[None]] = {}
         self._turns = Turns(PROBES.bounds, standing)
 
