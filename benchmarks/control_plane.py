@@ -19,7 +19,8 @@ import sys
 import tempfile
 import time
 import xmlrpc.client
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -96,12 +97,13 @@ def furnish(port: int) -> None:
 
 
 class Client:
-    """One connection at a time, one request at a time; `delays` are seconds per call."""
+    """One connection at a time, one request at a time; `delays` are seconds per call, `answer` is the last body."""
 
     def __init__(self, port: int, wanted: list[bytes], keep: bool) -> None:
         self.delays: list[float] = []
-        self._port, self._wanted, self._keep = port, wanted, keep
+        self._port, self.wanted, self._keep = port, wanted, keep
         self._next = 0
+        self.answer = b""
         self._buffer = b""
         self.sock: socket.socket | None = None
 
@@ -111,7 +113,7 @@ class Client:
         if self.sock is None:
             self.sock = socket.create_connection(("127.0.0.1", self._port))
             self.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.sock.sendall(self._wanted[self._next % len(self._wanted)])
+        self.sock.sendall(self.wanted[self._next % len(self.wanted)])
         self._next += 1
         self._buffer = b""
         return self.sock
@@ -131,6 +133,7 @@ class Client:
             return False
         if b"<fault>" in body or not head.startswith((b"HTTP/1.1 200", b"HTTP/1.0 200")):
             raise ConnectionError(f"refused: {self._buffer[:500]!r}")
+        self.answer = body
         self.delays.append(time.perf_counter() - self._began)
         if not self._keep:
             self.sock.close()
@@ -250,13 +253,9 @@ def measure(plain: Master, ours: Master, seconds: float, rounds: int, only: str)
     return table
 
 
-def main() -> None:
-    """Run both masters and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=2.0)
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--only", default="", help="calls that have this in their name")
-    given = parser.parse_args()
+@contextmanager
+def masters() -> Iterator[tuple[Master, Master]]:
+    """A plain rosmaster, and an appliance as `rosrv up` runs it for users."""
     port = free_port()
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
@@ -267,44 +266,37 @@ def main() -> None:
         rosmaster = subprocess.Popen(
             ["/usr/bin/rosmaster", "--core", "-p", str(port)], env=environment, stdout=subprocess.DEVNULL
         )
-        command: list[str | Path] = [
-            "up",
-            "--policy",
-            policy,
-            "--state",
-            f"{folder}/state",
-            "--listen",
-            "127.0.0.1:0",
-        ]
+        command: list[str | Path] = [Path(sys.executable).with_name("rosrv"), "up", "--policy", policy]
+        command += ["--state", f"{folder}/state", "--listen", "127.0.0.1:0", "--rosmaster-port", "0"]
         appliance = subprocess.Popen(
-            [
-                Path(sys.executable).with_name("rosrv"),
-                *command,
-                "--rosmaster-port",
-                "0",
-                "--isolation",
-                "none",
-                "--json",
-            ],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
+            [*command, "--isolation", "none", "--json"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
         )
         try:
             assert appliance.stdout is not None
             ready = json.loads(appliance.stdout.readline())
             await_port(port)
-            masters = (
+            yield (
                 Master(port, [rosmaster.pid]),
                 Master(int(ready["master"].rpartition(":")[2]), descendants(appliance.pid)),
             )
-            for master in masters:
-                furnish(master.port)
-            table = measure(*masters, given.seconds, given.rounds, given.only)
         finally:
             for process in (appliance, rosmaster):
                 process.terminate()
             for process in (appliance, rosmaster):
                 process.wait(15)
+
+
+def main() -> None:
+    """Run both masters and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=2.0)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--only", default="", help="calls that have this in their name")
+    given = parser.parse_args()
+    with masters() as (plain, ours):
+        furnish(plain.port)
+        furnish(ours.port)
+        table = measure(plain, ours, given.seconds, given.rounds, given.only)
     Console(width=120).print(table)
 
 

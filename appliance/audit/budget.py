@@ -21,7 +21,7 @@ from appliance.shares.table import AUDIT_BYTES, AUDIT_RESERVE
 RATE = 64 << 10
 """Bytes a second that a host pays off; on a disk that is nearly full a `_SCARCE` part of it."""
 
-_SCARCE = AUDIT_BYTES.bounds.host // AUDIT_RESERVE.bounds.host
+_SCARCE = 8
 _RECORD_BYTES = 400  # on disk, with its entries in the indices
 _BYTES_PER_CHARACTER = 2  # the text, and what of it is in the full-text index
 _PAID_EVERY_SECONDS = 0.1

@@ -4,12 +4,13 @@ While ROSMaster is down, or up but not yet told everything again, calls of nodes
 that registers in that moment notices nothing but a delay. The reconcile loop shuts the door, passes it with
 `call_now`, and opens it.
 
-Calls that are made in the same turn of the loop travel as one `system.multicall`, in their order. Under load this saves
-most of the system calls between the two processes; a call that is alone travels alone. The answers are taken apart
-again, so that nobody notices: a fault of one part is that part's fault. Only calls whose parameters and answers are a
-few names travel together (`small` in the table of calls). What may be large, slow or impossible to write (a parameter's
-value) travels alone: it could fail, and would take the calls of others with it. One caller's own run of calls, whose
-order counts, travels together by `in_order`.
+Calls whose parameters and answers are a few names (`small` in the table of calls) go one after the other: what comes
+while one is under way waits for its answer, and then travels with all others that wait, as one `system.multicall`, in
+their order. ROSMaster is one Python process, which does one thing at a time anyway; under load this saves most of what
+two processes cost each other, and a call that finds nothing under way goes at once. The answers are taken apart again,
+so that nobody notices: a fault of one part is that part's fault. What may be large, slow or impossible to write (a
+parameter's value) travels alone: it could fail, and would take the calls of others with it. One caller's own run of
+calls, whose order counts, travels together by `in_order`.
 """
 
 import asyncio
@@ -17,10 +18,10 @@ import contextlib
 import os
 import re
 import uuid
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Coroutine, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import structlog
 
@@ -37,24 +38,28 @@ _Waiting = tuple[str, tuple[Value, ...], "asyncio.Future[Value]"]
 
 
 class BatchingClient:
-    """Makes those calls of one turn of the loop together that are `small`, over `client`."""
+    """Makes calls that are `small` over `client`, one after the other: those that wait together go together."""
 
     def __init__(self, client: XmlRpcClient, small: Collection[str]) -> None:
         self._client = client
         self._small = small
         self._waiting: list[_Waiting] = []
-        self._sending: set[asyncio.Task[None]] = set()
+        self._busy = False
+        self._sending: asyncio.Task[None] | None = None
 
     async def call(self, method: str, *params: Value) -> Value:
         """Call `method` and return its value. Raises `CallFailedError`, `EncodingError`."""
         if method not in self._small:
             return await self._client.call(method, *params)
-        loop = asyncio.get_running_loop()
-        answer: asyncio.Future[Value] = loop.create_future()
-        self._waiting.append((method, params, answer))
-        if len(self._waiting) == 1:
-            loop.call_soon(self._send)
-        return await answer
+        if self._busy:
+            answer: asyncio.Future[Value] = asyncio.get_running_loop().create_future()
+            self._waiting.append((method, params, answer))
+            return await answer
+        self._busy = True
+        try:
+            return await self._client.call(method, *params)
+        finally:
+            self._send_waiting()
 
     async def in_order(self, calls: Sequence[Wanted]) -> "list[Value | CallFailedError]":
         """Make these calls as one, one after the other; the outcome of each.
@@ -67,33 +72,26 @@ class BatchingClient:
             raise CallFailedError("the ROS Master answered a multicall with another number of answers")
         return [_outcome(method, value) for (method, _params), value in zip(calls, values, strict=True)]
 
-    def _send(self) -> None:
-        waiting, self._waiting = self._waiting, []
-        for begin in range(0, len(waiting), _LARGEST):
-            part = waiting[begin : begin + _LARGEST]
-            task = asyncio.get_running_loop().create_task(
-                self._one(part[0]) if len(part) == 1 else self._many(part)
-            )
-            self._sending.add(task)
-            task.add_done_callback(self._sending.discard)
+    def _send_waiting(self) -> None:
+        waiting = [one for one in self._waiting if not one[2].done()]  # the others have been given up
+        part, self._waiting = waiting[:_LARGEST], waiting[_LARGEST:]
+        self._busy = bool(part)
+        if part:
+            self._sending = asyncio.get_running_loop().create_task(self._send(part))
 
-    async def _one(self, waiting: _Waiting) -> None:
-        method, params, answer = waiting
+    async def _send(self, part: list[_Waiting]) -> None:
+        outcomes: Sequence[Value | CallFailedError | EncodingError]
         try:
-            value = await self._client.call(method, *params)
+            if len(part) == 1:
+                method, params, _answer = part[0]
+                outcomes = [await self._client.call(method, *params)]
+            else:
+                outcomes = await self.in_order([(method, params) for method, params, _answer in part])
         except (CallFailedError, EncodingError) as error:
-            _settle(answer, error)
-        else:
-            _settle(answer, value)
-
-    async def _many(self, waiting: list[_Waiting]) -> None:
-        try:
-            outcomes = await self.in_order([(method, params) for method, params, _answer in waiting])
-        except (CallFailedError, EncodingError) as error:
-            for _method, _params, answer in waiting:
-                _settle(answer, error)
-            return
-        for (_method, _params, answer), outcome in zip(waiting, outcomes, strict=True):
+            outcomes = [error] * len(part)
+        finally:
+            self._send_waiting()
+        for (_method, _params, answer), outcome in zip(part, outcomes, strict=True):
             _settle(answer, outcome)
 
 
@@ -158,6 +156,7 @@ class RosMaster:
         )
         self.calls = BatchingClient(self._client, small)
         self._open = asyncio.Event()
+        self._away = True
         self._alone = asyncio.Lock()
         self._inside = 0
         self._empty = asyncio.Event()
@@ -167,6 +166,11 @@ class RosMaster:
     def reachable(self) -> bool:
         """Whether calls pass (ROSMaster is there and whole)."""
         return self._open.is_set()
+
+    @property
+    def whole(self) -> bool:
+        """Whether ROSMaster is there and knows everything, also while a look at it has calls wait for a moment."""
+        return not self._away
 
     async def call(self, method: str, *params: Value) -> Answer:
         """Call for a node; waits while the door is shut. Raises `CallFailedError` when it stays shut."""
@@ -216,12 +220,13 @@ class RosMaster:
         return answer
 
     def _lost(self) -> None:
-        self._open.clear()
+        self.shut()
         self.doubtful.set()
 
     def shut(self) -> None:
-        """Let calls wait from now on: ROSMaster is away."""
+        """Let calls wait from now on: ROSMaster is away, or knows nothing yet."""
         self._open.clear()
+        self._away = True
 
     @contextlib.asynccontextmanager
     async def alone(self) -> AsyncIterator[None]:
@@ -231,6 +236,7 @@ class RosMaster:
             await self._empty.wait()
             yield
             self._open.set()
+            self._away = False
 
     def close(self) -> None:
         """Close the connections."""
@@ -244,6 +250,20 @@ class RosMaster:
         self._inside -= 1
         if not self._inside:
             self._empty.set()
+
+
+async def together(calls: Iterable[Coroutine[Any, Any, _T]]) -> list[_T]:
+    """Make these calls in their order, none waiting for the one before; what they return.
+
+    For who shuts the door: everybody waits for the last of what may be thousands. Raises `CallFailedError`; the others
+    are given up then.
+    """
+    try:
+        async with asyncio.TaskGroup() as group:
+            tasks = [group.create_task(call) for call in calls]
+    except ExceptionGroup as failed:
+        raise failed.exceptions[0] from failed
+    return [task.result() for task in tasks]
 
 
 def _answer_to(method: str, value: Value) -> Answer | CallFailedError:

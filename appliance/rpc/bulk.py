@@ -64,14 +64,14 @@ class LargeWrites:
         self._enough = enough
 
     @contextlib.asynccontextmanager
-    async def turn(self, host: Address, values: list[Value]) -> AsyncIterator[None]:
-        """Carry out what brings these values to ROSMaster; small ones wait for nobody."""
+    async def turn(self, host: Address, values: list[Value]) -> AsyncIterator[bool]:
+        """Carry out what brings these values to ROSMaster; small ones wait for nobody, large ones may (True)."""
         if weigh(values, self._enough) < self._enough:
-            yield
+            yield False
             return
         await self._turns.enter(host)
         try:
-            yield
+            yield True
         finally:
             self._turns.leave(host)
 

@@ -250,7 +250,7 @@ AUDIT_READ_KINDS = Share(
 )
 AUDIT_BYTES = Share(
     "bytes of audit records to pay off; time pays 64 KiB a second of each host's",
-    Bounds(whole=1 << 40, host=8 << 20, strangers=0, kept=1 << 39),
+    Bounds(whole=1 << 40, host=16 << 20, strangers=0, kept=1 << 39),
     "",
     "the host's calls wait, one of many parts is refused in words; strangers are served nothing, and what is"
     " recorded of that is folded",

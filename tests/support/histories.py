@@ -302,7 +302,7 @@ class Control(ControlParts):
     def __init__(self, world: "World") -> None:
         self.world = world
         super().__init__(silent=20.0)
-        self.reminders = Reminders(self.registry, self.relay, self.graph, self.enactor)
+        self.reminders = Reminders(self.registry, self.graph, self.enactor)
 
     def surround(self) -> None:
         """As `ControlParts`."""
@@ -324,7 +324,7 @@ class Control(ControlParts):
                 policy=lambda: self.current, broken=self.watchlist.look_at, own_header=None, own_call=cast(Any, None),
             ),
         )  # fmt: skip
-        cast(Any, self.relay.carried).used = world.used
+        self.grants.used = world.used
 
     def arrivals(self) -> Any:
         """As `ControlParts`."""

@@ -2,8 +2,8 @@
 
 1. A call is decided when it is its turn, by the policy and the registry of that moment. Calls that register wait for
    those that register under the same name, writes of parameters for those that touch them; nothing else waits.
-2. Who must wait and is denied as things are is denied at once: it waits for nobody, and nobody waits for it. This look
-   grants nothing.
+2. Who is denied as things are is denied at once: it waits for nobody, and nobody waits for it. Who had to wait is
+   decided again when it is its turn; who had not, is not: nothing else ran in between.
 3. Whether the node that holds a name is still there only the network can say: it is asked before the turn.
 4. A policy that comes into force while a call is carried out decides again what that left: when the policy took back
    what it denies, the registry and the relay did not have it yet.
@@ -108,9 +108,11 @@ class Execution:
             probe = await self._liveness.probe(outcome.holder)
         elif not outcome.allowed or not (registers or call.verb is Verb.WRITE):
             return await self._carry_out(visit, attempt, outcome)
-        name = self._claims.alone(attempt.caller.caller_id) if registers else contextlib.nullcontext()
-        async with name, self._turn([attempt]):
-            return await self._carry_out(visit, attempt, self._settled(attempt, probe))
+        name = self._claims.alone(attempt.caller.caller_id) if registers else contextlib.nullcontext(False)
+        async with name as named_later, self._turn([attempt]) as later:
+            if named_later or later or isinstance(outcome, Contest):
+                outcome = self._settled(attempt, probe)
+            return await self._carry_out(visit, attempt, outcome)
 
     async def answer_run(self, visit: Visit, run: Sequence[Attempt]) -> list[Value]:
         """Decide calls that read and write parameters one by one, and carry them out in their order.
@@ -125,22 +127,23 @@ class Execution:
         ]
         if not writing:
             return await self._carry_out_run(visit, run, looks)
-        async with self._turn(writing):
-            decisions = [
-                self._settled(one) if look.allowed else look for one, look in zip(run, looks, strict=True)
-            ]
-            return await self._carry_out_run(visit, run, decisions)
+        async with self._turn(writing) as later:
+            if later:
+                looks = [
+                    self._settled(one) if look.allowed else look for one, look in zip(run, looks, strict=True)
+                ]
+            return await self._carry_out_run(visit, run, looks)
 
     @contextlib.asynccontextmanager
-    async def _turn(self, attempts: Sequence[Attempt]) -> AsyncIterator[None]:
-        """Wait until nothing else writes the parameters that these calls are about.
+    async def _turn(self, attempts: Sequence[Attempt]) -> AsyncIterator[bool]:
+        """Wait until nothing else writes the parameters that these calls are about; whether there was anything.
 
         Who subscribes to a parameter hears of every write after the value that answers, so that has a turn, too.
         """
         keys = [attempt.resource for attempt in attempts if attempt.call.kind is Kind.PARAMETER]
         host, values = attempts[0].caller.peer.host, [attempt.value for attempt in attempts]
-        async with self._writes.alone(keys), self._large_writes.turn(host, values):
-            yield
+        async with self._writes.alone(keys) as later, self._large_writes.turn(host, values) as large:
+            yield later or large
 
     async def _carry_out(self, visit: Visit, attempt: Attempt, decision: Decision) -> Value:
         policy, verb = self._policy(), attempt.call.verb

@@ -70,11 +70,14 @@ class Multicall:
             return [await self._one(visit, left.popleft())]
         answers: list[Value] = []
         run: list[tuple[int, Attempt]] = []
+        written: list[str] = []
         weight, most = 0, min(room, self._offload)
         while left and len(answers) < _LONGEST_RUN and weight < most and _in_run(visit, left[0]):
             attempt = await self._understand(visit, left[0])
             if isinstance(attempt, Attempt):
-                if any(_reads_what_is_written(attempt, one) for _place, one in run):
+                if attempt.call.verb is Verb.WRITE:
+                    written.append(attempt.resource)
+                elif touch([attempt.resource], written):
                     left[0] = attempt
                     break
                 run.append((len(answers), attempt))
@@ -132,8 +135,3 @@ def _in_run(visit: Visit, part: "Value | Attempt") -> bool:
         return part.call.in_run
     name = part.get("methodName") if isinstance(part, dict) else None
     return isinstance(name, str) and name in visit.table and visit.table[name].call.in_run
-
-
-def _reads_what_is_written(attempt: Attempt, before: Attempt) -> bool:
-    verbs = attempt.call.verb, before.call.verb
-    return verbs == (Verb.READ, Verb.WRITE) and touch([attempt.resource], [before.resource])

@@ -3,7 +3,8 @@
 Between the decision on a registration and ROSMaster's answer the registry does not know of it yet. Two hosts that
 register a free name at the same moment would both be told that it is free, and the later one would take it from the
 other. So the calls that make a node part of the graph wait for each other, name by name; a decision is made when it
-is the caller's turn.
+is the caller's turn. Who finds nobody before him enters without letting anything else run in between: what was decided
+just before stands.
 
 A write is decided by what is there: a value that stands where it needs a namespace is written, too. Between the
 decision and ROSMaster's answer another write could put such a value there, which nobody would have asked about. And
@@ -42,7 +43,8 @@ class WriteTurn:
         self._keys = keys
         self._done: asyncio.Event | None = None  # made for who waits for this one
 
-    async def __aenter__(self) -> None:
+    async def __aenter__(self) -> bool:
+        """Whether it had to wait."""
         before = [turn for turn in self._turns if self._touches(turn)]
         self._turns[self] = None
         try:
@@ -51,6 +53,7 @@ class WriteTurn:
         except BaseException:
             self._end()
             raise
+        return bool(before)
 
     async def __aexit__(self, *_error: object) -> None:
         self._end()
@@ -102,13 +105,14 @@ class Claims:
         return len(self._claims)
 
     @contextlib.asynccontextmanager
-    async def alone(self, name: str) -> AsyncIterator[None]:
-        """Be the only one who registers under this name, first come, first served."""
+    async def alone(self, name: str) -> AsyncIterator[bool]:
+        """Be the only one who registers under this name, first come, first served; whether it had to wait."""
         claim = self._claims.setdefault(name, _Claim())
         claim.users += 1
+        waited = claim.users > 1
         try:
             async with claim.lock:
-                yield
+                yield waited
         finally:
             claim.users -= 1
             if not claim.users:

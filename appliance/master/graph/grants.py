@@ -18,7 +18,7 @@ class Grants:
     """Every grant. `used()` are those that somebody is connected by now."""
 
     def __init__(self, used: Callable[[], Collection[PermissionRow]], bounds: Bounds = GRANTS.bounds) -> None:
-        self._used = used
+        self.used = used
         self._bounds = bounds
         self._of_node: dict[str, set[PermissionRow]] = {}  # by the key of who publishes or serves
         self._of_host: dict[str, dict[PermissionRow, None]] = {}  # the same, in the order they were granted
@@ -81,6 +81,6 @@ class Grants:
         return [EraseGrant(row)]
 
     def _clear_unused(self, host: str, newest: PermissionRow) -> Effects:
-        used = self._used()
+        used = self.used()
         unused = [row for row in self._of_host[host] if row != newest and row not in used]
         return [effect for row in unused[:_CLEARED_AT_ONCE] for effect in self.take(row)]

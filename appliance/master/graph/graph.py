@@ -10,7 +10,7 @@ ROSMaster is rebuilt), out of date or misread by ROSMaster never reaches a node.
 import ipaddress
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 
 from appliance.audit.record import Severity
 from appliance.master.graph.effects import (
@@ -310,11 +310,35 @@ class Graph:
         told = self._may_be_told(subscriber, key, value)
         return [TellNode(subscriber, _param_update(key, value))] if told else []
 
-    def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> Effects:
+    def renew(self, subscriber: Incarnation, topic: str, absent: Collection[Incarnation]) -> Effects:
         """Have a subscriber drop these publishers and take them again: roscpp takes a list it knows for no news."""
+        if not absent:
+            return self.remind(subscriber, topic)
         gone = {one.outer_uri(subscriber.told) for one in absent}
         without = [uri for uri in self._publishers_for(subscriber, topic) if uri not in gone]
         return [_list(subscriber, topic, without), *self.remind(subscriber, topic)]
+
+    def absent(
+        self, subscribers: Iterable[Incarnation]
+    ) -> Iterator[tuple[Incarnation, str, list[Incarnation]]]:
+        """Which of their topics these have through the relay, and of which publishers they are not connected to.
+
+        Whether they have a grant does not count: one that was taken while the subscriber heard nothing is asked for
+        again only when it drops the publisher. So this follows from what is kept over a restart.
+        """
+        used = self._grants.used()
+        for subscriber in subscribers:
+            for topic in subscriber.resources(Kind.SUBSCRIPTION):
+                publishers = [
+                    one
+                    for one in self._registry.registered(Kind.PUBLICATION, topic)
+                    if one is not subscriber
+                    and (one.own or subscriber.own or self._mediation.carries_topic(topic))
+                    and PermissionRow(one.key, TOPIC, topic, str(subscriber.host), subscriber.name)
+                    not in used
+                ]
+                if publishers:
+                    yield subscriber, topic, publishers
 
     def list_for(self, subscriber: Incarnation, topic: str) -> list[str]:
         """The list that answers a registration: what the subscriber is told from here on is relative to it."""

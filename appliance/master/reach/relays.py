@@ -323,18 +323,6 @@ class RelayControl:
             _flow(policy.limit(Part.TOPIC, topic)),
         )
 
-    def unconnected(self) -> list[PermissionRow]:
-        """Grants for topics of live publishers whose subscriber is not connected."""
-        used = self.carried.used()
-        return [
-            row
-            for incarnation in self._registry.live()
-            for row in self._grants.of(incarnation.key)
-            if row.kind == TOPIC
-            and (Kind.PUBLICATION, row.resource) in incarnation.registrations
-            and row not in used
-        ]
-
     # --- what the relays say ---
 
     def _received(self, post: RelayPost, message: messages.Message, monitors: Monitors) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from appliance.master.caller import Answer
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration
 from appliance.master.graph.revocation import CALLS
-from appliance.master.rosmaster import RosMaster
+from appliance.master.rosmaster import RosMaster, together
 from appliance.ros.uris import service_uri
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError
@@ -63,23 +63,27 @@ class Entries:
         Returns the parameters it subscribed to with their values: it heard of no change in the meantime, and ROSMaster
         tells each change once. Raises `CallFailedError`, and then a round of the reconcile loop is due.
         """
-        values: list[tuple[str, Value]] = []
+
+        async def put(registration: Registration) -> tuple[str, Value] | None:
+            if (
+                node.life is not Life.LIVE
+                or (registration.kind, registration.resource) not in node.registrations
+            ):
+                return None
+            code, _, value = await self.make(node, registration)
+            return (
+                (registration.resource, value) if registration.kind is Kind.PARAMETER and code == 1 else None
+            )
+
         try:
             async with self._rosmaster.alone():
                 if (await self._rosmaster.call_now("getPid", NAME))[2] != self.pid:
                     raise CallFailedError("the ROS Master is new: the next round tells it everything")
-                for registration in registrations:
-                    if (
-                        node.life is Life.LIVE
-                        and (registration.kind, registration.resource) in node.registrations
-                    ):
-                        answer = await self.make(node, registration)
-                        if registration.kind is Kind.PARAMETER and answer[0] == 1:
-                            values.append((registration.resource, answer[2]))
+                values = await together(put(registration) for registration in registrations)
         except CallFailedError:
             self._rosmaster.doubtful.set()
             raise
-        return values
+        return [value for value in values if value is not None]
 
 
 def stand_in(node: Incarnation) -> str:

@@ -243,8 +243,9 @@ class Liveness:
         missed = self._watchlist.to_make_up(incarnation, self._settings.interval)
         if missed is None:
             return
+        absent = {topic: publishers for _, topic, publishers in self._graph.absent([incarnation])}
         for topic in sorted(missed.topics):
-            self._enactor.carry_out(self._graph.remind(incarnation, topic))
+            self._enactor.carry_out(self._graph.renew(incarnation, topic, absent.get(topic, ())))
         subscribed = [
             registration
             for registration in incarnation.registrations.values()

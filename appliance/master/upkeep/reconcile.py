@@ -24,7 +24,7 @@ from appliance.master.graph.registry import Kind, Life, Registry
 from appliance.master.graph.revocation import Revocation
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.master.reach.faces import Faces
-from appliance.master.rosmaster import RosMaster
+from appliance.master.rosmaster import RosMaster, together
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import NAME, NO_SERVICE, Entries, stand_in
 from appliance.ros.parameter_tree import Tree, standing_at
@@ -119,14 +119,12 @@ class Reconciler:
     # --- a new ROSMaster ---
 
     async def _rebuild(self) -> None:
+        self._rosmaster.shut()
         tree = {**self._own_parameters(), **self._parameters.tree}
         await self._rosmaster.call_now("setParam", NAME, "/", tree)
         self._parameters.replace(tree)
         self._registry.forget_types()
-        made = 0
-        for incarnation, registration in self._registry.in_order():
-            await self._entries.make(incarnation, registration)
-            made += 1
+        made = len(await together(self._entries.make(*pair) for pair in self._registry.in_order()))
         self._enactor.carry_out(self._graph.tell_everybody())
         if made:
             text = (
@@ -145,16 +143,18 @@ class Reconciler:
             is not Kind.PARAMETER  # ROSMaster does not tell who subscribed to a parameter
         }
         uris = await self._inner_uris({name for _kind, _resource, name in seen})
-        missing = [
-            pair
+        missing = await together(
+            self._entries.make(*pair)
             for key, pair in wanted.items()
             if key not in seen or uris.get(pair[0].name) != self._faces.inner_uri(pair[0])
-        ]
-        for incarnation, registration in missing:
-            await self._entries.make(incarnation, registration)
-        extra = [one for one in seen if one not in wanted]
-        for kind, resource, name in sorted(extra):
-            await self._settle(kind, resource, name, uris.get(name))
+        )
+        extra = sorted(one for one in seen if one not in wanted)
+        if extra:
+            rows = (await self._rosmaster.call_now("getTopicTypes", NAME))[2]
+            types = dict(cast(list[tuple[str, str]], rows))
+            await together(
+                self._settle(kind, what, name, uris.get(name), types) for kind, what, name in extra
+            )
         if missing or extra:
             text = f"{len(missing)} registrations were made again, {len(extra)} adopted or removed"
             self._trail.happened("reconciled", text, made=len(missing), settled=len(extra))
@@ -180,7 +180,9 @@ class Reconciler:
         )
         return {name: str(answer[2]) for name, answer in zip(names, answers, strict=True) if answer[0] == 1}
 
-    async def _settle(self, kind: Kind, resource: str, name: str, inner: str | None) -> None:
+    async def _settle(
+        self, kind: Kind, resource: str, name: str, inner: str | None, types: dict[str, str]
+    ) -> None:
         incarnation = self._faces.by_inner_uri(inner) if inner is not None else None
         if (
             incarnation is not None
@@ -190,9 +192,6 @@ class Reconciler:
             and (kind, resource) not in incarnation.shelf
             and self._revocation.may_have(incarnation, kind, resource)
         ):
-            types = dict(
-                cast(list[tuple[str, str]], (await self._rosmaster.call_now("getTopicTypes", NAME))[2])
-            )
             adopted = self._graph.registered(incarnation, kind, resource, types.get(resource, "*"))
             self._enactor.carry_out(adopted)
             return

@@ -4,14 +4,14 @@ rospy forgets a connection that broke and opens another only for a list that arr
 that overtakes the break (the machine is busy, the relay hung before it died) changes nothing, and there would never
 be another. roscpp comes back by itself to a port that stayed open; where it was shut for a while (the whole appliance
 was restarted) it gives up, and takes a list it knows for no news. So who is still away after the first reminders is
-told to drop the publisher and to take it again.
+told to drop the publisher and to take it again. So is who has no grant any more: the policy took it, and gave the topic
+back, while the subscriber or control did not hear of it.
 """
 
 import asyncio
 
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reach.relays import RelayControl
+from appliance.master.graph.registry import Registry
 from appliance.master.upkeep.enactor import Enactor
 
 _GENTLE = 2  # reminders before the publisher is to be dropped and taken again
@@ -21,9 +21,8 @@ _PAUSES = (0.5, 0.5, 1.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # seconds before each look
 class Reminders:
     """Looks whether everybody is back whenever a relay was attached."""
 
-    def __init__(self, registry: Registry, relay: RelayControl, graph: Graph, enactor: Enactor) -> None:
+    def __init__(self, registry: Registry, graph: Graph, enactor: Enactor) -> None:
         self._registry = registry
-        self._relay = relay
         self._graph = graph
         self._enactor = enactor
         self.round: asyncio.Task[None] | None = None
@@ -41,25 +40,10 @@ class Reminders:
     async def _remind(self) -> None:
         for number, pause in enumerate(_PAUSES):
             await asyncio.sleep(pause)
-            absent = self.absent()
+            absent = list(self._graph.absent(self._registry.live()))
             if not absent:
                 return
             for subscriber, topic, publishers in absent:
-                gentle = number < _GENTLE
                 self._enactor.carry_out(
-                    self._graph.remind(subscriber, topic)
-                    if gentle
-                    else self._graph.renew(subscriber, topic, publishers)
+                    self._graph.renew(subscriber, topic, publishers if number >= _GENTLE else ())
                 )
-
-    def absent(self) -> list[tuple[Incarnation, str, list[Incarnation]]]:
-        """Subscribers, topics, and the publishers they hold a grant for and are not connected to."""
-        found: dict[tuple[str, str], tuple[Incarnation, str, list[Incarnation]]] = {}
-        for row in self._relay.unconnected():
-            publisher = self._registry.by_key(row.key)
-            for subscriber in self._registry.registered(Kind.SUBSCRIPTION, row.resource):
-                if publisher is None or (subscriber.name, str(subscriber.host)) != (row.caller_id, row.host):
-                    continue
-                entry = found.setdefault((subscriber.key, row.resource), (subscriber, row.resource, []))
-                entry[2].append(publisher)
-        return list(found.values())

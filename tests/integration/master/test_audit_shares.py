@@ -13,7 +13,7 @@ from tests.support.requirements import need_root, needs
 from tests.support.siege import Siege
 
 SLOW = 1.0  # seconds for a call of the robot in a flood, on a machine that does nothing else
-PARTS = 6000
+PARTS = 9000
 LONG = "k" * 900
 
 

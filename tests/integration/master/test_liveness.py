@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from examples.landshark.lab import Host, Lab
-from tests.support.appliance import ROSRV, Appliance
+from tests.support.appliance import Appliance
+from tests.support.command import ROSRV
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import needs

@@ -3,10 +3,12 @@
 A ROS 1 node registers once: what is refused is refused until somebody starts the node again.
 """
 
+import itertools
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,13 +16,13 @@ from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import Process
-from tests.support.requirements import need_root, needs
+from tests.support.requirements import needs
 from tests.support.rosmaster import call_on
 from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 DROPPING = "add table inet gone; add chain inet gone in { type filter hook input priority 0; policy drop; }"
-API = "http://10.77.0.20:9/"
+_NUMBERS = itertools.count(40, 3)  # of the machines of a test
 
 
 @dataclass
@@ -33,24 +35,32 @@ class Pair:
     second: Host
     ros: RosSession
     ear: Process
+    voice: str
+    topic: str
 
     def talker(self, client: Client, host: Host) -> Process:
-        """/voice on a host; `ready` when its constructor is done, whatever the master said."""
-        return self.ros.on(host).talker(client, "/chatter", "--text", host.name, name="voice")
+        """The voice on a host; `ready` when its constructor is done, whatever the master said."""
+        return self.ros.on(host).talker(client, self.topic, "--text", host.name, name=self.voice[1:])
+
+    def registered(self) -> Any:
+        """What the voice of the second machine is told when it registers."""
+        register = ("registerPublisher", self.voice, self.topic, "std_msgs/String")
+        return call_on(self.second, self.appliance.master_uri, *register, f"http://{self.second.address}:9/")
 
 
 @pytest.fixture
-def pair(lab: Lab, tmp_path: Path) -> Iterator[Pair]:
-    """An appliance with the default times, and a listener."""
-    need_root()
+def pair(common_lab: Lab, appliance: Appliance, tmp_path: Path) -> Iterator[Pair]:
+    """An appliance with the default times and a listener; machines, voice and topic are of this test alone."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    first, second = lab.host("first", "10.77.0.10/24"), lab.host("second", "10.77.0.20/24")
-    third = lab.host("third", "10.77.0.30/24")
-    with (
-        Appliance(lab.host("appliance", "10.77.0.2/24"), options=("--api", "off")) as appliance,
-        RosSession(appliance.master_uri, tmp_path, third) as ros,
-    ):
-        yield Pair(lab, appliance, first, second, ros, ros.listener("roscpp", "/chatter", name="ear"))
+    number = next(_NUMBERS)
+    hosts = [
+        common_lab.host(f"{name}{number}", f"10.77.0.{number + place}/24")
+        for place, name in enumerate(("first", "second", "third"))
+    ]
+    voice, topic = f"/voice{number}", f"/chatter{number}"
+    with RosSession(appliance.master_uri, tmp_path, hosts[2]) as ros:
+        ear = ros.listener("roscpp", topic, name=f"ear{number}")
+        yield Pair(common_lab, appliance, hosts[0], hosts[1], ros, ear, voice, topic)
 
 
 def unplugged(pair: Pair, _voice: Process) -> None:
@@ -86,8 +96,8 @@ def test_a_machine_that_vanished_holds_no_name(
     pair.talker(client, pair.second)
     pair.ear.wait_for(lambda event: str(event.get("data", "")).startswith("second"))
     voice.kill()  # it would wait for its master when it is interrupted
-    [taken] = pair.appliance.recorded("--event", "takeover")
-    lost = pair.appliance.audit("--event", "node lost", caller_id="/voice")
+    [taken] = pair.appliance.recorded("--event", "takeover", caller_id=pair.voice)
+    lost = pair.appliance.audit("--event", "node lost", caller_id=pair.voice)
     assert [record for record in lost if record["sequence"] < taken["sequence"]] == []
 
 
@@ -97,13 +107,12 @@ def test_a_node_that_hangs_holds_its_name_until_it_is_lost(pair: Pair) -> None:
     pair.ear.wait_for(event="received")
     voice.popen.send_signal(signal.SIGSTOP)
     try:
-        register = ("registerPublisher", "/voice", "/chatter", "std_msgs/String", API)
-        code, why, _ = call_on(pair.second, pair.appliance.master_uri, *register)
+        code, why, _ = pair.registered()
         assert code == 0
         assert "takes connections and does not answer" in why
         seconds = int(why.partition("unregistered in ")[2].partition(" s")[0])
         assert 0 < seconds <= 25
-        eventually(lambda: call_on(pair.second, pair.appliance.master_uri, *register)[0] == 1, why)
+        eventually(lambda: pair.registered()[0] == 1, why)
     finally:
         voice.popen.send_signal(signal.SIGCONT)
 
@@ -112,7 +121,6 @@ def test_a_node_that_runs_holds_its_name(pair: Pair) -> None:
     """It answers: the other is refused at once, and goes on talking to nobody."""
     pair.talker("rospy", pair.first)
     pair.ear.wait_for(event="received")
-    register = ("registerPublisher", "/voice", "/chatter", "std_msgs/String", API)
-    code, why, _ = call_on(pair.second, pair.appliance.master_uri, *register)
+    code, why, _ = pair.registered()
     assert code == 0
     assert "is held by a running node" in why

@@ -1,4 +1,4 @@
-"""Calls of one turn of the loop travel together."""
+"""Small calls go one after the other; those that wait for the same answer travel together."""
 
 import asyncio
 from typing import Any
@@ -18,7 +18,8 @@ class Server:
         self.broken = False
 
     async def call(self, method: str, *params: Any) -> Any:
-        """Echo; the method `searchParam` is a fault."""
+        """Echo, after a turn of the loop; the method `searchParam` is a fault."""
+        await asyncio.sleep(0)
         self.travelled.append((method, params))
         if self.broken:
             raise BrokenOffError("gone")
@@ -49,22 +50,55 @@ def test_a_call_alone_travels_alone() -> None:
     assert server.travelled == [("getPid", (7,))]
 
 
-def test_calls_of_one_turn_travel_as_one_in_their_order() -> None:
-    """Each caller gets its own answer; the order is the order of the calls."""
+def test_calls_that_wait_travel_as_one_in_their_order() -> None:
+    """What finds nothing under way goes at once; each caller gets its own answer, in the order of the calls."""
     server = Server()
-    assert run(server, ("hasParam", 1), ("lookupNode", 2), ("hasParam", 3)) == [
+    assert run(server, ("registerPublisher", 0), ("hasParam", 1), ("lookupNode", 2), ("hasParam", 3)) == [
+        [1, "registerPublisher", 0],
         [1, "hasParam", 1],
         [1, "lookupNode", 2],
         [1, "hasParam", 3],
     ]
-    [(method, (parts,))] = server.travelled
+    [first, (method, (parts,))] = server.travelled
+    assert first == ("registerPublisher", (0,))
     assert method == "system.multicall"
     assert [part["methodName"] for part in parts] == ["hasParam", "lookupNode", "hasParam"]
 
 
+def test_one_is_under_way_at_a_time() -> None:
+    """What comes while a call is under way waits for its answer, also when nobody waits for that any more."""
+    server, go = Server(), asyncio.Event()
+    answer = server.call
+
+    async def slow(method: str, *params: Any) -> Any:
+        if params == (1,):
+            await go.wait()
+        return await answer(method, *params)
+
+    async def scene() -> None:
+        server.call = slow  # type: ignore[method-assign]  # a peer that takes its time
+        client = BatchingClient(server, {"hasParam", "lookupNode"})  # type: ignore[arg-type]  # as in `run`
+        calls = [asyncio.ensure_future(client.call("hasParam", one)) for one in (1, 2, 3)]
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert server.travelled == []
+        calls[1].cancel()
+        go.set()
+        assert [await calls[0], await calls[2]] == [[1, "hasParam", 1], [1, "hasParam", 3]]
+        calls = [asyncio.ensure_future(client.call("lookupNode", one)) for one in (1, 2)]
+        await asyncio.sleep(0)
+        calls[0].cancel()
+        assert await calls[1] == [1, "lookupNode", 2]
+        assert await client.call("hasParam", 4) == [1, "hasParam", 4]
+
+    asyncio.run(scene())
+
+
 def test_a_fault_is_its_own_callers_only() -> None:
     """One part fails, the others have their answers."""
-    first, second, third = run(Server(), ("hasParam", 1), ("searchParam", 2), ("lookupNode", 3))
+    _, first, second, third = run(
+        Server(), ("hasParam", 0), ("hasParam", 1), ("searchParam", 2), ("lookupNode", 3)
+    )
     assert first == [1, "hasParam", 1]
     assert isinstance(second, CallFailedError)
     assert "no such thing" in str(second)
@@ -75,7 +109,7 @@ def test_a_broken_connection_is_everybodys_as_what_it_is() -> None:
     """Each caller learns that the connection broke, so that each can try again."""
     server = Server()
     server.broken = True
-    outcomes = run(server, ("hasParam", 1), ("lookupNode", 2))
+    _, *outcomes = run(server, ("hasParam", 1), ("lookupNode", 2), ("lookupNode", 3))
     assert [type(one) for one in outcomes] == [BrokenOffError, BrokenOffError]
     assert outcomes[0] is not outcomes[1]
 
@@ -92,8 +126,13 @@ def test_many_calls_are_split(count: int) -> None:
 def test_values_travel_alone() -> None:
     """A parameter's value, which may be large or impossible to write, takes nobody else's call with it."""
     server = Server()
-    run(server, ("setParam", 1), ("hasParam", 2), ("getParam", 3), ("lookupNode", 4))
-    assert sorted(method for method, _ in server.travelled) == ["getParam", "setParam", "system.multicall"]
+    run(server, ("lookupNode", 0), ("setParam", 1), ("hasParam", 2), ("getParam", 3), ("lookupNode", 4))
+    assert sorted(method for method, _ in server.travelled) == [
+        "getParam",
+        "lookupNode",
+        "setParam",
+        "system.multicall",
+    ]
     [parts] = [params[0] for method, params in server.travelled if method == "system.multicall"]
     assert [part["methodName"] for part in parts] == ["hasParam", "lookupNode"]
 
@@ -108,3 +147,19 @@ def test_what_cannot_be_written_is_the_callers_error() -> None:
     server.call = call  # type: ignore[method-assign, assignment]  # a peer that cannot be written to
     outcomes = run(server, ("hasParam", None), ("lookupNode", None), ("setParam", None))
     assert [type(one) for one in outcomes] == [EncodingError] * 3
+
+
+def test_what_is_given_up_does_not_travel() -> None:
+    """Who waits no longer, and has not been sent for, is not sent for."""
+    server = Server()
+
+    async def scene() -> None:
+        client = BatchingClient(server, {"hasParam"})  # type: ignore[arg-type]  # the server stands for the connection
+        calls = [asyncio.create_task(client.call("hasParam", number)) for number in range(4)]
+        await asyncio.sleep(0)
+        calls[2].cancel()
+        await asyncio.gather(*calls, return_exceptions=True)
+
+    asyncio.run(scene())
+    [first, (_method, (parts,))] = server.travelled
+    assert (first, [part["params"] for part in parts]) == (("hasParam", (0,)), [[1], [3]])

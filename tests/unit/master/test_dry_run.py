@@ -12,6 +12,7 @@ from appliance.policy import Live, compile_policy, endings
 from appliance.ros.uris import parse_node_uri
 from appliance.store.state import PermissionRow
 from tests.support.control_parts import ControlParts
+from tests.support.examples import examples
 from tests.support.parameters import mirror
 
 HOSTS = ("10.0.0.5", "10.0.0.6")
@@ -113,7 +114,7 @@ async def taken(
     return {(one.host, one.caller_id, one.what, one.resource) for one in named}, gone, count
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(POLICIES, REGISTRATIONS, GRANTS, TREES)
 def test_a_dry_run_names_exactly_what_a_reload_then_takes(
     written: dict[str, dict[str, str]],

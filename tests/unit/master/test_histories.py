@@ -15,6 +15,11 @@ def test_histories() -> None:
     assert said("--many", "60") == []
 
 
+def test_who_hung_while_its_topic_was_taken_and_given_back_connects_again() -> None:
+    """It knows the list that it is told, and the control that took its grant is no more."""
+    assert any(line.endswith("no faults any more") for line in said("1811"))
+
+
 def test_a_seed_is_one_history() -> None:
     """What it says is the same each time."""
     assert said("7") == said("7")

@@ -16,6 +16,7 @@ from appliance.policy.model import Address
 from appliance.ros.parameter_tree import parts_of
 from appliance.ros.xmlrpc import Value
 from appliance.shares.pool import Bounds, Standing
+from tests.support.examples import examples
 from tests.support.parameters import Owners, mirror, put
 
 ROBOT, GUEST, OTHER, STRANGER = (ipaddress.ip_address(f"10.0.0.{number}") for number in (1, 2, 3, 4))
@@ -94,7 +95,7 @@ def _places(value: Value, place: tuple[str, ...] = ()) -> dict[tuple[str, ...], 
     return found
 
 
-@settings(max_examples=400)
+@settings(max_examples=examples(400))
 @given(st.lists(STEP, max_size=14))
 def test_who_set_it_is_charged(steps: list[tuple[str, str, Any, Address]]) -> None:
     """After any sequence, restarts included: each host's bytes are those of what it set last, names and all."""
@@ -117,7 +118,7 @@ def test_who_set_it_is_charged(steps: list[tuple[str, str, Any, Address]]) -> No
         assert there.charges.pool.total == there.weight == measure(there.tree)[0]
 
 
-@settings(max_examples=400)
+@settings(max_examples=examples(400))
 @given(st.lists(STEP, max_size=20))
 def test_no_sequence_gets_beyond_a_share(steps: list[tuple[str, str, Any, Address]]) -> None:
     """Whatever hosts set, replace, take over and delete: no share and no sum is passed, whoever works together."""
@@ -136,7 +137,7 @@ def test_no_sequence_gets_beyond_a_share(steps: list[tuple[str, str, Any, Addres
         assert named <= BOUNDS.whole - BOUNDS.kept
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(st.lists(STEP, max_size=10), st.integers(0, 3), HOST)
 def test_a_value_is_always_replaced_by_one_that_takes_no_more(
     steps: list[tuple[str, str, Any, Address]], place: int, host: Address

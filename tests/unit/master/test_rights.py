@@ -28,6 +28,7 @@ from appliance.ros.uris import parse_node_uri
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.server import Peer
 from tests.support.control_parts import ControlParts
+from tests.support.examples import examples
 
 HOST = ipaddress.ip_address("10.0.0.5")
 NAME, THING, KEY_GIVEN = "/me", "/thing", "/arm/speed"
@@ -143,7 +144,7 @@ def case_passes(policy: Policy, request: Request, allowed: bool) -> bool:
     return all(one.passed for one in run_cases(policy, text, "cases"))
 
 
-@settings(max_examples=150, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(150), suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.frozensets(st.sampled_from(SECTIONS)),
     st.frozensets(st.sampled_from(SECTIONS), max_size=2),

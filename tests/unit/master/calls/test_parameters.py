@@ -18,6 +18,7 @@ from appliance.master.parameter_mirror import ParameterMirror
 from appliance.ros.errors import EncodingError, ProtocolError
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import Peer
+from tests.support.examples import examples
 from tests.support.nodes import PYTHON
 from tests.support.parameters import mirror, put
 
@@ -64,7 +65,7 @@ def oracle() -> Any:
         process.stdin.close()
 
 
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(300), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=st.lists(STEP, max_size=12))
 def test_the_mirror_is_what_rosmaster_has(oracle: Any, steps: list[Any]) -> None:
     """After any sequence of settings and deletions both trees are equal, and the weight is that of the tree."""
@@ -170,7 +171,7 @@ def test_a_run_is_one_request_in_its_order() -> None:
     assert server.told == [("/a", "/me"), ("/a/b", None), ("/c", "/me")]
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(st.lists(STEP, max_size=12))
 def test_a_run_leaves_what_single_calls_leave(steps: list[tuple[str, str, Any]]) -> None:
     """Whatever the calls, together they leave the tree that they leave one by one."""
@@ -221,7 +222,7 @@ def test_a_part_that_fails_and_a_master_that_is_gone() -> None:
     assert server.told == [("/a", "/me")]
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(st.lists(STEP, max_size=14), st.data())
 def test_changes_made_once_more_leave_the_same_tree(
     steps: list[tuple[str, str, Any]], data: st.DataObject

@@ -1,5 +1,7 @@
 """What the graph tells and takes when lives of one name overlap, and when control has died over a change."""
 
+from typing import Any, cast
+
 import pytest
 
 from appliance.master.graph.registry import Kind, Life
@@ -44,3 +46,28 @@ async def test_who_lost_a_topic_is_told_again_by_the_next_control() -> None:
     world.deliveries.told.clear()
     world.enactor.carry_out(world.graph.tell_everybody(lambda topic: topic == "/plain"))
     assert [params[0] for _name, _method, params in world.deliveries.told] == ["/plain"]
+
+
+async def test_who_is_absent() -> None:
+    """Whoever has a topic of somebody through the relay and is not connected, whether or not a grant is left."""
+    world = await ControlParts.begun()
+    talker, ear, other = world.node("/talker", 1), world.node("/ear", 2), world.node("/other", 3)
+    await world.register(talker, Kind.PUBLICATION, "/a")
+    for node in (talker, ear, other):
+        await world.register(node, Kind.SUBSCRIPTION, "/a")
+    connected = PermissionRow(talker.key, "topic", "/a", str(HOST), "/other")
+    world.grants.used = lambda: {connected}
+    assert list(world.graph.absent(world.registry.live())) == [(ear, "/a", [talker])]
+    assert list(world.graph.absent([other])) == []
+
+
+async def test_nobody_is_absent_where_nodes_connect_by_themselves() -> None:
+    """What the relay does not carry has no connections there; the appliance's own nodes have all of theirs there."""
+    world = await ControlParts.begun()
+    cast(Any, world.mediation).carries_topic = lambda _topic: False
+    talker, ear, own = world.node("/talker", 1), world.node("/ear", 2), world.node("/rosout", 3)
+    own.own = True
+    await world.register(talker, Kind.PUBLICATION, "/a")
+    for node in (ear, own):
+        await world.register(node, Kind.SUBSCRIPTION, "/a")
+    assert list(world.graph.absent(world.registry.live())) == [(own, "/a", [talker])]

@@ -15,6 +15,7 @@ from appliance.master.graph.registry import Kind
 from appliance.ros.names import is_relative_member
 from appliance.ros.xmlrpc import Value
 from tests.support.control_parts import ControlParts
+from tests.support.examples import examples
 from tests.support.nodes import PYTHON
 
 ORACLE = """
@@ -56,7 +57,7 @@ def in_order(told: list[Any]) -> list[str]:
     return sorted(json.dumps(one, sort_keys=True) for one in told)
 
 
-@settings(max_examples=400, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=examples(400), suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     SUBSCRIBED,
     KEY,

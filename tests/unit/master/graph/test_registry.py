@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
 from appliance.ros.uris import parse_node_uri
+from tests.support.examples import examples
 
 HOSTS = [ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")]
 STEP = st.tuples(
@@ -26,7 +27,7 @@ def incarnation(number: int) -> Incarnation:
     )
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(steps=st.lists(STEP, max_size=40))
 def test_invariants(steps: list[tuple[str, int, Kind, str]]) -> None:
     """One live incarnation a name; shadows count for nobody; the indexes are what a look at everything finds."""

@@ -1,5 +1,8 @@
 """The reconcile loop makes ROSMaster what the registry wants, and wants nothing that the policy took."""
 
+import asyncio
+from typing import Any, cast
+
 import pytest
 
 from appliance.master.graph.registry import Kind, Registration
@@ -125,3 +128,88 @@ async def test_a_new_master_is_whole_before_it_is_asked_anything() -> None:
     await world.round()
     assert (world.rosmaster.reachable, world.entries.pid) == (True, world.hidden.pid)
     assert [world.hidden.has(Kind.PUBLICATION, topic) for topic in ("/t", "/u")] == [["/n"], ["/other"]]
+
+
+class _Patient:
+    """The hidden ROSMaster, which answers `method` when `many` of these calls are under way."""
+
+    def __init__(self, world: ControlParts, method: str, many: int) -> None:
+        self._hidden, self._method, self._many = world.hidden, method, many
+        self.told: list[Any] = []
+        self._all = asyncio.Event()
+        world.rosmaster.calls = cast(Any, self)
+
+    async def call(self, method: str, *params: Any) -> Any:
+        """One call."""
+        if method == self._method:
+            self.told.append(params[1])
+            if len(self.told) == self._many:
+                self._all.set()
+            await self._all.wait()
+        return await self._hidden.call(method, *params)
+
+
+async def test_a_new_master_is_told_without_waiting_for_each_answer() -> None:
+    """Everybody waits at the door meanwhile: thousands of registrations are not thousands of round trips."""
+    world = ControlParts()
+    await world.round()
+    node = world.node("/n")
+    names = [f"/t{number}" for number in range(40)]
+    for name in reversed(names):
+        await world.register(node, Kind.PUBLICATION, name)
+    world.hidden.restart()
+    master = _Patient(world, "registerPublisher", len(names))
+    async with asyncio.timeout(60):
+        await world.round()
+    assert master.told == names[::-1]
+
+
+async def test_what_is_left_of_a_lost_node_is_ended_without_waiting_for_each_answer() -> None:
+    """The same for thousands of registrations that nobody has any more."""
+    world = ControlParts()
+    await world.round()
+    gone = world.faces.inner_uri(world.node("/n"))
+    for number in range(40):
+        await world.hidden.call("registerPublisher", "/gone", f"/t{number}", "t", gone)
+    _Patient(world, "unregisterPublisher", 40)
+    async with asyncio.timeout(60):
+        await world.round()
+    assert not any(world.hidden.tables[Kind.PUBLICATION].values())
+
+
+async def test_a_node_that_returns_is_put_back_without_waiting_for_each_answer() -> None:
+    """The same for what it had; it is registered in the order in which it did."""
+    world = ControlParts(silent=3600.0)
+    await world.round()
+    node = world.node("/n")
+    names = [f"/t{number}" for number in range(40)]
+    for name in names:
+        await world.register(node, Kind.PUBLICATION, name)
+    master = _Patient(world, "registerPublisher", len(names))
+    async with asyncio.timeout(60):
+        await world.entries.put_back(node, node.in_order())
+    assert master.told == names
+
+
+async def test_a_look_at_rosmaster_is_no_trouble() -> None:
+    """Calls wait for the moment of a round, and status does not say that ROSMaster is rebuilt, unless it is."""
+    world = ControlParts()
+    seen: list[tuple[str, bool, bool]] = []
+    call = world.hidden.call
+
+    async def watched(method: str, *params: Any) -> Any:
+        seen.append((method, world.rosmaster.reachable, world.rosmaster.whole))
+        return await call(method, *params)
+
+    world.hidden.call = watched  # type: ignore[method-assign]  # the same ROSMaster, looked at
+    assert not world.rosmaster.whole
+    await world.round()
+    await world.register(world.node("/n"), Kind.PUBLICATION, "/t")
+    seen.clear()
+    await world.round()
+    assert {(reachable, whole) for _, reachable, whole in seen} == {(False, True)}
+    world.hidden.restart()
+    seen.clear()
+    await world.round()
+    assert {whole for method, _, whole in seen if method != "getPid"} == {False}
+    assert (world.rosmaster.reachable, world.rosmaster.whole) == (True, True)

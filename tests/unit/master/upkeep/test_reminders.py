@@ -10,34 +10,29 @@ from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.upkeep import reminders
 from appliance.master.upkeep.reminders import Reminders
 from appliance.ros.uris import parse_node_uri
-from appliance.store.state import PermissionRow
 
 HOST = ipaddress.ip_address("10.0.0.5")
 
 
 class Told:
-    """Counts the reminders; the relay's side says who is absent for how many looks."""
+    """The graph, of which `/ear` is absent for so many looks, and who carries out what it returns."""
 
-    def __init__(self, row: PermissionRow, absent_for: int) -> None:
-        self.row, self.absent_for = row, absent_for
-        self.reminded: list[tuple[str, str]] = []
-        self.renewed: list[tuple[str, str, list[str]]] = []
+    def __init__(self, absent_for: int) -> None:
+        self.absent_for = absent_for
+        self.reminded: list[tuple[str, str, list[str]]] = []
 
-    def unconnected(self) -> list[PermissionRow]:
-        """As `RelayControl`."""
+    def absent(self, subscribers: list[Incarnation]) -> list[tuple[Incarnation, str, list[Incarnation]]]:
+        """As `Graph`."""
         self.absent_for -= 1
-        return [self.row] if self.absent_for >= 0 else []
+        ear, _other, mouth = subscribers
+        return [(ear, "/chatter", [mouth])] if self.absent_for >= 0 else []
 
     def carry_out(self, _effects: object) -> None:
-        """As `Execution`."""
-
-    def remind(self, subscriber: Incarnation, topic: str) -> None:
-        """As `Graph`."""
-        self.reminded.append((subscriber.name, topic))
+        """As `Enactor`."""
 
     def renew(self, subscriber: Incarnation, topic: str, absent: list[Incarnation]) -> None:
         """As `Graph`."""
-        self.renewed.append((subscriber.name, topic, [one.key for one in absent]))
+        self.reminded.append((subscriber.name, topic, [one.key for one in absent]))
 
 
 def node(registry: Registry, name: str, kind: Kind) -> Incarnation:
@@ -59,14 +54,14 @@ def test_reminded_until_back(
     node(registry, "/ear", Kind.SUBSCRIPTION)
     node(registry, "/other", Kind.SUBSCRIPTION)
     node(registry, "/mouth", Kind.PUBLICATION)
-    told = Told(PermissionRow("key of /mouth", "topic", "/chatter", str(HOST), "/ear"), absent_for)
+    told = Told(absent_for)
 
     async def run() -> None:
-        looks = Reminders(registry, cast(Any, told), cast(Any, told), cast(Any, told))
+        looks = Reminders(registry, cast(Any, told), cast(Any, told))
         looks.begin()
         assert looks.round is not None
         await looks.round
 
     asyncio.run(run())
-    assert told.reminded == [("/ear", "/chatter")] * reminded
-    assert told.renewed == [("/ear", "/chatter", ["key of /mouth"])] * renewed
+    gentle, anew = ("/ear", "/chatter", list[str]()), ("/ear", "/chatter", ["key of /mouth"])
+    assert told.reminded == [gentle] * reminded + [anew] * renewed
