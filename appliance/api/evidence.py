@@ -1,7 +1,6 @@
 """`/v1/evidence` and `/v1/recordings/{id}/evidence`: what happened, in one file that proves itself elsewhere."""
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator
 from typing import Annotated, Any
 
 from fastapi import Query, Request, Response
@@ -12,19 +11,15 @@ from appliance.api.moments import given
 from appliance.api.problems import ProblemError
 from appliance.api.recordings import OneId
 from appliance.api.roles import Investigator, Reader, problem_of
-from appliance.api.routing import Responses, Routes
+from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
-from appliance.api.streams import Held, peer_of
+from appliance.api.streams import Held, in_thread, peer_of
 from appliance.audit.database import LogUnreadableError
 from appliance.channel.admin import AdminAnswer, AdminRequest
 from appliance.evidence.bundle import BundleError, Kept, Span, export
 
-_ZIP: Responses = {
-    200: {
-        "description": "A ZIP file.",
-        "content": {"application/zip": {"schema": {"type": "string", "format": "binary"}}},
-    },
-    404: {"description": "There is no such recording, or the log has no record of that time."},
+_ZIP: Responses = file("application/zip", "A ZIP file.", binary=True) | {
+    404: {"description": "There is no such recording, or the log has no record of that time."}
 }
 _Moment = Annotated[str, Query(max_length=64, description="1h (ago), a date, or RFC 3339", examples=["1h"])]
 
@@ -33,7 +28,7 @@ def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1", tags=["evidence"])
 
-    @router.get("/evidence", operation_id="export_evidence", responses=_ZIP, response_class=Response)
+    @router.get("/evidence", responses=_ZIP, response_class=Response)
     async def export_evidence(
         request: Request, bearer: Reader, since: _Moment, until: _Moment = "0s"
     ) -> Response:
@@ -43,12 +38,7 @@ def routes(services: Services) -> Routes:
         """
         return await _bundle(services, request, bearer, Span(given(since), given(until)))
 
-    @router.get(
-        "/recordings/{recording_id:recording}/evidence",
-        operation_id="recording_evidence",
-        responses=_ZIP,
-        response_class=Response,
-    )
+    @router.get("/recordings/{recording_id:recording}/evidence", responses=_ZIP, response_class=Response)
     async def recording_evidence(recording_id: OneId, request: Request, bearer: Investigator) -> Response:
         """The same of the time of a recording, with its messages. For investigators."""
         kept = Kept(recording_id, services.settings.state / "recordings")
@@ -74,9 +64,4 @@ async def _bundle(services: Services, request: Request, bearer: Bearer, wanted: 
             raise ProblemError(503, "log-unreadable", str(error)) from error
         raise
     name = {"Content-Disposition": 'attachment; filename="rosrv-evidence.zip"'}
-    return Held(StreamingResponse(_given(pieces), headers=name, media_type="application/zip"), give_back)
-
-
-async def _given(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
-    while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
-        yield piece
+    return Held(StreamingResponse(in_thread(pieces), headers=name, media_type="application/zip"), give_back)

@@ -4,7 +4,7 @@ No change here needs `If-Match`: a recording never changes, it only ends.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path as FilePath
 from typing import Annotated, Literal, TypeVar
 
@@ -18,9 +18,9 @@ from appliance.api.control import ControlLink
 from appliance.api.moments import given
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Investigator, Operator, Viewer, answered, ask
-from appliance.api.routing import Responses, Routes, answer, body, content
+from appliance.api.routing import Responses, Routes, answer, body, content, file
 from appliance.api.services import Services
-from appliance.api.streams import Held, peer_of, turn
+from appliance.api.streams import Held, in_thread, peer_of, turn
 from appliance.channel import admin
 from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.recordings import (
@@ -45,12 +45,7 @@ _T = TypeVar("_T")
 _PIECE = 1 << 20
 _SLOW_SECONDS = 15.0  # longer than control waits for the recorder
 _UNKNOWN: Responses = {404: {"description": "There is no such recording, or the flight recorder is off."}}
-_BAG: Responses = {
-    200: {
-        "description": "The bag (rosbag, format 2.0), or MCAP (profile ros1)",
-        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
-    }
-}
+_BAG = file("application/octet-stream", "The bag (rosbag, format 2.0), or MCAP (profile ros1)", binary=True)
 _BEGUN: Responses = {201: {"description": "It is being made.", "content": content(RecordingBegun)}}
 OneId = Annotated[
     str, Path(pattern="^[0-9a-f]{20}$", description="of a recording", examples=["18ea0bb9b11c1024196c"])
@@ -64,7 +59,7 @@ _Topics = Annotated[
     Query(max_length=20, description="of these alone; none: of all", examples=[["/scan"]]),
 ]
 _Given = Annotated[
-    int | Annotated[str, msgspec.Meta(max_length=64)] | None,
+    Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)] | Annotated[str, msgspec.Meta(max_length=64)] | None,
     told("RFC 3339, or nanoseconds since the epoch"),
 ]
 _Reading = Callable[[Recording, FilePath], _T]
@@ -107,14 +102,12 @@ def routes(services: Services) -> Routes:
 def _add_all(router: Routes, control: ControlLink) -> None:
     """What is there, and what is to be there."""
 
-    @router.get("", operation_id="recordings", responses=_UNKNOWN)
+    @router.get("", responses=_UNKNOWN)
     async def recordings(bearer: Viewer) -> Recordings:
         """All recordings that are kept, the oldest first."""
         return await ask(control, admin.RecordingsWanted(), bearer)
 
-    @router.post(
-        "", operation_id="record_now", responses=_BEGUN | _UNKNOWN, response_class=Response, status_code=201
-    )
+    @router.post("", responses=_BEGUN | _UNKNOWN, response_class=Response, status_code=201)
     async def record_now(new: Annotated[NewRecording, body(NewRecording)], bearer: Operator) -> Response:
         """Record the last seconds, and the next ones, of what the robot says."""
         order = admin.RecordNow(new.before, new.after, new.note)
@@ -130,7 +123,7 @@ def _add_all(router: Routes, control: ControlLink) -> None:
 def _add_one(router: Routes, control: ControlLink) -> None:
     """A recording, without its messages."""
 
-    @router.get("/{recording_id:recording}", operation_id="recording", responses=_UNKNOWN)
+    @router.get("/{recording_id:recording}", responses=_UNKNOWN)
     async def recording(recording_id: OneId, bearer: Viewer) -> Recording:
         """Why a recording was made, and what it has."""
         return await ask(control, admin.RecordingWanted(recording_id), bearer)
@@ -183,7 +176,7 @@ def _add_reading(router: Routes, services: Services) -> None:
             except ValueError as error:
                 raise ProblemError(422, "bad-input", str(error)) from error
 
-    @router.get("/{recording_id:recording}/timeline", operation_id="recording_timeline", responses=_UNKNOWN)
+    @router.get("/{recording_id:recording}/timeline", responses=_UNKNOWN)
     async def recording_timeline(
         recording_id: OneId,
         bearer: Viewer,
@@ -201,7 +194,7 @@ def _add_reading(router: Routes, services: Services) -> None:
             lambda row, bag: timeline(row, bag, start, end, columns),
         )
 
-    @router.get("/{recording_id:recording}/messages", operation_id="recording_messages", responses=_UNKNOWN)
+    @router.get("/{recording_id:recording}/messages", responses=_UNKNOWN)
     async def recording_messages(
         recording_id: OneId,
         bearer: Investigator,
@@ -239,7 +232,7 @@ async def _bag(services: Services, recording_id: str, bearer: Bearer, *, mcap: b
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
     if not mcap:
         headers["Content-Length"] = str(found.size)
-    return StreamingResponse(_in_thread(pieces), media_type="application/octet-stream", headers=headers)
+    return StreamingResponse(in_thread(pieces), media_type="application/octet-stream", headers=headers)
 
 
 def _bag_of(services: Services, recording_id: str) -> FilePath:
@@ -255,12 +248,6 @@ def _moment(moment: str | int | None) -> int | None:
 
 
 def _pieces_of(path: FilePath) -> Iterator[bytes]:
-    with path.open("rb") as file:
-        while piece := file.read(_PIECE):
-            yield piece
-
-
-async def _in_thread(pieces: Iterator[bytes]) -> AsyncIterator[bytes]:
-    while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
-        if piece:
+    with path.open("rb") as bag:
+        while piece := bag.read(_PIECE):
             yield piece

@@ -81,7 +81,7 @@ def list_recordings(appliance: Appliance, as_json: Json = False) -> None:
         else:
             say(f"{row.id}  {_moment(row.began)}  {_summary(row)}")
     if not rows and not as_json:
-        say("nothing has been recorded: rosrv record now")
+        say("nothing has been recorded: rosrv record now (what is being recorded is listed when it ends)")
 
 
 @speaks
@@ -201,7 +201,7 @@ def fetch(
     Example: rosrv record fetch 1879f3c2a4b5d6e7f012 && rosbag info rosrv-1879f3c2a4b5d6e7f012.bag
     """
     target = out or Path(f"rosrv-{recording}.{'mcap' if mcap else 'bag'}")
-    if target.exists():
+    if os.path.lexists(target):
         raise usage_error(f"{target} is there already")
     part = target.with_name(f"{target.name}.part")
     try:
@@ -220,7 +220,7 @@ def fetch(
         elif whole:
             part.replace(target)
     except OSError as error:
-        raise usage_error(f"{error.filename}: {error.strerror}") from None
+        raise usage_error(f"{error.filename2 or error.filename or target}: {error.strerror}") from None
     finally:
         part.unlink(missing_ok=True)
     if not whole:
@@ -322,14 +322,16 @@ def _private(path: Path) -> int:
 
 def _convert(bag: Path, target: Path) -> None:
     """Write the bag as MCAP. Raises `OSError`; ends the program with 1 where a message type makes no sense."""
-    try:
-        with os.fdopen(_private(target), "wb") as file:
-            for piece in as_mcap(bag):
-                file.write(piece)
-    except ValueError as error:
-        target.unlink()
-        typer.echo(f"rosrv: it cannot be made MCAP, fetch the bag: {error}", err=True)
-        raise typer.Exit(1) from None
+    with os.fdopen(_private(target), "wb") as file:
+        try:
+            file.writelines(as_mcap(bag))
+            file.flush()
+        except BaseException as error:
+            target.unlink()
+            if not isinstance(error, ValueError):
+                raise
+            typer.echo(f"rosrv: it cannot be made MCAP, fetch the bag: {printable(str(error))}", err=True)
+            raise typer.Exit(1) from None
 
 
 def _seconds(option: str, given: str | None) -> float | None:

@@ -43,6 +43,7 @@ class RecordingOrders:
         self._channel: Channel | None = None
         self._kept: dict[str, Recording] = {}
         self._lent: dict[str, Recording] = {}  # the last one of the memory
+        self._begun: str | None = None  # the id of the one that is being made, if somebody was told it
         self._numbers = itertools.count(1)
         self._asked: dict[int, asyncio.Future[_Answer]] = {}
 
@@ -205,6 +206,10 @@ class RecordingOrders:
 
     def _find(self, recording_id: str) -> Recording:
         known = self._kept | self._lent
+        if recording_id == self._begun:
+            raise UnknownThingError(
+                f"recording {recording_id} is still being made: what happens meanwhile makes it longer"
+            )
         if recording_id not in known:
             raise UnknownThingError(f"there is no recording {recording_id[:40]}")
         return known[recording_id]
@@ -235,9 +240,11 @@ class RecordingOrders:
             case messages.RevisionsWanted():
                 channel.send(self._in_force())
             case messages.RecordingClosed(recording):
+                self._begun = None
                 self._closed(recording)
                 channel.send(messages.RecordingNoted(recording.id))
             case messages.RecordingMissed(trigger, reason):
+                self._begun = None
                 self._trail.happened(
                     "recording missed",
                     reason,
@@ -256,7 +263,10 @@ class RecordingOrders:
                     who=who or "recorder",
                 )
                 self._answered(message)
-            case messages.RecordingBegun() | messages.MemoryLent() | messages.RecordingRefused():
+            case messages.RecordingBegun(_number, recording_id):
+                self._begun = recording_id
+                self._answered(message)
+            case messages.MemoryLent() | messages.RecordingRefused():
                 self._answered(message)
 
     def _answered(self, message: _Answer) -> None:

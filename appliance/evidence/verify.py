@@ -29,6 +29,7 @@ import json
 import subprocess
 import tempfile
 import zipfile
+from collections import Counter
 from pathlib import Path
 from typing import Any, Callable, Iterator
 
@@ -131,10 +132,10 @@ class Verifier:
         members = self.manifest["members"]
         if self.manifest["format"] != FORMAT or {*self.manifest} != FIELDS:
             self.findings.append(f"manifest.json: is not of the format {FORMAT!r}")
-        for name in sorted(set(self.names)):
+        for name, times in sorted(Counter(self.names).items()):
             if name not in members and name not in OWN:
                 self.findings.append(f"{name!a}: does not belong to the bundle")
-            if self.names.count(name) > 1:
+            if times > 1:
                 self.findings.append(f"{name!a}: is there more than once")
         for name in members.keys() - set(self.names):
             self.findings.append(f"{name!a}: is missing")

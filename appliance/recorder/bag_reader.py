@@ -25,7 +25,7 @@ from appliance.recorder.bag import (
 )
 
 _SECOND = 1_000_000_000
-_PLACE = re.compile(r"\d{1,20}-\d{1,12}-\d{1,12}", re.ASCII)
+_PLACE = re.compile(r"\d{6,20}-\d{1,12}-\d{1,12}", re.ASCII)  # no date, of no calendar
 _U32, _U64, _STAMP = struct.Struct("<I"), struct.Struct("<Q"), struct.Struct("<II")
 
 

@@ -156,6 +156,7 @@ class Recorder:
         progress = Progress(self._ids.next(), self._memory, since, until, [wanted.trigger])
         try:
             lent = self._in_progress(progress)
+            self._shelf.mark_lent(progress.id)
             lent.step()
             recording = lent.finish((), self._revisions)
             self._shelf.lend(recording)

@@ -7,7 +7,9 @@ Invariants:
    of trigger whose recordings have most of it, the oldest goes: who causes many loses none of others. So it does where
    their descriptions have more than `_MOST_DESCRIBED` bytes, for control is told of all of them in one message.
 3. `noted` in a folder says that the audit log has the recording; what was not noted is told again.
-4. `lent` in a folder says that it is no recording that is kept: there is one at most, which goes with the next.
+4. `lent` in a folder says that it is no recording that is kept: there is one at most, which goes with the next, and
+   a recorder that begins removes it, also where the one before fell while it was made. It is not counted: beside what
+   `disk` says there may be one recording's share for `LENT_SECONDS`.
 """
 
 import re
@@ -82,10 +84,13 @@ class Shelf:
         self.recordings.append(recording)
         self._described[recording.id] = self._length(recording)
 
+    def mark_lent(self, recording_id: str) -> None:
+        """What is made in its folder is not to be kept. Raises `OSError`."""
+        (self.part(recording_id) / _LENT).touch()
+
     def lend(self, recording: Recording) -> None:
         """One that is not kept can be read until there is another, or for `LENT_SECONDS`. Raises `OSError`."""
         self._take_back()
-        (self.part(recording.id) / _LENT).touch()
         self.part(recording.id).rename(self._folder / recording.id)
         self._lent = recording
 

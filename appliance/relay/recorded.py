@@ -13,13 +13,15 @@ _TOPIC_SHARE = 0.25
 
 
 class Recorded:
-    """Writes into the memory that was given, after whoever wrote there before; takes over the descriptor."""
+    """Writes into the memory that was given, after what the process before it wrote; takes over the descriptor."""
 
     def __init__(self, given: RingGiven, descriptor: int) -> None:
         bounds = RECORDER_MEMORY.bounds
+        # Its pages are mapped at once: else each is, by a fault, when the first message comes to it.
+        memory = mmap.mmap(descriptor, 0, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
         self._topics, self._never = given.topics, given.never
         self._ring = RingWriter(
-            memoryview(mmap.mmap(descriptor, 0)),
+            memoryview(memory),
             topic_share=_TOPIC_SHARE,
             host_share=bounds.host / bounds.whole,
             seconds=given.seconds,

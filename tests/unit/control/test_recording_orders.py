@@ -179,6 +179,10 @@ def test_orders_are_carried_out_in_somebodys_name() -> None:
         begun = await scene.orders.now(admin.RecordNow(after=5, note="why"), "eve")
         assert (begun.id, begun.ends) == (KEPT.id, 9)
         assert scene.trail.events[0][1]["who"] == "eve"
+        with pytest.raises(UnknownThingError, match="still being made"):
+            await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve")
+        with pytest.raises(UnknownThingError, match="no recording"):
+            await scene.orders.fetch(admin.RecordingFetch(""), "eve")
         assert await scene.orders.remove(admin.RecordingRemove(KEPT.id), "eve") == KEPT
         assert scene.trail.events[1][1]["who"] == "eve"
         with pytest.raises(UnknownThingError):

@@ -525,5 +525,6 @@ def test_the_verifier_is_a_program_for_python_3_8() -> None:
     imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
     imported |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert imported == {
-        "__future__", "argparse", "hashlib", "json", "pathlib", "subprocess", "sys", "tempfile", "typing", "zipfile",
+        "__future__", "argparse", "collections", "hashlib", "json", "pathlib", "subprocess", "sys", "tempfile",
+        "typing", "zipfile",
     }  # fmt: skip

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import mmap
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from appliance.channel import messages
 from appliance.channel.answers.recordings import Recording, Trigger
 from appliance.config import RecorderRules
 from appliance.recorder.recorder import SETTLE_SECONDS, Recorder
+from appliance.recorder.recording import RecordingInProgress
 from appliance.recorder.ring import SMALLEST, RingWriter
 from appliance.recorder.shelf import Shelf
 from tests.support.audit import decision, settle
@@ -167,6 +169,13 @@ def test_what_is_in_memory_is_lent_and_not_kept(scene: Scene) -> None:
     lent(0, scene.clock.now)
     scene.begin_anew()
     assert there() == set()
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr(RecordingInProgress, "finish", lambda made, *_given: sys.exit(made.leave()))  # it falls
+        lent(0, scene.clock.now)
+    assert there()
+    scene.begin_anew()
+    assert there() == set()
+    assert not scene.closed(scene.later(60))
 
 
 def test_triggers_that_overlap_make_one_recording(scene: Scene) -> None:

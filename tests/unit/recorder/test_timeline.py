@@ -127,6 +127,14 @@ def test_pages_of_one_moment_end(tmp_path: Path) -> None:
     assert seen == [str(step) for step in range(9)]
 
 
+@pytest.mark.parametrize("text", ["2026-02-30", "10000-01-01", "2026-03-01", "", "1795155949800000000-4109"])
+def test_a_date_is_no_place(text: str) -> None:
+    """One that no calendar has is refused as a moment, and does not show the beginning."""
+    assert Place.parsed(text) is None
+    place = Place(1795155949800000000, 4109, 2210)
+    assert Place.parsed(str(place)) == place
+
+
 def test_no_publisher_makes_events(tmp_path: Path) -> None:
     """What a node says on the recorder's own topic is a message like any other."""
     writer = BagWriter(tmp_path / "a.bag", {})

@@ -7,6 +7,7 @@ import pytest
 from pydantic import ByteSize
 
 from appliance.config import RecorderRules
+from appliance.supervisor.errors import StartError
 from appliance.supervisor.rings import Rings
 
 MIB = 1 << 20
@@ -49,3 +50,17 @@ def test_another_user_does_not_open_it_anew_to_write() -> None:
     [(_given, read)] = rings.given_to("recorder", 0)
     assert os.fstat(read).st_mode & 0o777 == 0o600
     rings.close()
+
+
+def test_the_memory_is_there_from_the_start() -> None:
+    """Nobody finds out amid an incident that the machine has not got it."""
+    rings = Rings(RecorderRules(memory=ByteSize(16 * MIB)), 1)
+    [(_given, written)] = rings.given_to("relay", 0)
+    assert os.fstat(written).st_blocks * 512 == 16 * MIB
+    rings.close()
+
+
+def test_more_than_the_machine_has_is_refused() -> None:
+    """With what to do, before anything is started."""
+    with pytest.raises(StartError, match=r"recorder\.memory: 1\.0PiB are more than .* give less"):
+        Rings(RecorderRules(memory=ByteSize(1 << 50)), 1)
