@@ -18,7 +18,7 @@
  *
  * With TRACE the steps that leave a record are only taken in the order of a trace of the running appliance (`kind`,
  * `first`, `second`, LENGTH), and all others when they like: a trace is one of the model's when its end can be reached
- * (`accepted`). `tests/integration/test_insertion_traces.py` has such traces, and tampered ones.
+ * (`accepted`). `tests/proofs/test_insertion_traces.py` has such traces, and tampered ones.
  */
 
 #ifndef PUBLISHERS

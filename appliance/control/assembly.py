@@ -225,7 +225,7 @@ class Parts:
             self.trail,
             own_parameters=own_parameters,
         )
-        self.reminders = Reminders(self.registry, self.relay, self.graph, self.enactor)
+        self.reminders = Reminders(self.registry, self.graph, self.enactor)
         arrivals = Arrivals(
             self.registry,
             self.graph,

@@ -25,6 +25,7 @@ from appliance.hosts.hosts import Hosts
 from appliance.inventory import inventory
 from appliance.master.graph.registry import Kind, Life
 from appliance.policy import Live
+from appliance.policy.sections import DECIDERS
 
 MOST_MESSAGES = 20
 LONGEST_LOOK = 10.0
@@ -153,7 +154,7 @@ class Looks:
             policy=self._policy(),
             ipsec=self.hosts.status(),
             monitors=monitors_status(parts.monitors),
-            rosmaster="reachable" if parts.rosmaster.reachable else "being rebuilt",
+            rosmaster="reachable" if parts.rosmaster.whole else "being rebuilt",
             relay=relay.presence,
             nodes=lives.count(Life.LIVE),
             shadows=lives.count(Life.SHADOW),
@@ -176,5 +177,6 @@ class Looks:
             who=policies.in_force.who,
             differs_from_file=policies.differs_from_file,
             warnings=len(policies.current.warnings),
+            audit_only=[one.name for one in DECIDERS if policies.current.audit_only(one.categories[0])],
             confirm_by=policies.confirm_by,
         )

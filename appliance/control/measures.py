@@ -52,6 +52,11 @@ def measures_of(parts: Parts, status: Status, hosts: list[Host], queued_deliveri
         delayed=delayed,
         monitors=[(*labels, count) for labels, count in done.items()],
         margins=list(islice(_margins(parts.monitors.rows), MOST_MARGINS)),
+        slices={
+            name: (row.slices, row.slice_limit)
+            for name, row in parts.monitors.rows.items()
+            if row.slice_limit
+        },
         drop_at=_at(records.at, "drop"),
         change_at=_at(records.at, "change"),
         limited=[(*labels, count) for labels, count in carried.limited_messages.items()],

@@ -1,6 +1,5 @@
 """What operators ask of the monitors."""
 
-from dataclasses import asdict
 from typing import Any
 
 import msgspec
@@ -14,7 +13,6 @@ from appliance.control.errors import UnknownThingError
 from appliance.rosmop.positions import line_of
 from appliance.specifications.files import Sources
 from appliance.specifications.monitors import Monitors, sources_of
-from appliance.specifications.monitors import Replaced as Done
 from appliance.store.state import MonitorRevisionRow
 
 
@@ -52,14 +50,13 @@ class MonitorOrders:
 
     async def load(self, request: admin.MonitorLoad, who: str) -> answers.Replaced:
         """Add or replace files of specifications."""
-        done = await self._monitors.load(
+        return await self._monitors.load(
             Sources(request.files, request.definitions, request.signatures),
             who=who,
             note=request.note,
             expected=request.expected,
             confirm_within=request.confirm_within,
         )
-        return self._replaced(done)
 
     async def replace(self, request: admin.MonitorReplace, who: str) -> answers.Replaced:
         """Put a text in the place of a monitor's file."""
@@ -76,22 +73,19 @@ class MonitorOrders:
 
     async def reload(self, request: admin.MonitorReload, who: str) -> answers.Replaced:
         """Take what the folder has."""
-        done = await self._monitors.reload(
+        return await self._monitors.reload(
             who=who, expected=request.expected, prune=request.prune, confirm_within=request.confirm_within
         )
-        return self._replaced(done)
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> answers.Replaced:
         """Remove specifications."""
-        done = await self._monitors.remove(
+        return await self._monitors.remove(
             request.names, who=who, expected=request.expected, confirm_within=request.confirm_within
         )
-        return self._replaced(done)
 
     async def roll_back(self, request: admin.MonitorRollback, who: str) -> answers.Replaced:
         """Bring a kept revision into force."""
-        done = await self._monitors.rollback(request.revision, who=who, expected=request.expected)
-        return self._replaced(done)
+        return await self._monitors.rollback(request.revision, who=who, expected=request.expected)
 
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
         """Keep a change that would go back by itself."""
@@ -141,9 +135,6 @@ class MonitorOrders:
         names = await self._monitors.resume(request.names, who=who, expected=request.expected)
         return answers.Switched(names, self._monitors.revision, self._monitors.tag)
 
-    def _replaced(self, done: Done) -> answers.Replaced:
-        return answers.Replaced(**asdict(done), tag=self._monitors.tag)
-
 
 def monitors_status(monitors: Monitors) -> MonitorsState:
     """The few words of `rosrv status`."""
@@ -190,6 +181,8 @@ def _state(monitors: Monitors, name: str) -> answers.MonitorState:
         would_drop=drops if tried else 0,
         would_change=changes if tried else 0,
         missed=row.missed if row is not None else 0,
+        slices=row.slices if row is not None else 0,
+        slice_limit=row.slice_limit if row is not None else 0,
         margins=[]
         if row is None
         else [_margin(each, monitors.sources.files.get(row.file, "")) for each in row.margins],

@@ -76,9 +76,7 @@ _RESERVED_SHARES = AUDIT_RESERVE.bounds.whole // AUDIT_RESERVE.bounds.host  # of
 def main(lifeline_fd: int, config_path: Path) -> None:
     """Run control until the supervisor stops it."""
     settings = load_resolved(config_path)
-    # The loop waits this long at most for a thread (audit log, store) that is in the middle of Python code.
-    sys.setswitchinterval(0.0005)
-    # Large values are read and written in threads: the loop waits no longer than this for the interpreter.
+    # The loop waits no longer than this for a thread (audit log, store, large values) in the middle of Python code.
     sys.setswitchinterval(_SWITCH_SECONDS)
     uvloop.run(_Control(settings, lifeline_fd).run())
 

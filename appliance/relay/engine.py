@@ -247,7 +247,7 @@ class Engine:
         relayed.flow.set(message.limit, together, self._loop.clock())
 
     def _limit_subscriber(self, message: messages.GrantInstalled) -> None:
-        """Those that are connected by this grant are limited so from now on."""
+        """Limit the connections of this grant so from now on."""
         flow = self._flows.of(message.limit, message.topic, message.host, message.caller_id)
         for subscriber in self._connected_by(message):
             subscriber.flow = flow
@@ -422,7 +422,7 @@ class Engine:
             self._serve_client(visitor, sock, kept(fields), rest)
 
     def _judge_waiting(self, key: str) -> None:
-        """Something new is stated of this incarnation: who can be served now is served."""
+        """Something new is stated of this incarnation: peers that can be served now are."""
         for visitor in list(self.waiting.get(key, ())):
             if not missing(self._table, key, visitor.host, visitor.fields):
                 self._judge(visitor, patient=True)

@@ -22,7 +22,7 @@ Tap = Callable[[Batch], None]
 
 
 class Looks:
-    """Who looks into which topics. `tell(message)` reaches control."""
+    """Which topics operators look into. `tell(message)` reaches control."""
 
     def __init__(self, tell: Callable[[Message], None]) -> None:
         self._tell = tell

@@ -13,15 +13,15 @@ Theory of operation:
    the caller calls `advance` when `next_due` has come; a deadline may have been put off since. Ticks that take longer
    than the caller's `patience` allows are left out, and that is logged; deadlines wait for the next time.
 4. `walker` offers, for most topics, a walk that does what `process` does to many messages at once (`walking.py`), as
-   far as these need nothing that is recorded or explained. Whoever uses it must not see a difference but in time.
+   far as these need nothing that is recorded or explained. Its results differ in nothing but the time that they take.
 5. `replaced` makes the set that follows: one swap between two messages. Specifications whose text is the same
    keep their variables and runs.
 6. Of a parametric specification each slice that an event belongs to takes its turn, with its own state
    (`slices.py`), as if there were a specification for each.
 7. Specifications on trial are sets of their own (`trials`), one for those that share variables: nothing that one does
    or uses up is seen by others. Where the first of such a set would stand among the others, a copy of the message as
-   it is there is left in `tapped`; who has passed the message on has it given (`Tapped.give`), and what comes of it is
-   what would have been done. The copies for one set are given in their order.
+   it is there is left in `tapped`; the caller gives it to them when the message is passed on (`Tapped.give`), and what
+   comes of it is what would have been done. The copies for one set are given in their order.
 """
 
 import math
@@ -34,10 +34,10 @@ from appliance.ros.definitions import Definitions
 from appliance.rosmop.compile.events import EventCode
 from appliance.rosmop.compile.program import connected
 from appliance.rosmop.compile.specification import Compiled, compile_files, findings_of
-from appliance.rosmop.faults import explain, happened
+from appliance.rosmop.faults import explain
 from appliance.rosmop.logics.interface import Categories, RunFaultError
 from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step, Timer, monitors_of
-from appliance.rosmop.outcomes import Fault, Outcome, Verdict
+from appliance.rosmop.outcomes import DROPPED, Fault, Outcome, Verdict
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.reach import reached, redefined
 from appliance.rosmop.runtime.context import FOLDED_NS, Context, FaultError, LogLine
@@ -112,7 +112,7 @@ class Margin(NamedTuple):
 
     @property
     def distance(self) -> float:
-        """Of the sides."""
+        """How far the sides are apart."""
         return abs(self.left - self.right)
 
     @property
@@ -451,7 +451,10 @@ class MonitorSet:
         self.switch({name: enabled}, time_ns)
 
     def switch(self, enabled: Mapping[str, bool], time_ns: int) -> tuple[Monitor, ...]:
-        """The same of many at once, unknown ones left out; those that were not so already."""
+        """Let the events of monitors happen, or not, and leave unknown names out; the monitors that this changed.
+
+        Time that passed meanwhile does not count: timers and properties with time bounds begin anew.
+        """
         changed = [monitor for trial in self.trials for monitor in trial.switch(enabled, time_ns)]
         for monitor in self._monitors:
             wanted = enabled.get(monitor.name, monitor.enabled)
@@ -562,7 +565,7 @@ class MonitorSet:
         try:
             has_happened = step.function(message)
         except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
-            if happened(error, step.event.action_line):
+            if self.compiled.module.has_begun(step.event.action_line, error):
                 outcome.events = (*outcome.events, step.name)
             self._fault(error, step.monitor, step.event.position, outcome)
             self._block(message, outcome)
@@ -651,10 +654,11 @@ class MonitorSet:
         self._explains = False  # of seeds nothing is told
         for one in () if dropped else seeds:
             unseen = Outcome(time=outcome.time)
-            lines, published = len(turn.log), len(turn.published)
+            lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
             copied = None if message is None else Message(bytes(message.buffer), message.time)
             self._in_slice(step.monitor, one, unseen, copied, act)
             del turn.log[lines:], turn.published[published:]
+            turn.looked = looked
             faults += unseen.faults
         self._explains = True
         outcome.events, outcome.verdicts, outcome.faults = names, tuple(verdicts), tuple(faults)
@@ -697,15 +701,15 @@ class MonitorSet:
 
     def _finish(self, message: Message, writers: tuple[Step, ...], outcome: Outcome) -> None:
         turn = self._turn
-        if turn.log or turn.published:
+        if turn.log or turn.published or turn.looked:
             self._collect(outcome)
-        if message.looked:
-            outcome.looked, outcome.sites = message.looked, self.compiled.module.sites
         if message.dropped:
             outcome.result = "dropped"
             outcome.overwritten = message.overwritten
-            if message.cause is not None and outcome.fatal is None:
-                outcome.cause, outcome.sites = message.cause, self.compiled.module.sites
+            if outcome.fatal is not None:
+                outcome.dropped_at = outcome.fatal.position
+            elif message.cause is not None:
+                outcome.dropped_at = self.compiled.module.sites[message.cause].position
         elif message.changed:
             outcome.result = "changed"
             outcome.buffer = message.buffer
@@ -718,10 +722,10 @@ class MonitorSet:
         """A message for a monitor that has seen none yet, or that holds its topics; whether it was dropped."""
         if monitor.held:
             outcome.reason = f"{monitor.name} holds its topics until it is resumed"
-            message.dropped = True
-            return True
-        if monitor.broken and self.on_fault == "drop":
+        elif monitor.broken and self.on_fault == "drop":
             outcome.reason = f"{monitor.name} could not begin: its first values or `init` faulted"
+        if outcome.reason is not None:
+            outcome.dropped_at = monitor.node.position
             message.dropped = True
             return True
         monitor.seen = True
@@ -767,8 +771,15 @@ class MonitorSet:
             handlers.sort(key=lambda pair: categories.index(pair[0]))
         self._turn.reset = False
         for category, handler in handlers:
-            outcome.verdicts = (*outcome.verdicts, self._verdict(monitor, running, category))
+            verdict = self._verdict(monitor, running, category)
+            outcome.verdicts = (*outcome.verdicts, verdict)
+            published, dropped = len(self._turn.published), message is not None and message.dropped
             self._handle(monitor, handler, message, running, outcome)
+            made = [*range(published, len(self._turn.published))]
+            if message is not None and message.dropped and not dropped:
+                made.append(DROPPED)
+            if made:
+                outcome.handling = {**outcome.handling, **dict.fromkeys(made, verdict)}
         if self._turn.reset:
             running.begin(self._turn.now)
 
@@ -825,8 +836,9 @@ class MonitorSet:
 
     def _collect(self, outcome: Outcome) -> None:
         turn = self._turn
-        outcome.log, outcome.published = turn.log, turn.published
-        turn.log, turn.published = [], []
+        outcome.log, outcome.published, outcome.looked = turn.log, turn.published, turn.looked
+        outcome.sites = self.compiled.module.sites
+        turn.log, turn.published, turn.looked = [], [], {}
 
     # Time
 
@@ -1006,7 +1018,7 @@ class MonitorSet:
         )
 
     def _taps(self, trial: "MonitorSet") -> tuple[Step, ...]:
-        """One for each topic and part of a service on which the trial has an enabled event."""
+        """A tap for each topic and part of a service on which the trial has an enabled event."""
         return tuple(
             _Tap(found[0].monitor, found[0].event, 0, "", self._tap(trial, found[0].event))
             for found in (*trial.steps.values(), *trial._requests.values())

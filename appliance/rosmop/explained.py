@@ -1,19 +1,86 @@
-"""An explanation as data for a record, for the CLI and for REST: bounded, in the words of the specification."""
+"""What came of a message, a tick or a deadline, as data for a record, for the CLI and for REST: what led to it.
+
+Bounded, and in the words of the specification. `who` names the source of a message.
+"""
 
 import datetime
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from appliance.rosmop.deciding import deciding
-from appliance.rosmop.outcomes import Outcome, Verdict
+from appliance.rosmop.outcomes import DROPPED, Fault, Outcome, Verdict, named
 from appliance.rosmop.why import SEQ, Happened
 
 _EACH_END = 5
 """So many of the first and of the last events are told; how many there are between them is said."""
 
+Who = Callable[[int], Mapping[str, Any]]
 
-def explained(verdict: Verdict, who: Callable[[int], Mapping[str, str]]) -> dict[str, Any]:
-    """`why` of a verdict; nothing where it was not asked or is not known. `who` names the source of a message."""
+
+def of_drop(outcome: Outcome, who: Who) -> dict[str, Any]:
+    """What led to the drop of the message, and where that is written."""
+    return {
+        **({"at": [str(outcome.dropped_at)]} if outcome.dropped_at is not None else {}),
+        **({"values": dict(outcome.fatal.values)} if outcome.fatal is not None else {}),
+        **_led(outcome, who, outcome.handling.get(DROPPED)),
+    }
+
+
+def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
+    """What led to the change of the message, and where the events are written that made it."""
+    return {
+        "changed_by": list(outcome.changed_by),
+        "at": [str(one) for one in outcome.changed_at],
+        **_led(outcome, who),
+    }
+
+
+def of_published(outcome: Outcome, number: int, who: Who) -> dict[str, Any]:
+    """What led to one of the messages that were published, and where that is written."""
+    message = outcome.published[number]
+    position = outcome.sites[message.site].position
+    return {"type": message.type, "at": [str(position)], **_led(outcome, who, outcome.handling.get(number))}
+
+
+def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, Any]:
+    """What led to the fault, where it is, and the values of the variables there."""
+    where = fault.position
+    return {
+        "file": where.file,
+        "line": where.line,
+        "column": where.column,
+        "text": fault.text,
+        "values": dict(fault.values),
+        "at": [str(where)],
+        **_led(outcome, who),
+    }
+
+
+def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, Any]:
+    """What led to the verdict, and where its property is written."""
+    return {
+        "property": verdict.property,
+        "logic": verdict.logic,
+        "category": verdict.category,
+        **({"binding": dict(verdict.binding)} if verdict.binding else {}),
+        "at": [str(verdict.source.origin)],
+        **_led(outcome, who),
+        **why_of(verdict, who),
+    }
+
+
+def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str, Any]:
+    """Events, or the timer; conditions that were met, with what they compared; the verdict in whose handler it is."""
+    return {
+        "events": list(outcome.events),
+        **({"timer": outcome.timer} if outcome.timer is not None else {}),
+        **({"conditions": outcome.conditions} if outcome.looked else {}),
+        **({"handler": named(handled), **why_of(handled, who)} if handled is not None else {}),
+    }
+
+
+def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
+    """`why` of a verdict; nothing where it was not asked or is not known."""
     why = verdict.why
     if why is None:
         return {}
@@ -31,17 +98,12 @@ def explained(verdict: Verdict, who: Callable[[int], Mapping[str, str]]) -> dict
     return {"why": said}
 
 
-def conditions(outcome: Outcome) -> dict[str, Any]:
-    """`conditions` that were met, with the values that they compared."""
-    return {"conditions": outcome.conditions} if outcome.looked else {}
-
-
 def moment(time_ns: int) -> str:
     """A time in UTC, with microseconds."""
     return datetime.datetime.fromtimestamp(time_ns / 1e9, datetime.UTC).isoformat(timespec="microseconds")
 
 
-def _event(verdict: Verdict, one: Happened, who: Callable[[int], Mapping[str, str]]) -> dict[str, Any]:
+def _event(verdict: Verdict, one: Happened, who: Who) -> dict[str, Any]:
     event: dict[str, Any] = {"event": verdict.source.events[one.event], "time": moment(one.time)}
     event |= {"state": one.state} if one.state else {}
     event |= who(one.sender.source) if one.sender.source else {}

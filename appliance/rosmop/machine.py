@@ -130,7 +130,7 @@ class Machine:
         return function(*arguments)
 
     def function(self, name: str | int) -> Call:
-        """An exported function of integers, for who calls it often; see `call`."""
+        """An exported function of integers, to be called often; see `call`."""
         try:
             return self._functions[name]
         except KeyError:
@@ -283,7 +283,7 @@ def _bound(store: _Store, export: _Export) -> Call | None:
 
 
 def _kinds(vector: Any) -> list[Any]:
-    """Of values; None for one that is no integer."""
+    """The kinds of values; None for one that is no integer."""
     found = vector.contents
     return [_KINDS.get(load().wasm_valtype_kind(found.data[number])) for number in range(found.size)]
 

@@ -99,7 +99,7 @@ class Monitor:
     slices: Slices | None = None
     """Of a parametric specification: its states. `properties` have the runs of the one that was looked at last."""
     slice: Slice | None = None
-    """That one."""
+    """The slice that was looked at last."""
     trail: deque[Bound] = field(default_factory=partial(deque, maxlen=TRAIL))
     """Of a parametric specification: what happened last in all slices."""
 

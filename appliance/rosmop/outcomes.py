@@ -14,6 +14,9 @@ from appliance.rosmop.why import Explanation
 
 Result = Literal["passed", "changed", "dropped"]
 
+DROPPED = -1
+"""The place of the drop in `Outcome.handling`."""
+
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
@@ -42,6 +45,12 @@ class Fault:
     values: Mapping[str, object]
 
 
+def named(verdict: Verdict) -> str:
+    """Which property of which monitor, with its binding, and the category that it is in."""
+    name = f"property {verdict.property + 1} of {verdict.monitor} ({verdict.logic}){bound(verdict)}"
+    return f"{name}: {verdict.category}"
+
+
 def bound(verdict: Verdict) -> str:
     """The binding as text that goes on from the name of the property; empty without parameters."""
     if not verdict.binding:
@@ -62,11 +71,12 @@ class Outcome:
     result is `changed`, and stand at `changed_at`. An event that happened without a change, or assigned what was there,
     is not among them.
     `dropped_by` is the specification that dropped it: by its last event, by `fatal` (a fault that dropped it), or for
-    `reason` (it is held, or could not begin).
+    `reason` (it is held, or could not begin); `dropped_at` is where the statement, the action or the specification
+    stands. `handling` has the verdicts in whose handlers the message was dropped (under `DROPPED`) and messages were
+    published (under their places in `published`).
 
     `looked` are the conditions that were met on the way, by their sites, with the values that they compared: each
-    `when` of an event that happened, each `if` around a statement that dropped the message. `cause` is the site of that
-    statement, or None.
+    `when` of an event that happened, each `if` around a statement that dropped or changed the message, or published.
 
     `overwritten` is, of a dropped message, what stood in the buffer that came in where actions have written into it
     (place and bytes, in order): `restore` puts it back.
@@ -88,8 +98,9 @@ class Outcome:
     changed_at: Sequence[Position] = ()
     dropped_by: str = ""
     fatal: Fault | None = None
+    dropped_at: Position | None = None
+    handling: Mapping[int, Verdict] = MappingProxyType({})
     looked: Mapping[int, tuple[Any, ...]] = MappingProxyType({})
-    cause: int | None = None
     sites: Sequence[Site] = ()
     overwritten: Sequence[tuple[int, bytes]] = ()
 
@@ -112,11 +123,6 @@ class Outcome:
             }
             for site, values in ((self.sites[number], values) for number, values in self.looked.items())
         }
-
-    @property
-    def statement(self) -> Position | None:
-        """Where the statement stands that dropped the message."""
-        return None if self.cause is None else self.sites[self.cause].position
 
     def __repr__(self) -> str:
         told = {name: value for name, value in vars(self).items() if name != "buffer"}

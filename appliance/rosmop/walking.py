@@ -65,8 +65,8 @@ class Walked(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """What holds for all walks of a topic until the engine, or somebody else, has done something: who sends the
-    messages; bits of `told` (and whether no message may be changed) and of `enabled`, as the module takes them.
+    """What holds for all walks of a topic until the engine, or anything else, has done something: the sender of
+    the messages; bits of `told` (and whether no message may be changed) and of `enabled`, as the module takes them.
     """
 
     source: int
@@ -75,7 +75,7 @@ class Prepared(NamedTuple):
 
 
 class Due(Protocol):
-    """Who knows when the next tick or deadline is due (ns; None: nothing is waited for)."""
+    """Says when the next tick or deadline is due (ns; None: nothing is waited for)."""
 
     def __call__(self, *, anew: bool) -> int | None:
         """`anew`: find out, as there may be an earlier deadline."""
@@ -113,7 +113,7 @@ class Home:
         """For whom the module was prepared last, with the state in its memory; None where that is with Python."""
 
     def prepare(self, prepared: Prepared) -> None:
-        """Take the state into the module, and say who sends what comes now."""
+        """Take the state into the module, and name the sender of what comes now."""
         if not self._inside:
             self._enter()
         self.prepared = prepared

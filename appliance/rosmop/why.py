@@ -8,8 +8,9 @@ Theory of operation:
    the way, it need not be forgotten either. The module keeps the same, in the same place.
 2. Of the others (`Steps`; with a clock `ClockedSteps`, which the module keeps, too) the last events are kept, and the
    run as it was before them. Where they give the verdict to a run that begins anew they explain it alone; where not,
-   only to the run as it was before them, and that is said (`Explanation.since`), or, where a run cannot be copied,
-   nothing.
+   only to the run as it was before them, and that is said (`Explanation.since`). A run about the future cannot be
+   copied; of it more events are kept, and it knows at which of them the formula is what was told: from there on they
+   are enough, unless the formula looks back, too. Where they are not, nothing explains it.
 3. Of a parametric specification the last `TRAIL` events are kept with what they bound; those of the slice explain its
    verdict alone, or nothing does.
 4. An explanation is found by trying: what is named has given the verdict.
@@ -21,6 +22,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from appliance.rosmop.logics.automaton import Automaton
+from appliance.rosmop.logics.bounded import BoundedRun
 from appliance.rosmop.logics.interface import (
     Categories,
     ClockedProperty,
@@ -36,6 +38,9 @@ TRAIL = 4096
 
 KEPT = 64
 """Of so many events, and as many more at most, what happened is kept where there are no tables."""
+
+FUTURE_KEPT = 1024
+"""The same of `mtl` about the future."""
 
 ENTRY = struct.Struct("<qqI4x")
 """How a state was left: time (ns); `Sender.source`, `Sender.kind` (from bit 24) and the event; `Sender.number`."""
@@ -197,6 +202,8 @@ def _shortest(automaton: Automaton, way: Sequence[Happened], category: str) -> S
 class Steps:
     """What happened last to a property without tables: at least `KEPT` steps, and the run before them."""
 
+    _run: Run | None = None
+
     def __init__(self, compiled: CompiledProperty, time_ns: int) -> None:
         self._compiled = compiled
         self.begin(time_ns)
@@ -234,11 +241,13 @@ class Steps:
         return self._steps, self._before
 
     def _make_room(self, run: Run) -> None:
-        if len(self._steps) == 2 * KEPT:
-            del self._steps[:KEPT]
+        self._run = run
+        kept = FUTURE_KEPT if isinstance(run, BoundedRun) else KEPT
+        if len(self._steps) == 2 * kept:
+            del self._steps[:kept]
             self._before = self._following
-        if len(self._steps) == KEPT:
-            self._following = copy.copy(run) if hasattr(run, "__copy__") else None
+        if len(self._steps) == kept:
+            self._following = None if isinstance(run, BoundedRun) else copy.copy(run)
 
     def explain(self, category: str) -> Explanation | None:
         """What made the last step's verdict; None where that cannot be said."""
@@ -247,11 +256,19 @@ class Steps:
             return None
         ended = steps[-1].time if steps[-1].event == _DEADLINE else None
         events = [one for one in steps if one.event != _DEADLINE]
-        for before in (None, earlier) if earlier is not None else (None,):
+        last = events[-1:] if ended is None else []
+        tries: list[tuple[Run | None, list[Happened]]] = [(None, events)]
+        if earlier is not None:
+            tries.append((earlier, events))
+        if isinstance(self._run, BoundedRun):
+            first = len(events) - 1 - (self._run.place - self._run.about(category))
+            if 0 <= first < len(events) - len(last):
+                tries = [(None, [events[first], *last]), (None, events[first:]), *tries]
+        for before, some in tries:
             tried = _Trial(self._compiled, before, self._started, category, ended)
-            if tried.gives(events):
+            if tried.gives(some):
                 since = steps[0].time if before is not None else None
-                return Explanation(*tried.fewest(events), since=since)
+                return Explanation(*tried.fewest(some), since=since)
         return None
 
 

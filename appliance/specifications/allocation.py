@@ -9,8 +9,8 @@ Invariants:
 1. A topic (a service) is carried by exactly one relay at any time, for all its publishers.
 2. What is carried stays where it is for as long as it can: a plan moves as few running monitors as possible, then as
    few topics and services that are carried now. Only then loads are evened out.
-3. In one plan no relay both gives up and gets monitored topics: who gets some can have their monitors before it carries
-   them, and who gives some up keeps its monitors until it carries them no longer.
+3. In one plan no relay both gives up and gets monitored topics: one that gets some has their monitors before it carries
+   them, and one that gives some up keeps their monitors until it carries them no longer.
 4. The allocation survives the death of control, as connections in the relays do.
 """
 

@@ -14,7 +14,7 @@ A reload takes what the folder has, and leaves what the folder does not have in 
 nobody's protection ends because a file is not where it was.
 
 Every change can be made on trial (`store/revisions.py`), and every revision is kept with the switches that it had last:
-whoever goes back to it has its monitors as they were.
+a rollback to it brings its monitors back as they were.
 
 What operators have seen has a tag, which is another after every revision, switch and resumption, and never comes back:
 a change that is meant for another tag than the present one is refused.
@@ -24,7 +24,6 @@ import asyncio
 import json
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -34,6 +33,7 @@ import structlog
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
+from appliance.channel.answers.monitors import Replaced
 from appliance.fingerprints import fingerprint_of_all
 from appliance.rosmop.engine import sharing
 from appliance.specifications.allocation import Allocation
@@ -74,27 +74,6 @@ class MonitorsChangedError(Exception):
             " look at them first"
         )
         self.tag = tag
-
-
-@dataclass(frozen=True, slots=True)
-class Replaced:
-    """What a load did: the revision in force, the one before, files added, changed and removed, the lint.
-
-    `moved` are monitors that began in their initial state because another relay process has them now, `began` all that
-    did: new ones, edited ones, and those whose messages have another definition. `kept` are files that a reload left in
-    force although the folder does not have them. It goes back by itself at `confirm_by` unless confirmed.
-    """
-
-    revision: int
-    replaced: int
-    added: list[str]
-    changed: list[str]
-    removed: list[str]
-    warnings: list[str]
-    moved: list[str]
-    began: list[str]
-    kept: list[str]
-    confirm_by: float | None
 
 
 class Kept(Sources, frozen=True):
@@ -225,7 +204,7 @@ class Monitors:
         return self._states.get(name) == TRIAL
 
     def began(self, names: Sequence[str]) -> list[str]:
-        """Those of these monitors that are in their initial state since the last change."""
+        """Which of these monitors are in their initial state since the last change."""
         return self._stating.began(names)
 
     def names(self) -> list[str]:
@@ -268,10 +247,7 @@ class Monitors:
             self._expect(expected)
             sources = self.sources.with_files(new)
             if self._row.who != _DISK and sources == self.sources:  # the same texts twice are one revision
-                warnings = list(self.checked.warnings)
-                return Replaced(
-                    self.revision, self.revision, [], [], [], warnings, [], [], [], self.confirm_by
-                )
+                return self._replaced(self.revision, ([], [], []))
             return await self._change(sources, who, who, note or "loaded", confirm_within)
 
     async def reload(
@@ -476,7 +452,7 @@ class Monitors:
     # --- inside ---
 
     def _states_of(self, checked: Checked) -> dict[str, Switch]:
-        """What these monitors are, or would be; whoever shares variables with one on trial is on trial, too."""
+        """What these monitors are, or would be; what shares variables with a monitor on trial is on trial, too."""
         named = self._named()
         states: dict[str, Switch] = {
             name: self._switches.get(name, self._enable == "all" or name in named)
@@ -568,20 +544,21 @@ class Monitors:
         await self._store.settled()
         await self._stating.all_taken()
         self._published()
-        added, changed, removed = sources.difference(previous)
         began = self._stating.began(checked.monitors)  # by those that have it only now, too
-        warnings = list(checked.warnings)
+        return self._replaced(before, sources.difference(previous), moved, began, kept)
+
+    def _replaced(
+        self,
+        before: int,
+        files: tuple[list[str], list[str], list[str]],
+        moved: Sequence[str] = (),
+        began: Sequence[str] = (),
+        kept: Sequence[str] = (),
+    ) -> Replaced:
+        """What a change did; `files` are those added, changed and removed."""
+        warnings = list(self.checked.warnings)
         return Replaced(
-            self.revision,
-            before,
-            added,
-            changed,
-            removed,
-            warnings,
-            moved,
-            began,
-            list(kept),
-            self.confirm_by,
+            self.revision, self.tag, before, *files, warnings, [*moved], [*began], [*kept], self.confirm_by
         )
 
     def _keep(

@@ -95,6 +95,6 @@ class MonitorRecords:
 
 
 def _monitors(event: MonitorEvent) -> set[str]:
-    """Whose doing it was."""
+    """The monitors that did it."""
     together = event.detail.get("changed_by", ())
     return {event.monitor, *(str(one).partition(".")[0] for one in together)}

@@ -66,6 +66,10 @@ class MonitorState(msgspec.Struct, frozen=True):
     missed: Annotated[
         int, told("messages that it was not given on trial, or not to the end: its counts are not complete")
     ] = 0
+    slices: Annotated[
+        int, told("bindings of its parameters that are monitored now; 0 of one without parameters")
+    ] = 0
+    slice_limit: Annotated[int, told("at most so many at a time; 0 of one without parameters")] = 0
     margins: Annotated[
         list[MonitorMargin], told("of its comparisons of numbers that came up, in the order of the text")
     ] = []
@@ -95,7 +99,12 @@ class Monitors(msgspec.Struct, frozen=True):
 
 
 class Replaced(msgspec.Struct, frozen=True):
-    """What a change of the specifications did; `replaced` is the revision before, `warnings` are lines."""
+    """What a change of the specifications did; `replaced` is the revision before, `warnings` are lines.
+
+    `moved` are monitors that began in their initial state because another relay process has them now, `began` all that
+    did: new ones, edited ones, and those whose messages have another definition. `kept` are files that a reload left in
+    force although the folder does not have them.
+    """
 
     revision: int
     tag: str

@@ -61,6 +61,7 @@ class PolicyState(msgspec.Struct, frozen=True):
     who: str
     differs_from_file: bool
     warnings: int
+    audit_only: Annotated[list[str], told("sections whose denials are recorded and pass")]
     confirm_by: Moment | None
 
 

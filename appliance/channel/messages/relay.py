@@ -432,7 +432,7 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     """The state and counters of one running monitor; counters since it was loaded or the relay started.
 
     Of one on `trial` drops and changes are what it would have done, since it is; `missed` are messages that it was not
-    given as others would be.
+    given as others would be. A parametric specification has so many `slices` now, and at most `slice_limit`.
     """
 
     name: str
@@ -448,6 +448,8 @@ class MonitorRow(msgspec.Struct, frozen=True, array_like=True):
     trial: bool = False
     missed: int = 0
     margins: list[MarginRow] = []
+    slices: int = 0
+    slice_limit: int = 0
 
 
 class MonitorsCounted(Message):

@@ -2,16 +2,23 @@
 
 from collections.abc import Iterable
 from contextlib import closing
-from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Column, Table
+from rich.table import Column
 
 from appliance.cli.monitor.bag import Recorded, open_bag, refusals
-from appliance.cli.monitor.input import read_definitions, read_specifications, usage_error
-from appliance.cli.output import Json, printable, say, say_json
+from appliance.cli.monitor.input import (
+    Bags,
+    Files,
+    Folders,
+    read_definitions,
+    read_specifications,
+    usage_error,
+)
+from appliance.cli.output import Json, refused, say, say_json
+from appliance.cli.tables import table_of
 from appliance.learning.coverage import Item, covered
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -20,17 +27,10 @@ _KINDS = ("event", "branch", "function", "handler", "state", "transition")
 
 
 def coverage(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="FILE…", help="Specifications (.rv)", show_default=False)
-    ],
+    files: Files,
     *,
-    bags: Annotated[
-        list[Path], typer.Option("--bag", metavar="FILE", help="A recording (repeatable)", show_default=False)
-    ],
-    msg: Annotated[
-        list[Path] | None,
-        typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
-    ] = None,
+    bags: Bags,
+    msg: Folders = None,
     fail_under: Annotated[
         float, typer.Option(min=0.0, max=100.0, metavar="PERCENT", help="Exit status 1 below it")
     ] = 0.0,
@@ -53,9 +53,7 @@ def coverage(
                     raise usage_error(f"{bag}: {text}")
         counts = covered(texts, definitions, recordings)
     except SpecificationError as error:
-        for finding in error.findings:
-            typer.echo(printable(str(finding)), err=True)
-        raise typer.Exit(1) from None
+        raise refused(error.findings) from None
     exercised = sum(count > 0 for count in counts.values())
     percent = 100 * exercised / len(counts) if counts else 100.0
     if as_json:
@@ -72,7 +70,7 @@ def coverage(
 
 def _show(counts: dict[Item, int]) -> None:
     columns = (Column(kind, justify="right") for kind in _KINDS)
-    table = Table("monitor", *columns, box=None, padding=(0, 2, 0, 0), header_style="dim")
+    table = table_of("monitor", *columns)
     for name in dict.fromkeys(item.specification for item in counts):
         own = [(item, count) for item, count in counts.items() if item.specification == name]
         table.add_row(name, *(_share(count for item, count in own if item.kind == kind) for kind in _KINDS))

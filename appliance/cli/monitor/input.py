@@ -4,6 +4,9 @@ import functools
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from appliance.cli import output
 from appliance.ros.definitions import Definitions
@@ -14,6 +17,16 @@ from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.specifications.files import Sources, signatures_of
 
 usage_error = functools.partial(output.usage_error, verb="rosrv monitor")
+Files = Annotated[
+    list[Path], typer.Argument(metavar="FILE…", help="Specifications (.rv)", show_default=False)
+]
+Folders = Annotated[
+    list[Path] | None,
+    typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
+]
+Bags = Annotated[
+    list[Path], typer.Option("--bag", metavar="FILE", help="A recording (repeatable)", show_default=False)
+]
 _NOT_UTF_8 = re.compile("[\udc80-\udcff]")
 _SAVE_AS_UTF_8 = "these bytes are no UTF-8; save the file as UTF-8"
 _STRING_CONSTANT = re.compile(r"\s*string\s+\w+\s*=")  # whose value goes to the end of the line

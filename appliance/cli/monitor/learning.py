@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from appliance.cli.monitor.bag import Recorded
-from appliance.cli.monitor.input import BESIDE, usage_error
+from appliance.cli.monitor.input import BESIDE, Bags, usage_error
 from appliance.cli.output import Json, counted, say, say_json
 from appliance.cli.progress import progress
 from appliance.learning.learner import LearningError, Learnt, learn
@@ -19,9 +19,7 @@ from appliance.ros.standard import standard_definitions
 
 
 def learn_monitors(
-    bags: Annotated[
-        list[Path], typer.Option("--bag", metavar="FILE", help="A recording (repeatable)", show_default=False)
-    ],
+    bags: Bags,
     topics: Annotated[
         list[str] | None,
         typer.Option("--topic", metavar="PATTERN", help="Only such topics, as /arm/* (repeatable)"),

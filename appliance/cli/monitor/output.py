@@ -5,7 +5,7 @@ from typing import Any
 
 from appliance.audit.why import lines_of_why
 from appliance.cli.output import say, say_json
-from appliance.rosmop.explained import explained as reasons
+from appliance.rosmop.explained import why_of
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.outcomes import Fault, Outcome, Verdict, bound
 from appliance.rosmop.positions import Finding
@@ -46,7 +46,7 @@ def record(outcome: Outcome, index: int | None = None, topic: str | None = None)
                 "logic": verdict.logic,
                 "category": verdict.category,
                 **({"binding": dict(verdict.binding)} if verdict.binding else {}),
-                **reasons(verdict, _place),
+                **why_of(verdict, _place),
             }
             for verdict in outcome.verdicts
         ],
@@ -71,7 +71,7 @@ def explained(monitor: Monitor) -> Iterator[str]:
 
 def because(verdict: Verdict) -> Iterator[str]:
     """Which messages of the recording made a verdict so."""
-    return lines_of_why(reasons(verdict, _place).get("why", {}))
+    return lines_of_why(why_of(verdict, _place).get("why", {}))
 
 
 def _place(source: int) -> dict[str, Any]:

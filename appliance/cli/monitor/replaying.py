@@ -1,6 +1,5 @@
 """`rosrv monitor replay`: what a monitor would have dropped and changed of recordings, where, and how often."""
 
-import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -9,19 +8,18 @@ from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import typer
-from rich.console import Console
-from rich.table import Column, Table
+from rich.table import Column
 from rosbags.rosbag1 import Reader
 
 from appliance.channel import admin
 from appliance.cli.monitor.bag import Replayed, definitions_of, open_bag, refusals, replay
-from appliance.cli.monitor.input import read_definitions, read_specifications, usage_error
+from appliance.cli.monitor.input import Folders, read_definitions, read_specifications, usage_error
 from appliance.cli.monitor.output import BILLION, because
 from appliance.cli.monitor.recorded import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
-from appliance.cli.monitor.running import WIDE
-from appliance.cli.output import Json, counted, printable, say, say_json
+from appliance.cli.output import Json, counted, refused, say, say_json
 from appliance.cli.progress import progress
 from appliance.cli.running import Appliance, speaks
+from appliance.cli.tables import say_table, table_of
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.engine import Margin, MonitorSet, sharing
@@ -81,10 +79,7 @@ def replay_monitor(
     margins: Annotated[
         bool, typer.Option("--margins", help="Also how close each comparison of numbers came (takes longer)")
     ] = False,
-    msg: Annotated[
-        list[Path] | None,
-        typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
-    ] = None,
+    msg: Folders = None,
     as_json: Json = False,
 ) -> None:
     """Say what a monitor would have dropped and changed of recordings, where, and how often.
@@ -120,9 +115,7 @@ def replay_monitor(
                     monitors.write_module()
                     messages += report.of(monitors, reader, piece, patterns)
     except SpecificationError as error:
-        for finding in error.findings:
-            typer.echo(printable(str(finding)), err=True)
-        raise typer.Exit(1) from None
+        raise refused(error.findings) from None
     if not as_json:
         report.show()
     report.show_margins(texts)
@@ -262,13 +255,12 @@ class _Report:
             )
             return
         heads = ("would drop", "would change", "verdicts", "warnings", "faults")
-        table = Table(
-            "monitor", Column("topic", overflow="fold"), *(Column(head, justify="right") for head in heads),
-            box=None, padding=(0, 2, 0, 0), header_style="dim",
-        )  # fmt: skip
+        table = table_of(
+            "monitor", Column("topic", overflow="fold"), *(Column(head, justify="right") for head in heads)
+        )
         for monitor, where in dict.fromkeys((monitor, where) for monitor, where, _kind in counts):
             table.add_row(monitor, where, *(str(counts[monitor, where, kind]) for kind in _KINDS))
-        Console(highlight=False, width=None if sys.stdout.isatty() else WIDE).print(table)
+        say_table(table)
 
 
 def _found(outcome: Outcome) -> Iterator[_Found]:

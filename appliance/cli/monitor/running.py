@@ -1,6 +1,5 @@
 """`rosrv monitor list|margins|enable|disable|load|remove|reload|resume`: the monitors of the running appliance."""
 
-import sys
 from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
@@ -8,8 +7,7 @@ from typing import Annotated
 import typer
 from msgspec import to_builtins
 from msgspec.structs import asdict
-from rich.console import Console
-from rich.table import Column, Table
+from rich.table import Column
 from rich.text import Text
 
 from appliance.channel import admin
@@ -18,10 +16,8 @@ from appliance.channel.answers.monitors import MonitorState, Replaced, Switched
 from appliance.cli import completion
 from appliance.cli.output import Json, counted, printable, say, say_json, usage_error
 from appliance.cli.running import Appliance, body_or_exit, speaks
+from appliance.cli.tables import say_table, table_of
 from appliance.cli.trials import ConfirmWithin, say_deadline, seconds_within
-
-WIDE = 200
-"""Columns where nobody looks at them through a window."""
 
 _Names = Annotated[
     list[str], typer.Argument(metavar="MONITOR…", show_default=False, autocompletion=completion.monitors)
@@ -41,16 +37,18 @@ def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
         return
     if body.refused:
         say(f"the relay does not take them: {body.refused[0]}", "red")
-    table = Table(
+    sliced = ("slices",) if any(row.slice_limit for row in body.monitors) else ()
+    table = table_of(
         "monitor", "state", Column("listens to", overflow="fold"), "events", "verdicts", "drops", "changes", "faults",
-        box=None, padding=(0, 2, 0, 0), header_style="dim",
+        *sliced,
     )  # fmt: skip
     for row in body.monitors:
         done = (f"({row.would_drop})", f"({row.would_change})") if row.trial else (row.drops, row.changes)
         counts = map(str, (row.events, row.verdicts, *done, row.faults))
-        table.add_row(row.name, _state(row), "\n".join(row.topics + row.services), *counts)
+        slices = (f"{row.slices} of {row.slice_limit}" if row.slice_limit else "",) if sliced else ()
+        table.add_row(row.name, _state(row), "\n".join(row.topics + row.services), *counts, *slices)
     if body.monitors:
-        Console(highlight=False, width=None if sys.stdout.isatty() else WIDE).print(table)
+        say_table(table)
     else:
         say("no monitor is loaded: rosrv monitor load FILE…")
     if any(row.trial for row in body.monitors):
@@ -92,10 +90,9 @@ def margins(
     if not found:
         say("no comparison of numbers has come up yet")
         return
-    table = Table(
-        "monitor", "line", Column("condition", overflow="fold"), "was", "today", "since load", "at",
-        box=None, padding=(0, 2, 0, 0), header_style="dim",
-    )  # fmt: skip
+    table = table_of(
+        "monitor", "line", Column("condition", overflow="fold"), "was", "today", "since load", "at"
+    )
     for row, margin in found:
         load, today = margin.since_load, margin.today
         table.add_row(
@@ -103,7 +100,7 @@ def margins(
             "-" if today is None else f"{today.distance:.6g}", f"{load.distance:.6g}",
             "-" if load.threshold_at is None else f"{load.threshold_at:.6g}",
         )  # fmt: skip
-    Console(highlight=False, width=None if sys.stdout.isatty() else WIDE).print(table)
+    say_table(table)
 
 
 @speaks

@@ -12,9 +12,9 @@ import typer
 from rosbags.rosbag1 import Reader
 
 from appliance.cli.monitor.bag import Recording, definitions_of, open_bag, refusals, replay
-from appliance.cli.monitor.input import read_definitions, read_specifications, usage_error
+from appliance.cli.monitor.input import Files, Folders, read_definitions, read_specifications, usage_error
 from appliance.cli.monitor.output import explained, lines, record, say_finding
-from appliance.cli.output import Json, counted, printable, say, say_json
+from appliance.cli.output import Json, counted, printable, refused, say, say_json
 from appliance.cli.progress import progress
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.certify.properties import certificates_of
@@ -30,21 +30,13 @@ app = typer.Typer(
     no_args_is_help=True,
 )
 
-_Files = Annotated[
-    list[Path], typer.Argument(metavar="FILE…", help="Specifications (.rv)", show_default=False)
-]
-_Folders = Annotated[
-    list[Path] | None,
-    typer.Option("--msg", metavar="DIR", help="A folder of message definitions (repeatable)"),
-]
-
 
 @app.command()
 def check(
-    files: _Files,
+    files: Files,
     *,
     as_json: Json = False,
-    msg: _Folders = None,
+    msg: Folders = None,
     prove: Annotated[
         bool,
         typer.Option(
@@ -93,14 +85,14 @@ def check(
 
 @app.command()
 def run(
-    files: _Files,
+    files: Files,
     *,
     bag: Annotated[Path, typer.Option(metavar="FILE", help="The recording", show_default=False)],
     as_json: Json = False,
     output: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write what subscribers would have received")
     ] = None,
-    msg: _Folders = None,
+    msg: Folders = None,
 ) -> None:
     """Give a recording to the monitors and report what came of every message, by the recording's clock.
 
@@ -110,9 +102,7 @@ def run(
         try:
             monitors = _load(files, msg or [], definitions_of(reader))
         except SpecificationError as error:
-            for finding in error.findings:
-                typer.echo(printable(str(finding)), err=True)
-            raise typer.Exit(1) from None
+            raise refused(error.findings) from None
         monitors.write_module()
         for text in refusals(monitors, reader):
             typer.echo(f"rosrv monitor: {printable(text)}; its messages are dropped", err=True)

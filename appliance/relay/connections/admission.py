@@ -66,7 +66,7 @@ def missing(table: StatedTable, key: str, host: str, fields: Mapping[str, str]) 
 def bound_name(table: StatedTable, key: str, host: str, fields: Mapping[str, str]) -> str | None:
     """The name under which a client may call a service: its own, which it has looked the service up by.
 
-    Who only probes calls nothing. The tools that do may have looked the service up by another name (roswtf probes as
+    A probe calls nothing. The tools that probe may have looked the service up by another name (roswtf probes as
     `/rosservice`): the service sees that one.
     """
     caller_id, service = fields["callerid"], fields["service"]

@@ -26,7 +26,7 @@ class Guest(Protocol):
 
 
 class Anteroom:
-    """Everybody who waits.
+    """The peers that wait.
 
     `standing(host)` says whether a host has a grant; `clock` is monotonic seconds; `headers` is what hosts hold of the
     memory for headers.
@@ -49,7 +49,7 @@ class Anteroom:
         self._waiting.put(guest, host, self._clock())
 
     def leave(self, guest: Guest) -> None:
-        """It waits no longer, if it did."""
+        """End the peer's waiting, if it waits."""
         self._waiting.remove(guest)
         self._with_long_headers.remove(guest)
         host, held = self._hosts.pop(guest, None), self._long.pop(guest, 0)
@@ -57,7 +57,7 @@ class Anteroom:
             self._headers.of(host).add(-held)
 
     def hold(self, guest: Guest, size: int) -> str:
-        """Its header has so many bytes by now; why that is too much, if it is."""
+        """Count the bytes that its header has by now; the reason if that is too much."""
         host, before = self._hosts[guest], self._long.get(guest, 0)
         more = max(0, size - _FREE) - before
         if more <= 0:

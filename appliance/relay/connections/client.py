@@ -47,7 +47,7 @@ class ServiceTraffic:
         self.changed = True
 
     def connected(self, change: int) -> None:
-        """So many clients more are connected."""
+        """Count so many clients more."""
         self.clients += change
         self.changed = True
 
@@ -226,7 +226,7 @@ class ServiceClient:
             self._guard(self._exchange.from_client, data)
 
     def _guard(self, feed: Callable[[bytes], None], data: bytes) -> None:
-        """Feed the exchange; whoever breaks the protocol loses the connection."""
+        """Feed the exchange; a peer that breaks the protocol loses its connection."""
         try:
             feed(data)
         except PeerError as error:

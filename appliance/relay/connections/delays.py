@@ -19,7 +19,7 @@ class Delays:
         self._seconds = 0.0
 
     def add(self, seconds: float, messages: int) -> None:
-        """So many messages became so late."""
+        """Count so many messages that became so late."""
         self._counts[bisect_left(DELAY_BOUNDS, seconds)] += messages
         self._seconds += seconds * messages
 

@@ -2,14 +2,14 @@
 
 With a monitor on its topic a publisher has a connection, and counts one subscriber, before the real one is there. A
 publisher that waits for its subscriber and then says one thing would say it to the monitor alone. So what it says
-first is kept for `SECONDS` and given to whoever comes in that time: a plain subscriber would have been connected when
-the publisher spoke.
+first is kept for `SECONDS` and given to every subscriber that comes in that time: in plain ROS it would have been
+connected when the publisher spoke.
 
 Invariants:
 - Of a stream nothing is kept: a publisher that still speaks `SPEECH` seconds after its first message goes on speaking,
-  and who comes gets what it says next, as in plain ROS. A command must not be carried out after it was meant.
+  and a new subscriber gets what it says next, as in plain ROS. A command must not be carried out after it was meant.
 - What is kept is without a gap up to the latest message, so a subscriber that gets it misses nothing after it.
-- Nobody gets it twice: who connects again under the same name in that time gets what comes then.
+- Nobody gets it twice: a subscriber that connects again under the same name in that time gets what comes then.
 """
 
 from appliance.relay.connections.frames import Batch
@@ -37,7 +37,7 @@ class FirstWords:
         self._given: set[str] = set()
 
     def over(self, now: float) -> bool:
-        """Whether everybody who was on the way has had the time to come."""
+        """Whether every subscriber that was on its way has had the time to come."""
         return now > self._until
 
     def add(self, batch: Batch, now: float) -> bool:

@@ -2,8 +2,8 @@
 
 A limit fills a store of messages and one of bytes, evenly, up to what it allows in `BURST` seconds (one message at
 least). A message passes while neither is empty, also if it is more than what is there; that is made up for by those
-after it. So whoever keeps to the limit loses nothing, a large message passes as well, and on average no more passes
-than is allowed.
+after it. So a publisher that keeps to the limit loses nothing, a large message passes as well, and on average no more
+passes than is allowed.
 
 What is beyond is dropped, never kept for later: nobody else waits for it.
 """
@@ -143,7 +143,7 @@ class PublicationFlow:
         return waiting
 
     def forget(self) -> None:
-        """Nothing waits any more."""
+        """Forget what waits."""
         if self._waiting is not None:
             self._share.add(-len(self._waiting.view))
             self._waiting = None

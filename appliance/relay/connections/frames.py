@@ -22,7 +22,7 @@ from appliance.relay.connections.memory import HostShare
 from appliance.ros.errors import LimitExceededError
 
 SMALL = 4 << 10
-"""So much of what is unfinished on a connection is never refused."""
+"""Bytes of what is unfinished on a connection that are never refused."""
 
 LARGE = 128 << 10
 SCRATCH = 512 << 10
@@ -173,7 +173,7 @@ class FrameReceiver:
         self._area, self._delivered, self._filled, self._torn = None, None, 0, b""
 
     def _count(self, size: int) -> None:
-        """So many bytes are held for this connection."""
+        """Count the bytes that are held for this connection."""
         if size != self._counted:
             self._share.add(size - self._counted)
             self._counted = size

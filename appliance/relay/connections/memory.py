@@ -2,7 +2,7 @@
 
 Four pools: what is not whole yet (frames, requests, replies), what waits for slow subscribers and clients, what is
 latched, and connection headers. Each is counted by host: what comes by its publisher's or service's (a request: its
-client's), what waits by that of whoever it waits for. A queue cannot take the memory that frames need.
+client's), what waits by that of the peer it waits for. A queue cannot take the memory that frames need.
 
 Invariants, besides those of `Pool`:
 
@@ -36,7 +36,7 @@ class HostShare:
         return self._pool.held(self._host)
 
     def add(self, size: int) -> None:
-        """So many bytes more of this host are there; fewer, where `size` is below 0."""
+        """Count so many bytes more of this host; fewer, where `size` is below 0."""
         if size > 0:
             self._pool.charge(self._host, size)
         elif size:
@@ -108,7 +108,7 @@ class Weight:
         self._size = 0
 
     def set(self, size: int) -> None:
-        """So many bytes now."""
+        """Say how many bytes there are now."""
         self.share.add(size - self._size)
         self._size = size
 
@@ -122,7 +122,7 @@ class Stall:
         self._since = 0.0
 
     def seen(self, held: int, now: float) -> bool:
-        """So much is held now (0: nothing is unfinished); whether it has been too long."""
+        """Say how much is held now (0: nothing is unfinished); whether it has been too long."""
         if not held or held != self._held:
             self._held, self._since = held, now
             return False

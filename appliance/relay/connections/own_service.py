@@ -29,7 +29,7 @@ _SECOND = 1.0
 
 @dataclass(slots=True)
 class _Call:
-    """The last call of a host: who waits for its answer, or what that was and until when it holds."""
+    """The last call of a host: the clients that wait for its answer, or the answer and until when it holds."""
 
     number: int
     waiting: list["OwnServer"] = field(default_factory=list)
@@ -38,7 +38,7 @@ class _Call:
 
 
 class OwnService:
-    """Who calls it, and what control answers. `send` tells control, if there is one."""
+    """Its clients, and what control answers. `send` tells control, if there is one."""
 
     def __init__(self, loop: Loop, send: Callable[[Message], None]) -> None:
         self._loop = loop

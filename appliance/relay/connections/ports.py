@@ -2,8 +2,8 @@
 
 Invariants:
 - There are never more than `connections` peers, nor more than `connections_per_host` of one host, nor more of
-  strangers together than is theirs (`RELAY_CONNECTIONS` of the table of shares), in whatever stage. Who is within
-  his share and finds no room is let in if `make_room` finds somebody who has to go.
+  strangers together than is theirs (`RELAY_CONNECTIONS` of the table of shares), in whatever stage. A peer within
+  its share that finds no room is let in if `make_room` finds another that has to go.
 - A flood of connections is accepted in slices, so that relayed messages go on between them; when the process
   has no descriptor left, listening pauses instead of spinning.
 """

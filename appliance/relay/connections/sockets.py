@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from appliance.relay.loop import HANGUP, READ, WRITE, Loop
 
-# Cubic is for whoever may choose it; every kernel lets an unprivileged process have reno. Where bbr is the default,
+# Not every process may choose cubic; every kernel lets an unprivileged one have reno. Where bbr is the default,
 # large messages over loopback and a bridge go at about half the rate of either.
 _CONGESTION = (b"cubic", b"reno")
 _KEEPALIVE = ((socket.TCP_KEEPIDLE, 60), (socket.TCP_KEEPINTVL, 10), (socket.TCP_KEEPCNT, 9))

@@ -160,7 +160,7 @@ class Subscriber:
             self._ended()
 
     def _cut_by(self, error: OSError, what: str) -> None:
-        """Who ends with messages unread resets the connection, and a write may notice before a read: its own end."""
+        """A node that ends with messages unread resets the connection; a write may notice its end before a read."""
         self.cut(
             "" if isinstance(error, BrokenPipeError | ConnectionResetError) else f"{what}: {error.strerror}"
         )

@@ -16,8 +16,9 @@ A topic that monitors want has its upstream without any subscriber, too. What th
 what subscribers get and what is latched. What monitors publish comes from no upstream and goes past them
 (`published`). What a new publisher says first is kept for those that are on their way (`first_words`).
 
-A latched message that the publisher's host has no memory for is passed on and not kept (`latch`). Who comes later
-gets it from the publisher, which is connected to anew when there is room again; the others get it once more.
+A latched message that the publisher's host has no memory for is passed on and not kept (`latch`). A later
+subscriber gets it from the publisher, which the relay connects to anew when there is room again; the others get it
+once more.
 
 When *all* subscribers are behind at the same moment, the publisher is not read until one has caught up, for at
 most `queue_grace`: a subscriber process that was descheduled for some milliseconds under a flood loses nothing,
@@ -42,7 +43,7 @@ class Member(Protocol):
     """A subscriber, as its topic sees it."""
 
     caller_id: str
-    """Who it says it is."""
+    """The caller id that it gives: a claim."""
 
     missed: bool
     """Whether its limit kept the last message from it."""
@@ -161,7 +162,7 @@ class RelayedTopic:
 
     @property
     def members(self) -> tuple[Member, ...]:
-        """Everybody who is connected for this topic."""
+        """All that are connected for this topic."""
         return self._waiting + self._served
 
     def join(self, member: Member) -> None:
@@ -197,7 +198,7 @@ class RelayedTopic:
             self.upstream.want()
 
     def look_away(self, look: Callable[[Batch], None]) -> None:
-        """Whoever looked has seen enough."""
+        """The look is over."""
         self._looks = tuple(other for other in self._looks if other != look)
         self._spare_unwanted()
 
@@ -418,7 +419,7 @@ class RelayedTopic:
             self._header = None
 
     def _announce(self) -> None:
-        """Tell the upstream who is served."""
+        """Tell the upstream which subscribers are served."""
         if self.upstream is not None and self._header is not None:
             names = frozenset(member.caller_id for member in self._served)
             self.upstream.announce(names, self._header.get("type", ""))

@@ -76,7 +76,7 @@ class Publisher:
             self.ask()
 
     def spare(self) -> None:
-        """Nobody is left; the connection is kept for a moment, for whoever comes back at once."""
+        """No subscriber is left; the connection is kept for a moment, for one that comes back at once."""
         self._wanted = False
         if self._linger is None:
             self._linger = self._loop.after(self._limits.linger, self._close_unwanted)
@@ -148,7 +148,7 @@ class Publisher:
             )
 
     def announce(self, names: frozenset[str], type_name: str) -> None:
-        """Who is served: the publishers of some types must see it by name."""
+        """The subscribers that are served: the publishers of some types must see them by name."""
         if self._socket is not None and looks_for_names(type_name):
             self._presences.want(names, self._address)
 

@@ -53,7 +53,7 @@ class Visitor:
         anteroom.enter(self, host)
 
     def take(self) -> socket.socket:
-        """Give the socket to whoever serves it."""
+        """Hand the socket over."""
         self._timer.cancel()
         self._anteroom.leave(self)
         return self._stream.take()

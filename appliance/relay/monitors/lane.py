@@ -56,10 +56,10 @@ class Monitors(Protocol):
     """What is told to control."""
 
     trials: Trials
-    """Those that are given copies."""
+    """The monitors on trial, which are given copies."""
 
     senders: Senders
-    """Who sends."""
+    """The senders, by number."""
 
     def now(self) -> int:
         """Nanoseconds."""

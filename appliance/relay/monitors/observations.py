@@ -4,7 +4,7 @@ Invariants:
 - Of each monitor, kind and distinction (the category of a verdict, the text of a log line) one event a second is
   told in full; the others of that second are one event with a count, whose detail is what they share. Nothing that
   happened is left out of the counts.
-- Each is told with who said the message: caller id and host, and which message of the publication it was.
+- Each is told with the sender of the message (caller id and host), and which message of the publication it was.
 - Distinctions are bounded (`_DISTINCT`); beyond, what happens is counted under the kind alone.
 - Counters follow the events that they count, and once a second those of which no event was told.
 - While there is no control, at most `_KEPT` events wait; how many more there were is said.
@@ -111,7 +111,7 @@ class Observations:
         distinction: str = "",
         shared: Mapping[str, Any] = _NOTHING,
     ) -> None:
-        """So many more happened at `place`, the last at this time; they are told as a count."""
+        """Count so many more at `place`, the last at this time; they are told as a count."""
         key = self._known(kind, monitor, place, distinction, shared)
         self._said(key, place)
         self._told[key] = self._told.get(key, 0) + count
@@ -154,7 +154,7 @@ class Observations:
         )
 
     def _said(self, key: _Key, place: Place) -> None:
-        """Who said it; of several clients of a host no one is named in the count."""
+        """The sender; of several clients of a host none is named in the count."""
         if self._callers.setdefault(key, place.caller_id) != place.caller_id:
             self._callers[key] = ""
 
@@ -189,7 +189,7 @@ class Observations:
             events = [self._waiting.popleft() for _ in range(min(_AT_ONCE, len(self._waiting)))]
             self._reporter.send(MonitorsReported(events, self._lost))
             self._lost = 0
-        self.tell_counters()  # who reads of a drop finds it counted
+        self.tell_counters()  # a drop that was told is counted, too
 
     def tell_counters(self) -> None:
         """Send the counters that have changed."""

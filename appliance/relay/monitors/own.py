@@ -44,7 +44,7 @@ class OwnPublisher:
             self._topic.upstream_opened(header)
 
     def publish(self, data: bytes) -> None:
-        """A monitor publishes: to whoever subscribes now."""
+        """A monitor publishes: to those that subscribe now."""
         if self._current is not None:
             self._topic.published(Batch(memoryview(encode_frame(data)), 1, 0, owned=True))
 

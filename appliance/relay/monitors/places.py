@@ -16,7 +16,7 @@ _SENDERS = 4096
 
 
 class Place(NamedTuple):
-    """A topic or service of an incarnation, and who says what is seen there: publisher, client or server."""
+    """A topic or service of an incarnation, and the sender of what is seen there: publisher, client or server."""
 
     key: str
     resource: str
@@ -29,7 +29,7 @@ NOWHERE = Place("", "")
 
 
 class Senders:
-    """Numbers for places, that monitors keep to say later who sent what; the latest `_SENDERS` are known."""
+    """Numbers for places, by which monitors tell later what came from where; the latest `_SENDERS` are known."""
 
     def __init__(self) -> None:
         self._places: OrderedDict[int, Place] = OrderedDict()
@@ -71,7 +71,7 @@ class Sighting:
         return Sighting(None, number, self._head)
 
     def sender(self, source: int) -> Sender:
-        """Who sent it, and its seq if it has a header."""
+        """The sender, and the message's seq if it has a header."""
         if len(self._head) == HEAD:
             return Sender(source, _HEADER.unpack(self._head)[0], SEQ)
         return Sender(source)

@@ -1,8 +1,8 @@
 """What monitors did, counted and put into words for control: from outcomes to `observations`.
 
-Who did it is exact: a drop is the monitor's that dropped the message, a change is that of each monitor whose action
-made its bytes others. A change that several made is one record, under the last of them, that names all; it counts once
-for each of them, and once for the topic.
+A drop is told of the monitor that dropped the message, a change of each monitor whose action changed its bytes. A
+change that several made is one record, under the last of them, that names all; it counts once for each of them, and
+once for the topic.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -13,9 +13,9 @@ from appliance.relay.counts import Counts
 from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.places import NOWHERE, Place, Senders, Sighting
-from appliance.rosmop.explained import conditions, explained
+from appliance.rosmop.explained import of_change, of_drop, of_fault, of_published, of_verdict
 from appliance.rosmop.monitor import Monitor
-from appliance.rosmop.outcomes import Outcome, Verdict, bound
+from appliance.rosmop.outcomes import Outcome, Verdict, bound, named
 from appliance.rosmop.runtime.context import Published
 
 _EXPLAINED = 10
@@ -108,14 +108,14 @@ class Telling:
                 detail={"level": line.level},
                 sighting=sighting,
             )
-        for published in outcome.published:
+        for number, published in enumerate(outcome.published):
             self._observations.note(
                 f"{self._prefix}publish",
                 published.monitor,
                 place._replace(key="", resource=published.topic),
                 outcome.time,
                 f"{published.type} on {published.topic}",
-                detail={"type": published.type, "events": list(outcome.events), "because_of": place.resource},
+                detail={"because_of": place.resource, **of_published(outcome, number, self._who)},
                 sighting=sighting,
                 after=published.data[:SHOWN],
                 size=len(published.data),
@@ -141,12 +141,7 @@ class Telling:
             f"{' and '.join(monitors)} changed a message",
             distinction=", ".join(together),
             shared={"changed_by": together} if together else {},
-            detail={
-                "events": list(outcome.events),
-                "changed_by": list(outcome.changed_by),
-                "at": [str(one) for one in outcome.changed_at],
-                **conditions(outcome),
-            },
+            detail=of_change(outcome, self._who),
             before=before,
             after=bytes(outcome.buffer[:SHOWN]),
             size=size,
@@ -164,11 +159,7 @@ class Telling:
             place,
             outcome.time,
             outcome.reason or _why(outcome),
-            detail={
-                "events": list(outcome.events),
-                **({"at": [str(outcome.statement)]} if outcome.statement is not None else {}),
-                **conditions(outcome),
-            },
+            detail=of_drop(outcome, self._who),
             before=bytes(body[:SHOWN]),
             size=len(body),
             sighting=sighting,
@@ -252,7 +243,7 @@ class Telling:
         return [self._row(monitor, time) for monitor in monitors]
 
     def _row(self, monitor: Monitor, time: int) -> MonitorRow:
-        counters = self._counter(monitor.name)
+        counters, slices = self._counter(monitor.name), monitor.slices
         return MonitorRow(
             monitor.name,
             monitor.code.file,
@@ -267,29 +258,21 @@ class Telling:
             bool(self._prefix),
             counters.missed,
             self._margins.rows(monitor.name, time),
+            slices.live if slices is not None else 0,
+            slices.limit if slices is not None else 0,
         )
 
     def _verdicts(self, outcome: Outcome, place: Place, sighting: Sighting | None) -> None:
         for verdict in outcome.verdicts:
             self._counter(verdict.monitor).verdicts += 1
-            name = f"property {verdict.property + 1} of {verdict.monitor} ({verdict.logic}){bound(verdict)}"
             self._observations.note(
                 f"{self._prefix}verdict",
                 verdict.monitor,
                 place,
                 outcome.time,
-                f"{name}: {verdict.category}",
+                named(verdict),
                 distinction=_which(verdict),
-                detail={
-                    "property": verdict.property,
-                    "logic": verdict.logic,
-                    "category": verdict.category,
-                    **({"binding": verdict.binding} if verdict.binding else {}),
-                    "events": list(outcome.events),
-                    "at": [str(verdict.source.origin)],
-                    **conditions(outcome),
-                    **explained(verdict, self._who),
-                },
+                detail=of_verdict(outcome, verdict, self._who),
                 after=bytes(outcome.buffer[:SHOWN]),
                 size=len(outcome.buffer),
                 sighting=sighting,
@@ -305,14 +288,7 @@ class Telling:
                 outcome.time,
                 f"{where}: {fault.text}",
                 distinction=str(where),
-                detail={
-                    "file": where.file,
-                    "line": where.line,
-                    "column": where.column,
-                    "text": fault.text,
-                    "values": dict(fault.values),
-                    "events": list(outcome.events),
-                },
+                detail=of_fault(outcome, fault, self._who),
                 after=bytes(outcome.buffer[:SHOWN]),
                 size=len(outcome.buffer),
                 sighting=sighting,

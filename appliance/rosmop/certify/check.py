@@ -39,7 +39,7 @@ class Tables:
     table: Sequence[Sequence[int]]
     verdicts: Sequence[Verdicts]
     timeouts: Sequence[tuple[int, int] | None] = ()
-    """Of each state of a `tfsm`: after how many nanoseconds it is left, and for which one."""
+    """For each state of a `tfsm`: after how many nanoseconds it is left, and for which state."""
 
 
 @dataclass(frozen=True)

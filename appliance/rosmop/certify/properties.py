@@ -22,7 +22,7 @@ def certificate_of(compiled: CompiledProperty) -> Certificate:
 
 
 def certificates_of(monitors: Iterable[Monitor]) -> tuple[dict[str, list[str]], list[Finding]]:
-    """Of each monitor a line for each of its properties; and an error for each whose automaton is wrong."""
+    """For each monitor a line on each of its properties; and an error for each property whose automaton is wrong."""
     lines: dict[str, list[str]] = {}
     wrong: list[Finding] = []
     for monitor in monitors:

@@ -111,7 +111,7 @@ MTL = (
     {**_NOT, **{word: word for word in ("previously", "once", "historically")}},
     ({"since": "since"}, *_BOOLEAN),
 )
-"""Of a logic: what stands before its one operand, and what stands between two, from the tightest to the loosest."""
+"""The operators of a logic: those before one operand, and those between two, from the tightest to the loosest."""
 
 Grammar = tuple[Mapping[str, str], Sequence[Mapping[str, str]]]
 

@@ -2,15 +2,16 @@
 
 import re
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from appliance.rosmop.compile import calls, initializers, members, operators, storing, vector_members
 from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
 from appliance.rosmop.compile.margins import noted
 from appliance.rosmop.compile.places import CharacterPlace, Value, Variable, VariablePlace
 from appliance.rosmop.compile.provided import CONSTANTS
+from appliance.rosmop.compile.python import constant_of
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.interpreter import constant_of
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.runtime.context import FaultError
 from appliance.rosmop.runtime.numbers import f32
@@ -93,7 +94,7 @@ def _integer(scope: Scope, node: tree.Number, text: str, suffix: str) -> Value:
     raise SpecificationError.at(node.position, f"{shown(node.text)} is larger than any integer type holds")
 
 
-def folded(operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
+def folded(scope: Scope, operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
     """The value that `make` makes of the operands; if all are numbers that are known, so is what comes of them."""
     if not all(isinstance(operand.constant, int | float) for operand in operands):
         return make(*operands)
@@ -106,7 +107,7 @@ def folded(operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
     if not kinds.is_number(value.type):
         return value
     try:
-        constant = constant_of(value.form)
+        constant = constant_of(value.form, scope.values)
     except FaultError:
         return value
     return constant_value(value.position, value.type, constant)
@@ -115,25 +116,21 @@ def folded(operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
 # Each kind of expression
 
 
-def _number(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Number)  # so says the table at the end
+def _number(scope: Scope, node: tree.Number) -> Value:
     return literal_number(scope, node)
 
 
-def _text(scope: Scope, node: tree.Expression) -> Value:
+def _text(scope: Scope, node: tree.Text) -> Value:
     del scope
-    assert isinstance(node, tree.Text)
     return constant_value(node.position, kinds.STRING, node.value)
 
 
-def _character(scope: Scope, node: tree.Expression) -> Value:
+def _character(scope: Scope, node: tree.Character) -> Value:
     del scope
-    assert isinstance(node, tree.Character)
     return constant_value(node.position, kinds.CHAR, node.value)
 
 
-def _name(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Name)
+def _name(scope: Scope, node: tree.Name) -> Value:
     parts = node.parts
     if parts == ("MESSAGE",):
         return _message(scope, node)
@@ -180,8 +177,7 @@ def _message(scope: Scope, node: tree.Expression) -> Value:
     return Value(whole, node.position)
 
 
-def _unary(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Unary)
+def _unary(scope: Scope, node: tree.Unary) -> Value:
     if node.operator == "-" and isinstance(node.operand, tree.Number) and _is_beyond_long(node.operand):
         if int(node.operand.text) == -kinds.LONG.least:
             return constant_value(node.position, kinds.LONG, kinds.LONG.least)
@@ -190,13 +186,13 @@ def _unary(scope: Scope, node: tree.Expression) -> Value:
         )
     site = scope.site(node)
     return folded(
+        scope,
         (value_of(scope, node.operand),),
         lambda operand: operators.unary(node.operator, operand, node.position, site),
     )
 
 
-def _step(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Step)
+def _step(scope: Scope, node: tree.Step) -> Value:
     target = value_of(scope, node.target)
     storing.require_place(target, f"`{node.operator}`")
     if not target.pure:
@@ -211,10 +207,10 @@ def _step(scope: Scope, node: tree.Expression) -> Value:
     return Value(stored if node.prefix else before, node.position, pure=False)
 
 
-def _binary(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Binary)
+def _binary(scope: Scope, node: tree.Binary) -> Value:
     operands, site = (value_of(scope, node.left), value_of(scope, node.right)), scope.site(node)
     value = folded(
+        scope,
         operands,
         lambda left, right: operators.binary(
             node.operator, operators.Operands(scope, node.position, left, right, site)
@@ -223,8 +219,7 @@ def _binary(scope: Scope, node: tree.Expression) -> Value:
     return noted(scope, node, *operands, value)
 
 
-def _assign(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Assign)
+def _assign(scope: Scope, node: tree.Assign) -> Value:
     target, value = assignment(scope, node)
     return Value(storing.store(scope, target, value), node.position, owned=False, pure=False)
 
@@ -262,10 +257,9 @@ def _character_or_text(scope: Scope, node: tree.Expression) -> form.Expression:
     return convert(scope, value, kinds.STRING)
 
 
-def _conditional(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Conditional)
+def _conditional(scope: Scope, node: tree.Conditional) -> Value:
     values = tuple(value_of(scope, part) for part in (node.condition, node.yes, node.no))
-    return folded(values, lambda test, yes, no: _either(scope, node.position, test, yes, no))
+    return folded(scope, values, lambda test, yes, no: _either(scope, node.position, test, yes, no))
 
 
 def _either(scope: Scope, position: Position, tested: Value, yes: Value, no: Value) -> Value:
@@ -288,15 +282,13 @@ def _either(scope: Scope, position: Position, tested: Value, yes: Value, no: Val
     return Value(chosen, position, owned=yes.owned and no.owned, pure=pure)
 
 
-def _sequence(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Sequence)
+def _sequence(scope: Scope, node: tree.Sequence) -> Value:
     values = [value_of(scope, item) for item in node.items]
     all_of_them = form.Sequence(values[-1].type, tuple(value.form for value in values), -1)
     return Value(all_of_them, node.position, owned=values[-1].owned, pure=False)
 
 
-def _index(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Index)
+def _index(scope: Scope, node: tree.Index) -> Value:
     base, index = value_of(scope, node.base), value_of(scope, node.index)
     site = scope.site(node)
     if isinstance(base.type, kinds.Vector):
@@ -309,42 +301,37 @@ def _index(scope: Scope, node: tree.Expression) -> Value:
     raise SpecificationError.at(node.position, f"{base.type} has no elements")
 
 
-def _member(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Member)
+def _member(scope: Scope, node: tree.Member) -> Value:
     return members.field(scope, value_of(scope, node.base), node.name, node.position, scope.site(node))
 
 
-def _cast(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Cast)
+def _cast(scope: Scope, node: tree.Cast) -> Value:
     target = resolve(node.type, scope.messages)
     return folded(
+        scope,
         (value_of(scope, node.operand),),
         lambda value: Value(convert(scope, value, target), node.position, pure=value.pure),
     )
 
 
-def _call(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Call)
+def _call(scope: Scope, node: tree.Call) -> Value:
     return calls.call(scope, node, value_of)
 
 
-def _construct(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Construct)
+def _construct(scope: Scope, node: tree.Construct) -> Value:
     kind = resolve(node.type, scope.messages)
     if kinds.is_number(kind) and len(node.arguments) == 1:
         return _cast(scope, tree.Cast(node.position, node.type, node.arguments[0]))
     return calls.construct(scope, node.position, kind, node.arguments, value_of)
 
 
-def _new(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.NewCharacters)
+def _new(scope: Scope, node: tree.NewCharacters) -> Value:
     size = convert(scope, value_of(scope, node.size), kinds.ULONG)
     zeros = (size, form.Literal(kinds.CHAR, 0))
     return Value(form.Call(kinds.CHARACTERS, "e_repeat", zeros, scope.site(node)), node.position, pure=False)
 
 
-def _limit(scope: Scope, node: tree.Expression) -> Value:
-    assert isinstance(node, tree.Limit)
+def _limit(scope: Scope, node: tree.Limit) -> Value:
     kind = resolve(node.type, scope.messages)
     found = calls.limits_of(kind).get(node.name)
     if found is None:
@@ -359,7 +346,7 @@ def _elements(scope: Scope, node: tree.Expression) -> Value:
     )
 
 
-_KINDS: Mapping[type[tree.Expression], Callable[[Scope, tree.Expression], Value]] = {
+_KINDS: Mapping[type[tree.Expression], Callable[[Scope, Any], Value]] = {
     tree.Number: _number,
     tree.Text: _text,
     tree.Character: _character,

@@ -42,9 +42,8 @@ def weight(node: tree.Node) -> int:
     return total
 
 
-def write_while(scope: Scope, node: tree.Statement, write: Write) -> None:
+def write_while(scope: Scope, node: tree.While, write: Write) -> None:
     """`while` and `do … while`."""
-    assert isinstance(node, tree.While)  # so says the table in statements.py
     _enter(scope, node, Loop((lambda: _leave_unless(scope, node.condition)) if node.at_end else None))
     with scope.nested() as statements:
         charge(scope, node)
@@ -57,9 +56,8 @@ def write_while(scope: Scope, node: tree.Statement, write: Write) -> None:
     scope.loops.pop()
 
 
-def write_for(scope: Scope, node: tree.Statement, write: Write) -> None:
+def write_for(scope: Scope, node: tree.For, write: Write) -> None:
     """`for (start; condition; step)`."""
-    assert isinstance(node, tree.For)
     with scope.block():
         if node.start is not None:
             write(scope, node.start)
@@ -76,9 +74,8 @@ def write_for(scope: Scope, node: tree.Statement, write: Write) -> None:
         scope.loops.pop()
 
 
-def write_range_for(scope: Scope, node: tree.Statement, write: Write) -> None:
+def write_range_for(scope: Scope, node: tree.RangeFor, write: Write) -> None:
     """`for (type name : values)`."""
-    assert isinstance(node, tree.RangeFor)
     values = value_of(scope, node.values)
     if not isinstance(values.type, kinds.Vector | kinds.String):
         raise SpecificationError.at(values.position, f"{values.type} has no elements to go through")
@@ -136,9 +133,8 @@ def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type, 
     scope.declare(Variable(node.name, kind, index, node.position, alias=alias))
 
 
-def write_switch(scope: Scope, node: tree.Statement, write: Write) -> None:
+def write_switch(scope: Scope, node: tree.Switch, write: Write) -> None:
     """`switch`: the index of the first case, then every block from there on until a `break`."""
-    assert isinstance(node, tree.Switch)
     value = value_of(scope, node.value)
     kind = kinds.promoted(value.type)
     if not isinstance(kind, kinds.Integer):

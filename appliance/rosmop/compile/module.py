@@ -1,11 +1,13 @@
 """The Python module that is being generated: its lines, the names it may use, and the sites faults are told by."""
 
 import struct
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from appliance.rosmop.positions import Position
+from appliance.rosmop.runtime.context import FaultError
 
 FILENAME = "<compiled specification>"
 MAX_LINES = 200_000
@@ -84,9 +86,17 @@ class Module:
         """The number of the line that is added next."""
         return len(self._lines) + 1
 
-    def site_of_line(self, number: int) -> int:
-        """The site of a line of the source, counted from 1."""
-        return self._line_sites[number - 1] if 0 < number <= len(self._line_sites) else -1
+    def place_of(self, error: Exception) -> tuple[int, Mapping[str, Any]]:
+        """The site that an exception of the code belongs to (-1: none), and the local variables there."""
+        frames = list(_frames(error))
+        line, variables = frames[-1] if frames else (0, {})
+        if isinstance(error, FaultError) and error.site >= 0:
+            return error.site, variables
+        return self._line_sites[line - 1] if line else -1, variables
+
+    def has_begun(self, line: int, error: Exception) -> bool:
+        """Whether the function of the code that was called had come to this line when the exception came."""
+        return next((at >= line for at, _ in _frames(error)), False)
 
     @property
     def source(self) -> str:
@@ -103,6 +113,13 @@ class Module:
             raise TooComplexError(str(error)) from None
         exec(code, self.namespace)  # noqa: S102  our own code: see the head of this package
         return self.namespace
+
+
+def _frames(error: Exception) -> Iterator[tuple[int, Mapping[str, Any]]]:
+    """The lines of the code that an exception has come through, from the outermost, with their local variables."""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        if frame.f_code.co_filename == FILENAME:
+            yield line, frame.f_locals
 
 
 class Lines:

@@ -9,7 +9,6 @@ from appliance.rosmop.compile.conversion import (
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.interpreter import SHORT
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
@@ -106,7 +105,9 @@ def _texts(operator: str, operands: Operands) -> Value:
     if not (isinstance(left.type, _TEXTS) and isinstance(right.type, _TEXTS)):
         raise operands.refused(operator, _text_hint(left, right))
     one, other = (convert(operands.scope, value, kinds.STRING) for value in (left, right))
-    short = any(isinstance(value.constant, bytes) and len(value.constant) <= SHORT for value in (left, right))
+    short = any(
+        isinstance(value.constant, bytes) and len(value.constant) <= form.SHORT for value in (left, right)
+    )
     return operands.value(form.CompareTexts(operator, one, other, short, operands.site))
 
 

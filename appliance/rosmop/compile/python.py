@@ -7,7 +7,6 @@ from typing import Any
 from appliance.rosmop.compile.module import Lines, Module
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.functions import CHARGING, FAULTING, FUNCTIONS
-from appliance.rosmop.ir.interpreter import CHARGED, SHORT
 from appliance.rosmop.ir.values import BILLION, Values, struct_code, struct_size, zero_of
 from appliance.rosmop.runtime import numbers, output, times, vectors, wire
 from appliance.rosmop.runtime.context import MAX_CALLS, FaultError
@@ -86,14 +85,19 @@ class Printer:
         self._module = module
         self._values = values
         self._context = context
-        self._drops = 0
-        self._is_event = False
+        self._acts = 0
+        self._flags: frozenset[str] = frozenset()
 
     def function(self, function: form.Function) -> int:
         """Add a function to the module; returns the line at which its event happens, 0 if it is none's."""
         lines = Lines()
         happens = 0
-        self._is_event = function.happens is not None
+        self._flags = frozenset(
+            write.flag
+            for one in function.body
+            if isinstance(one, form.WriteBack | form.Pending)
+            for write in one.writes
+        )
         for index, statement in enumerate(function.body):
             if index == function.happens:
                 happens = len(lines.lines)
@@ -128,6 +132,7 @@ class Printer:
     def _evaluate(self, lines: Lines, node: form.Evaluate) -> None:
         value = node.value.value if isinstance(node.value, form.Discard) else node.value
         if isinstance(value, form.Assign):
+            self._acts += value.name in self._flags  # a field of the message gets another value
             lines.add(f"{value.name} = {self.text(value.value)}")
         elif isinstance(value, form.Call) and value.function == "a_slot":
             base, slot, new = map(self.text, value.arguments)
@@ -144,17 +149,16 @@ class Printer:
             self._branch(lines, node, node.no)
 
     def _branch(self, lines: Lines, node: form.If, statements: Sequence[form.Statement]) -> None:
-        """What drops the message can say which conditions led there."""
-        begins, drops = len(lines.lines), self._drops
+        """What drops or changes the message, or publishes one, can say which conditions led there."""
+        begins, acts = len(lines.lines), self._acts
         self._block(lines, statements)
-        if self._drops > drops:
-            there = "" if self._is_event else "if m is not None: "
-            line = f"{'    ' * (lines.depth + 1)}{there}{self._looked(node.site)}"
+        if self._acts > acts:
+            line = f"{'    ' * (lines.depth + 1)}{self._looked(node.site)}"
             lines.lines.insert(begins, (line, node.site))
 
     def _looked(self, site: int) -> str:
         values = "".join(f"{code}, " for _, code, _, _ in self._module.sites[site].compared)
-        return f"m.looked[{site}] = ({values})"
+        return f"{self._context}.turn.looked[{site}] = ({values})"
 
     def _loop(self, lines: Lines, node: form.Loop) -> None:
         lines.add("while True:")
@@ -190,7 +194,7 @@ class Printer:
 
     def _allocate(self, lines: Lines, node: form.Allocate) -> None:
         if node.size is None:
-            lines.add(f"if w_len(b) > {CHARGED}: {self._context}.allocate(w_len(b), {node.site})")
+            lines.add(f"if w_len(b) > {form.CHARGED}: {self._context}.allocate(w_len(b), {node.site})")
         else:
             lines.add(f"{self._context}.allocate({node.size}, {node.site})")
 
@@ -198,7 +202,7 @@ class Printer:
         lines.add(f"if n > {MAX_CALLS}: e_too_deep({node.site}, {node.name!r})")
 
     def _drop(self, lines: Lines, node: form.Drop) -> None:
-        self._drops += 1
+        self._acts += 1
         lines.add(f"{'' if node.anyway else 'if m is not None: '}m.dropped, m.cause = True, {node.site}")
 
     def _reset(self, lines: Lines, node: form.Reset) -> None:
@@ -206,6 +210,7 @@ class Printer:
         lines.add(f"{self._context}.turn.reset = True")
 
     def _publish(self, lines: Lines, node: form.Publish) -> None:
+        self._acts += 1
         lines.add(f"{node.name} = e_bytearray()")
         encoder = self._module.use(self._values.encoder(node.kind))
         lines.add(f"{encoder}({self.text(node.value)}, {node.name})")
@@ -314,6 +319,7 @@ class Printer:
         return node.name
 
     def _assign(self, node: form.Assign) -> str:
+        self._acts += node.name in self._flags
         return f"({node.name} := {self.text(node.value)})"
 
     def _convert(self, node: form.Convert) -> str:
@@ -391,7 +397,7 @@ class Printer:
         known = next((code for code in (right, left) if code.isidentifier()), None)
         if known is None:
             return f"({charged})"
-        return f"({left} {node.operator} {right} if l_len({known}) <= {SHORT} else {charged})"
+        return f"({left} {node.operator} {right} if l_len({known}) <= {form.SHORT} else {charged})"
 
     def _logical(self, node: form.Logical) -> str:
         return f"({self.text(node.left)} {node.operator} {self.text(node.right)})"
@@ -564,18 +570,14 @@ def wrapped(code: str, kind: kinds.Integer) -> str:
     return f"(({code} + {half} & {mask}) - {half})"
 
 
-def _methods(*names: str) -> Mapping[type[Any], Callable[..., Any]]:
-    """The kinds of nodes, each with the method that writes it: `AfterText` with `_after_text`."""
-    return {getattr(form, name.title().replace("_", "")): getattr(Printer, f"_{name}") for name in names}
+_EXPRESSIONS: Mapping[type[Any], Callable[[Printer, Any], str]] = form.methods_of(Printer, form.Expression)
+_STATEMENTS: Mapping[type[Any], Callable[[Printer, Lines, Any], None]] = form.methods_of(
+    Printer, form.Statement
+)
 
 
-_EXPRESSIONS: Mapping[type[Any], Callable[[Printer, Any], str]] = _methods(
-    "literal", "read", "assign", "convert", "arithmetic", "unary", "moment", "moment_of", "compare", "compare_texts",
-    "logical", "not", "conditional", "sequence", "discard", "item", "vector", "zero", "copy", "recast", "of_type",
-    "call", "accumulate", "invoke", "format", "join", "log", "throttle", "now", "whole",
-)  # fmt: skip
-_STATEMENTS: Mapping[type[Any], Callable[[Printer, Lines, Any], None]] = _methods(
-    "evaluate", "if", "loop", "for_each", "break", "continue", "select", "return", "leave", "charge", "allocate",
-    "limit_depth", "drop", "reset", "publish", "after_text", "count", "after_elements", "skip", "not_past",
-    "read_numbers", "read_value", "require", "pending", "write_back",
-)  # fmt: skip
+def constant_of(node: form.Expression, values: Values) -> bool | int | float:
+    """The value of an expression of numbers without variables. Raises `FaultError`."""
+    code = Printer(Module(), values, "").text(node)
+    value: bool | int | float = eval(code, {"__builtins__": {}, **NAMESPACE})  # noqa: S307  our own code, as in `Module.run`
+    return value

@@ -67,13 +67,13 @@ class SpecificationNames:
     variables: dict[str, Variable] = field(default_factory=dict)
     functions: dict[str, HelperFunction] = field(default_factory=dict)
     parameters: dict[str, Variable] = field(default_factory=dict)
-    """Those of the specification, in order; they are variables, too."""
+    """The parameters of the specification, in order; they are variables, too."""
     misdeclared: set[str] = field(default_factory=set)
     """Names of variables and functions whose declarations are refused: to use them is no further mistake."""
     uses: set[str] = field(default_factory=set)
     """The other specifications whose variables are used."""
     comparisons: dict[tree.Binary, Comparison] = field(default_factory=dict)
-    """Those that are noted."""
+    """The comparisons that are noted."""
 
 
 @dataclass(eq=False)

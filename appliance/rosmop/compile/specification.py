@@ -82,7 +82,7 @@ class SpecificationCode:
     uses: frozenset[str]
     """The other specifications whose variables it uses."""
     comparisons: tuple[Comparison, ...] = ()
-    """Those that are noted, in the order of the text."""
+    """The comparisons that are noted, in the order of the text."""
     slicing: Slicing | None = None
     """Of a parametric specification: what its slices differ in."""
 

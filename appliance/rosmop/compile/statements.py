@@ -5,6 +5,7 @@ A statement that is refused is noted and the next one is looked at, so that one 
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 from appliance.ros import names
 from appliance.rosmop.compile import calls, loops
@@ -40,8 +41,7 @@ def write(scope: Scope, node: tree.Statement) -> None:
 # Declarations
 
 
-def _declaration(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Declaration)  # so says the table at the end
+def _declaration(scope: Scope, node: tree.Declaration) -> None:
     try:
         _declare(scope, node)
     except SpecificationError:
@@ -172,8 +172,7 @@ def _array_size(scope: Scope, declarator: tree.Declarator) -> int | None:
 # Expressions and control
 
 
-def _evaluate(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Evaluate)
+def _evaluate(scope: Scope, node: tree.Evaluate) -> None:
     expression = node.expression
     level = calls.stream_of(expression)
     if level is not None:
@@ -187,15 +186,13 @@ def _evaluate(scope: Scope, node: tree.Statement) -> None:
         scope.evaluate(value_of(scope, expression).form)
 
 
-def _block(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Block)
+def _block(scope: Scope, node: tree.Block) -> None:
     with scope.block():
         for statement in node.statements:
             write(scope, statement)
 
 
-def _if(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.If)
+def _if(scope: Scope, node: tree.If) -> None:
     with scope.at(node.condition):
         test, site = condition(value_of(scope, node.condition)), scope.lines.site
     yes = loops.body(scope, [node.yes], write)
@@ -213,8 +210,7 @@ def _continue(scope: Scope, node: tree.Statement) -> None:
     loops.write_continue(scope, node.position)
 
 
-def _return(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Return)
+def _return(scope: Scope, node: tree.Return) -> None:
     if scope.role == "function":
         _return_value(scope, node)
         return
@@ -253,15 +249,13 @@ def _reset(scope: Scope, node: tree.Statement) -> None:
     scope.add(form.Reset(scope.lines.site))
 
 
-def _delete(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Delete)
+def _delete(scope: Scope, node: tree.Delete) -> None:
     value = value_of(scope, node.target)
     if not isinstance(value.type, kinds.Characters):
         raise SpecificationError.at(node.position, f"`delete` is for `char` buffers; {value.type} needs none")
 
 
-def _publish(scope: Scope, node: tree.Statement) -> None:
-    assert isinstance(node, tree.Publish)
+def _publish(scope: Scope, node: tree.Publish) -> None:
     check_topic(node.topic, node.position)
     kind = record(node.type_position, node.type, scope.messages)
     value = value_of(scope, node.value)
@@ -278,7 +272,7 @@ def check_topic(topic: str, position: Position) -> None:
         raise SpecificationError.at(position, f"{shown(topic)} is no global name{hint}")
 
 
-_KINDS: Mapping[type[tree.Statement], Callable[[Scope, tree.Statement], None]] = {
+_KINDS: Mapping[type[tree.Statement], Callable[[Scope, Any], None]] = {
     tree.Declaration: _declaration,
     tree.Evaluate: _evaluate,
     tree.Block: _block,

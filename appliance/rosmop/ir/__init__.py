@@ -1,7 +1,6 @@
 """The intermediate form of specifications, and what it means.
 
 `form.py` is the form: what a checked specification is reduced to. `functions.py` are the functions that it may call.
-`interpreter.py` runs it, plainly and slowly: that is what a specification means, and what every faster way of running
-one is held against. `module.py` writes what reads, calculates and patches as WebAssembly (`wasm.py` has the codes), and
+`module.py` writes what reads, calculates and patches as WebAssembly (`wasm.py` has the codes), and
 `feed.py` the walk over the messages of a read around it.
 """

@@ -7,7 +7,7 @@ Python.
 
 - A message is either done, with all that follows from it, or left, and then `Feed.undo` says how to take back what was
   begun. After a trap the message that is left begins at the number that stands at `POSITION`.
-- What holds for all messages stands at `Cells.source`: who sends them; of which events (bit N for the topic's event N)
+- What holds for all messages stands at `Cells.source`: their sender; of which events (bit N for the topic's event N)
   a drop is left, and with `LOUD` a change is (*told*); bits of the topic's specifications (*enabled*).
 - An effect is 16 bytes: a set of events (i64) that changed so many (i64) messages on end, or -1 and from where to
   where (i32, i32) frames were dropped.
@@ -224,7 +224,7 @@ class _Walk:
         self._sooner = self._following + 2
         clocked = sorted(properties.intersection(cells.clocks))
         self._clocks = {number: self._following + 3 + 3 * place for place, number in enumerate(clocked)}
-        """Of each property with a clock the locals for what stands at `Cells.clocks`, and its number of steps."""
+        """The locals of each property with a clock for what stands at `Cells.clocks`, and its number of steps."""
 
     def feed(self, name: str) -> Feed:
         """What is said about it."""
@@ -402,8 +402,8 @@ class _Walk:
         return store(I64, address, load(I64, address) + more + b"\xad\x7c")
 
     def _changed(self) -> bytes:
-        """Note who changed it. What several have changed may be as it was: that is left unless the first place that was
-        written has other bytes. (Blocks: dropped, done, the loop, out, left.)
+        """Note which events changed it. What several have changed may be as it was: that is left unless the first place
+        that was written has other bytes. (Blocks: dropped, done, the loop, out, left.)
         """
         entry = self._log
         size = (

@@ -17,10 +17,20 @@ Bounds: `Charge` and `Allocate` take from the budget of instructions and bytes, 
 something long; what exceeds them is a fault.
 """
 
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import UnionType
+from typing import Any, get_args
 
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
+
+CHARGED = 1024
+"""A message longer than this is charged when an array or all of it is decoded."""
+
+SHORT = 64
+"""To compare with a string of so many bytes takes no longer than any other instruction."""
 
 # Expressions
 
@@ -354,7 +364,7 @@ class If:
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """Again and again, until `Break`."""
+    """A loop that only `Break` ends."""
 
     site: int
     body: "tuple[Statement, ...]"
@@ -422,7 +432,7 @@ class Charge:
 
 @dataclass(frozen=True, slots=True)
 class Allocate:
-    """So many bytes are about to be made; None: as many as the message has, if they are many."""
+    """Charge for so many bytes that will be made; None: as many as the message has, if they are many."""
 
     site: int
     size: int | None
@@ -473,7 +483,7 @@ class Spot:
     offset: int
 
     def plus(self, more: int) -> "Spot":
-        """So many bytes further."""
+        """The position so many bytes further."""
         return Spot(self.base, self.offset + more)
 
 
@@ -680,3 +690,9 @@ class Component:
     properties: int
     topics: tuple[tuple[str, tuple[Event, ...]], ...]
     noted: tuple[str, ...] = ()
+
+
+def methods_of(walker: type, nodes: UnionType) -> Mapping[type[Any], Callable[..., Any]]:
+    """Which method of a class is for which kind of expression or statement (`nodes`): `_after_text` for `AfterText`."""
+    named = {kind: "_" + re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower() for kind in get_args(nodes)}
+    return {kind: getattr(walker, name) for kind, name in named.items() if hasattr(walker, name)}

@@ -25,7 +25,6 @@ from types import MappingProxyType
 from typing import Any
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.interpreter import CHARGED, SHORT
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.ir.wasm import (
     ABS,
@@ -95,8 +94,8 @@ class Cells:
     base: int
     properties: int
     source: int = 0
-    """Where it stands who sends what is looked at (`Sender.source` from bit 32 on), what is told, who is enabled: three
-    i64 (see `feed.py`).
+    """Where the sender of what is looked at stands (`Sender.source` from bit 32 on), what is told, and which are
+    enabled: three i64 (see `feed.py`).
     """
     noted: frozenset[str] = frozenset()
     exits: dict[int, int] = field(default_factory=dict)
@@ -134,7 +133,7 @@ class Written:
 
 
 class Writer:
-    """The functions that are needed, in the order of their numbers, and who has which place in the memory."""
+    """The functions that are needed, in the order of their numbers, and what stands where in the memory."""
 
     def __init__(
         self, functions: Mapping[str, form.Function], shared: Mapping[str, Cells], values: Values
@@ -287,7 +286,7 @@ class _Body:
     def _set(self, name: str, machine: int = I32) -> bytes:
         return b"\x21" + self._local(name, machine)
 
-    def _if(self, test: bytes, yes: Callable[[], bytes], no: Callable[[], bytes] | None = None) -> bytes:
+    def _when(self, test: bytes, yes: Callable[[], bytes], no: Callable[[], bytes] | None = None) -> bytes:
         self._depth += 1
         inner = yes() + (ELSE + no() if no is not None else b"")
         self._depth -= 1
@@ -327,27 +326,27 @@ class _Body:
             return b""
         if isinstance(value, form.Conditional) and value.type == kinds.VOID:
             yes, no = ((form.Evaluate(node.site, each),) for each in (value.yes, value.no))
-            return self._either(form.If(node.site, value.test, yes, no))
+            return self._if(form.If(node.site, value.test, yes, no))
         return self._value(value) + DROP
 
-    def _either(self, node: form.If) -> bytes:
+    def _if(self, node: form.If) -> bytes:
         test = self._value(node.test)
         self._depends = True
         no = (lambda: self._block(node.no)) if node.no else None
-        return self._if(test, lambda: self._block(node.yes), no)
+        return self._when(test, lambda: self._block(node.yes), no)
 
     def _loop(self, node: form.Loop) -> bytes:
         self._brief = False
         return self._repeated(b"", node.body)
 
     def _times(self, left: str, each: bytes, body: Sequence[form.Statement] = ()) -> bytes:
-        """So often as a local variable says, which counts down."""
+        """A loop that is run as often as a local variable says, which counts down."""
         over = self._get(left, I64) + b"\x50\x0d\x01"
         less = self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
         return self._repeated(over + less + each, body)
 
     def _repeated(self, before: bytes, body: Sequence[form.Statement]) -> bytes:
-        """Again and again; `before` may leave the outer of the two blocks."""
+        """A loop without end; `before` may leave the outer of the two blocks."""
         self._depth += 2
         self._loops.append(self._depth)
         code = before + self._block(body)
@@ -388,7 +387,7 @@ class _Body:
         for wanted, index in node.table:
             test = self._get(value, machine) + constant(machine, wanted) + bytes((COMPARE[machine]["=="],))
             chosen = constant(I32, index) + self._set(node.name)
-            code += self._if(test, lambda chosen=chosen: chosen)  # type: ignore[misc]  # the row of this turn
+            code += self._when(test, lambda chosen=chosen: chosen)  # type: ignore[misc]  # the row of this turn
         return code
 
     def _return(self, node: form.Return) -> bytes:
@@ -409,20 +408,20 @@ class _Body:
     def _spend(self, instructions: bytes) -> bytes:
         budget = self._writer.budget(self._context)
         left = self._cell(0x37, budget, self._cell(0x29, budget) + instructions + b"\x7d")
-        return left + self._if(self._cell(0x29, budget) + constant(I64, 0) + b"\x53", self._elsewhere)
+        return left + self._when(self._cell(0x29, budget) + constant(I64, 0) + b"\x53", self._elsewhere)
 
     def _allocate(self, node: form.Allocate) -> bytes:
         """Nothing is made here, but it costs the same."""
         if node.size is not None:
             return self._allocated(constant(I64, node.size))
-        many = self._get("size") + constant(I32, CHARGED) + b"\x4b"
-        return self._if(many, lambda: self._allocated(self._get("size") + b"\xad"))
+        many = self._get("size") + constant(I32, form.CHARGED) + b"\x4b"
+        return self._when(many, lambda: self._allocated(self._get("size") + b"\xad"))
 
     def _allocated(self, size: bytes) -> bytes:
-        """So many bytes (i64) would be made; elsewhere if what the specification holds is measured then."""
+        """Charge for so many bytes (i64) that would be made; elsewhere if what the specification holds is measured."""
         many = size + constant(I64, UNMEASURED) + b"\x56"
         spent = size + constant(I64, BYTES_PER_INSTRUCTION) + b"\x80"
-        return self._if(many, self._elsewhere) + self._spend(spent)
+        return self._when(many, self._elsewhere) + self._spend(spent)
 
     def _pending(self, node: form.Pending) -> bytes:
         """Only `Whole` asks for it."""
@@ -463,12 +462,12 @@ class _Body:
         table = constant(I32, self._writer.take(4 * MOST_TEXTS))
         code = self._count(form.Count(node.site, count, node.at, 4))
         many = self._get(count, I64) + constant(I64, MOST_TEXTS) + b"\x56"
-        code += self._if(many, self._elsewhere) + self._get(count, I64) + self._set(left, I64)
+        code += self._when(many, self._elsewhere) + self._get(count, I64) + self._set(left, I64)
         code += self._position(node.at.plus(4)) + self._set(node.end, I64) + table + self._set(entry)
         each = self._get(entry) + self._get("at") + self._get(node.end, I64) + b"\xa7\x6a\x36\x00\x00"
         each += self._after_text(form.AfterText(node.site, node.end, form.Spot(node.end, 0)))
         beyond = self._get(node.end, I64) + self._get("size") + b"\xad\x56"
-        each += self._if(beyond, self._elsewhere)
+        each += self._when(beyond, self._elsewhere)
         each += self._get(entry) + constant(I32, 4) + b"\x6a" + self._set(entry)
         return code + self._times(left, each) + table + self._set(f"place of {node.name}")
 
@@ -520,12 +519,12 @@ class _Body:
     def _require(self, node: form.Require) -> bytes:
         test, leave = self._value(node.test) + b"\x45", form.Leave(node.site, False)
         self._depends = True
-        return self._if(test, lambda: self._leave(leave))
+        return self._when(test, lambda: self._leave(leave))
 
     def _not_past(self, node: form.NotPast) -> bytes:
         past = self._get(node.count, I64) + constant(I64, node.index) + b"\x57"
         self._depends = True
-        return self._if(past, self._elsewhere)
+        return self._when(past, self._elsewhere)
 
     def _skip(self, node: form.Skip) -> bytes:
         count = constant(I64, node.count) if isinstance(node.count, int) else self._get(node.count, I64)
@@ -535,7 +534,7 @@ class _Body:
             code += self._spend(self._get(left, I64) + constant(I64, 1) + b"\x7c")
         else:
             many = self._get(left, I64) + constant(I64, FEW) + b"\x56"
-            code += self._if(many, lambda: self._spend(self._get(left, I64)))
+            code += self._when(many, lambda: self._spend(self._get(left, I64)))
         if node.skipper is None:
             end = self._after_text(form.AfterText(node.site, place, form.Spot(place, 0)))
         else:
@@ -563,7 +562,7 @@ class _Body:
     def _within(self, at: form.Spot, size: int) -> bytes:
         """A fault unless so many bytes of the message stand there."""
         short = self._get("size") + b"\xad" + self._position(at.plus(size)) + b"\x54"
-        return self._if(short, self._elsewhere)
+        return self._when(short, self._elsewhere)
 
     def _at(self, at: form.Spot, opcode: int) -> tuple[bytes, bytes]:
         """What stands before and in an access of the message at a position that is within it."""
@@ -593,7 +592,7 @@ class _Body:
         least = number + constant(I64, node.least) + b"\x7e"
         if not node.least:
             least, room = number, constant(I64, MAX_EMPTY)
-        return code + self._set(node.name, I64) + self._if(least + room + b"\x56", self._elsewhere)
+        return code + self._set(node.name, I64) + self._when(least + room + b"\x56", self._elsewhere)
 
     def _after_elements(self, node: form.AfterElements) -> bytes:
         count = constant(I64, node.count) if isinstance(node.count, int) else self._get(node.count, I64)
@@ -601,13 +600,13 @@ class _Body:
         return end + self._set(node.name, I64)
 
     def _write_back(self, node: form.WriteBack) -> bytes:
-        code = self._if(self._get("dropped"), lambda: self._leave(form.Leave(node.site, True)))
+        code = self._when(self._get("dropped"), lambda: self._leave(form.Leave(node.site, True)))
         for write in node.writes:
             if write.end is not None:
-                code += self._if(self._get(write.flag), self._elsewhere)
+                code += self._when(self._get(write.flag), self._elsewhere)
                 continue
             self._writes += 1
-            code += self._if(self._get(write.flag), partial(self._put_field, write))
+            code += self._when(self._get(write.flag), partial(self._put_field, write))
         return code
 
     def _put_field(self, write: form.Write) -> bytes:
@@ -620,7 +619,7 @@ class _Body:
         if machine in (F32, F64):
             kept = f"kept {machine}"
             none = self._get(kept, machine) + self._get(kept, machine) + bytes((COMPARE[machine]["!="],))
-            code = value + self._set(kept, machine) + self._if(none, self._elsewhere)
+            code = value + self._set(kept, machine) + self._when(none, self._elsewhere)
             value = self._get(kept, machine) + (b"\xbc" if machine == F32 else b"\xbd")
         elif len(codes) == 2:
             code, value = self._parts_of(write.value.type, value)
@@ -642,7 +641,7 @@ class _Body:
                 end + note + place + self._get(new, whole) + store + constant(I32, 1) + self._set("changed")
             )
 
-        return code + self._if(differs, put)
+        return code + self._when(differs, put)
 
     def _parts_of(self, kind: Type, moment: bytes) -> tuple[bytes, bytes]:
         """What divides nanoseconds into seconds and the rest; the two as they stand."""
@@ -738,7 +737,7 @@ class _Body:
         one, other = (f"{side} {machine} {len(self._locals)}" for side in ("dividend", "divisor"))
         code = left + self._set(one, machine) + right + self._set(other, machine)
         zero = self._get(other, machine) + (b"\x45" if machine == I32 else b"\x50")
-        code += self._if(zero, self._elsewhere)
+        code += self._when(zero, self._elsewhere)
         quotient = self._get(one, machine) + self._get(other, machine) + opcode
         if node.operator == "%" or not _is_signed(node.type):
             return code + quotient
@@ -778,7 +777,7 @@ class _Body:
             raise NotScalarError("std::string")
         assert isinstance(known.value, bytes)  # noqa: S101  a constant of strings
         first, place, count = self._elements(given)
-        if len(known.value) > SHORT:
+        if len(known.value) > form.SHORT:
             raise NotScalarError("std::string")
         same, at = constant(I32, 1), 0
         while at < len(known.value):
@@ -830,7 +829,7 @@ class _Body:
         last, now = self._cell(0x29, self._writer.throttle(self._context, node.site)), self._cell(0x29, NOW)
         until = last + b"\xb9" + seconds + constant(F64, 1e9) + b"\xa2\xa0\x9b\xfc\x06"
         waits = last + now + b"\x57" + now + until + b"\x53\x71"
-        return self._if(waits + b"\x45", self._elsewhere) + constant(I32, 0)
+        return self._when(waits + b"\x45", self._elsewhere) + constant(I32, 0)
 
     def _accumulate(self, node: form.Accumulate) -> bytes:
         kind, size = self._writer.element(node.vector.type)
@@ -841,7 +840,7 @@ class _Body:
         code += self._value(node.start) + self._set(total, machine_type(node.type))
         code += self._value(node.first) + self._set(left, I64) + self._value(node.last) + self._set(last, I64)
         outside = self._get(left, I64) + self._get(last, I64) + b"\x56" + self._get(last, I64) + count
-        code += self._if(outside + b"\x56\x72", self._elsewhere)
+        code += self._when(outside + b"\x56\x72", self._elsewhere)
         code += place + self._get(left, I64) + b"\xa7" + constant(I32, size) + b"\x6c\x6a" + self._set(at)
         code += self._get(last, I64) + self._get(left, I64) + b"\x7d" + self._set(left, I64)
         code += self._spend(self._get(left, I64))
@@ -872,7 +871,7 @@ class _Body:
         for name, value, most in zip(names, (seconds, nanoseconds), (1 << 32, 1 << 61), strict=True):
             code += value + self._set(name, I64)
             wide = self._get(name, I64) + constant(I64, most) + b"\x7c" + constant(I64, 2 * most) + b"\x56"
-            code += self._if(wide, self._elsewhere)
+            code += self._when(wide, self._elsewhere)
         return (
             code
             + self._get(names[0], I64)
@@ -888,7 +887,7 @@ class _Body:
         name = f"moment {len(self._locals)}"
         code += self._set(name, I64)
         for limit, opcode in ((least, b"\x53"), (most, b"\x55")):
-            code += self._if(self._get(name, I64) + constant(I64, limit) + opcode, self._elsewhere)
+            code += self._when(self._get(name, I64) + constant(I64, limit) + opcode, self._elsewhere)
         return code + self._get(name, I64)
 
     def _call(self, node: form.Call) -> bytes:
@@ -925,7 +924,7 @@ class _Body:
         first, place, count = self._elements(values)
         code = first + self._value(index) + self._set("index", I64)
         past = self._get("index", I64) + count + b"\x5a"
-        code += self._if(past, self._elsewhere)
+        code += self._when(past, self._elsewhere)
         return code + place + self._get("index", I64) + b"\xa7" + constant(I32, size) + b"\x6c\x6a"
 
     def _question(self, argument: form.Expression, operator: str) -> bytes:
@@ -955,7 +954,7 @@ class _Body:
         whole = self._get("whole", I64)
         code += value + constant(I64, BILLION) + b"\x81" + self._set("whole", I64)
         more = whole + constant(I64, BILLION) + b"\x7c" + self._set("whole", I64)
-        return code + self._if(whole + constant(I64, 0) + b"\x53", lambda: more) + whole
+        return code + self._when(whole + constant(I64, 0) + b"\x53", lambda: more) + whole
 
     def _seconds(self) -> bytes:
         rest = self._nanoseconds() + self._set("rest", I64)
@@ -1066,55 +1065,5 @@ _OF_MOMENTS: Mapping[str, Callable[[_Body], bytes]] = MappingProxyType(
     {"m_nsec": _Body._nanoseconds, "m_sec": _Body._seconds, "m_seconds": _Body._in_seconds}
 )
 
-_STATEMENTS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = MappingProxyType(
-    {
-        form.Evaluate: _Body._evaluate,
-        form.If: _Body._either,
-        form.Loop: _Body._loop,
-        form.Break: _Body._break,
-        form.Continue: _Body._continue,
-        form.Select: _Body._select,
-        form.Return: _Body._return,
-        form.Leave: _Body._leave,
-        form.ForEach: _Body._for_each,
-        form.Charge: _Body._charge,
-        form.Allocate: _Body._allocate,
-        form.Pending: _Body._pending,
-        form.Drop: _Body._drop,
-        form.Require: _Body._require,
-        form.NotPast: _Body._not_past,
-        form.Skip: _Body._skip,
-        form.AfterText: _Body._after_text,
-        form.Count: _Body._count,
-        form.AfterElements: _Body._after_elements,
-        form.ReadNumbers: _Body._read_numbers,
-        form.ReadValue: _Body._read_value,
-        form.WriteBack: _Body._write_back,
-    }
-)
-
-_EXPRESSIONS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = MappingProxyType(
-    {
-        form.Literal: _Body._literal,
-        form.Zero: _Body._zero,
-        form.Read: _Body._read,
-        form.Assign: _Body._assign,
-        form.Convert: _Body._convert,
-        form.Arithmetic: _Body._arithmetic,
-        form.Unary: _Body._unary,
-        form.Compare: _Body._compare,
-        form.CompareTexts: _Body._compare_texts,
-        form.Logical: _Body._logical,
-        form.Now: _Body._now,
-        form.Moment: _Body._moment,
-        form.MomentOf: _Body._moment_of,
-        form.Not: _Body._not,
-        form.Conditional: _Body._conditional,
-        form.Sequence: _Body._sequence,
-        form.Item: _Body._item,
-        form.Accumulate: _Body._accumulate,
-        form.Throttle: _Body._throttle,
-        form.Call: _Body._call,
-        form.Invoke: _Body._invoke,
-    }
-)
+_STATEMENTS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = form.methods_of(_Body, form.Statement)
+_EXPRESSIONS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = form.methods_of(_Body, form.Expression)

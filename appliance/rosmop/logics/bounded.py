@@ -37,7 +37,8 @@ _LATER = ("until", "next")
 
 
 class Cell:
-    """The value of a part at an event that is not decided yet; `tells`: the part is the whole formula.
+    """The value of a part at an event that is not decided yet; `tells`: the part is the whole formula, at this event
+    (`BoundedRun.place`; 0: it is not the whole).
 
     The value of a `kind` (`and`, `or`, `xor`, `not`) comes from `operands`, of which `missing` are open.
     """
@@ -46,7 +47,7 @@ class Cell:
 
     def __init__(self) -> None:
         self.users: list[Cell | _Operator] = []
-        self.tells = False
+        self.tells = 0
         self.value: bool | None = None
         self.stand_for("", ())
 
@@ -58,7 +59,7 @@ class Cell:
     @property
     def wanted(self) -> bool:
         """Whether it is open, and somebody waits for it."""
-        return self.value is None and (self.tells or bool(self.users))
+        return self.value is None and bool(self.tells or self.users)
 
     def hear(self, value: bool) -> bool | None:
         """What it is worth now that one more operand has this value; None: that is still open."""
@@ -354,7 +355,7 @@ class _OpenPreviously(_Operator):
         _use(self.before, self)
 
     def settle(self) -> None:
-        """Who asked has the cell itself."""
+        """Nothing to do: what asked has the cell itself."""
 
 
 class _Next(_Operator):
@@ -486,7 +487,8 @@ class BoundedRun:
         self._values: list[Value | None] = []
         self._decided: list[Cell] = []
         self._looked_at: set[_Operator] = set()
-        self._told: set[bool] = set()
+        self._told: dict[bool, int] = {}
+        self._about: dict[bool, int] = {}
 
     @property
     def deadline(self) -> int | None:
@@ -507,9 +509,9 @@ class BoundedRun:
         self._values = self._at_once(event, self._now)
         whole = self.value(self._compiled.program.result)
         if isinstance(whole, Cell):
-            whole.tells = True
+            whole.tells = self.place
         else:
-            self._told.add(whole)
+            self._told[whole] = self.place
         for operator in self._operators.values():
             operator.take(self._now)
         return self._tell()
@@ -567,18 +569,23 @@ class BoundedRun:
                 innermost = min(self._looked_at, key=lambda operator: operator.number)
                 self._looked_at.remove(innermost)
                 innermost.settle()
-        told, self._told = self._told, set()
+        told, self._told = self._told, {}
+        self._about = told
         return _CATEGORIES[False in told, True in told]
+
+    def about(self, category: str) -> int:
+        """At which event, counted from 1, the formula is what the last step or deadline told."""
+        return self._about[category == VERDICTS[True]]
 
     def _pass_on(self, cell: Cell) -> None:
         assert cell.value is not None  # noqa: S101  it was decided
         if cell.tells:
-            self._told.add(cell.value)
+            self._told[cell.value] = cell.tells
         for user in cell.users:
             if not isinstance(user, Cell):
                 user.hear(cell.value)
                 self._looked_at.add(user)
-            elif user.wanted:  # who waited for it may have been decided by another user a moment ago
+            elif user.wanted:  # another user may have decided it a moment ago
                 value = user.hear(cell.value)
                 if value is not None:
                     self.decide(user, value)

@@ -11,7 +11,15 @@ table.
 from appliance.rosmop.logics.automaton import Automaton, TooManyStatesError, explore
 from appliance.rosmop.logics.ere import with_fail
 from appliance.rosmop.logics.grammar import prepare, read_grammar
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty, Run, Source, twin
+from appliance.rosmop.logics.interface import (
+    Categories,
+    CompiledProperty,
+    FiniteProperty,
+    Run,
+    Source,
+    UntimedRun,
+    twin,
+)
 from appliance.rosmop.logics.parsing import Frame, Recogniser
 
 CATEGORIES: Categories = ("match", "fail")
@@ -36,7 +44,7 @@ class GrammarProperty(CompiledProperty):
         return GrammarRun(self.recogniser)
 
 
-class GrammarRun:
+class GrammarRun(UntimedRun):
     """A run: the current frame, or None after a failure."""
 
     __slots__ = ("_step", "frame")
@@ -45,11 +53,6 @@ class GrammarRun:
     def __init__(self, recogniser: Recogniser) -> None:
         self._step = recogniser.step
         self.frame: Frame | None = recogniser.initial
-
-    @property
-    def deadline(self) -> int | None:
-        """None: nothing is waited for."""
-        return None
 
     def step(self, event: int, time_ns: int) -> Categories:
         """Take the event; the time plays no part. Raises RunFaultError, and is unchanged then."""
@@ -62,10 +65,6 @@ class GrammarRun:
             return FAIL
         self.frame, accepted = after
         return MATCH if accepted else UNDECIDED
-
-    def expire(self) -> Categories:
-        """Never right: there is no deadline."""
-        raise ValueError("this run has no deadline")
 
 
 def compile_cfg(source: Source) -> CompiledProperty:

@@ -1,8 +1,8 @@
 """Reads temporal formulas: one reader for ltl, ptltl and mtl, which differ only in their tables of operators.
 
 A ``Syntax`` names the unary operators, which bind tightest, and the levels of binary operators from the
-tightest to the loosest. Nesting is bounded, so that no formula can exhaust the stack of whoever walks over
-it.
+tightest to the loosest. Nesting is bounded, so that no walk over a formula can exhaust the
+stack.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

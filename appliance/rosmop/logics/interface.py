@@ -143,7 +143,22 @@ class FiniteProperty(CompiledProperty):
         return frozenset(name for row in self.automaton.table for name in verdicts[row[event]])
 
 
-class FiniteRun:
+class UntimedRun:
+    """What runs that wait for nothing have in common."""
+
+    __slots__ = ()
+
+    @property
+    def deadline(self) -> int | None:
+        """None: nothing is waited for."""
+        return None
+
+    def expire(self) -> Categories:
+        """Never right: there is no deadline."""
+        raise ValueError("this run has no deadline")
+
+
+class FiniteRun(UntimedRun):
     """A run over the tables of an automaton."""
 
     __slots__ = ("_automaton", "state")
@@ -152,20 +167,11 @@ class FiniteRun:
         self._automaton = automaton
         self.state = automaton.initial
 
-    @property
-    def deadline(self) -> int | None:
-        """None: nothing is waited for."""
-        return None
-
     def step(self, event: int, time_ns: int) -> Categories:
         """Take the event; the time plays no part."""
         del time_ns
         self.state = self._automaton.table[self.state][event]
         return self._automaton.verdicts[self.state]
-
-    def expire(self) -> Categories:
-        """Never right: there is no deadline."""
-        raise ValueError("this run has no deadline")
 
 
 Move = tuple[int, bool]

@@ -210,7 +210,7 @@ class Recogniser:
         return known
 
     def _closure(self, shape: Shape) -> tuple[dict[int, set[Entry]], dict[int, set[Entry]]]:
-        """Who waits for each nonterminal and for each event, predicted items included; all one symbol
+        """The items that wait for each nonterminal and for each event, predicted ones included; all one symbol
         further."""
         if shape.waiters is not None:
             return shape.waiters

@@ -30,7 +30,14 @@ from appliance.rosmop.logics.automaton import (
     spread,
 )
 from appliance.rosmop.logics.formula import Formula, event_names
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty, Run, Source
+from appliance.rosmop.logics.interface import (
+    Categories,
+    CompiledProperty,
+    FiniteProperty,
+    Run,
+    Source,
+    UntimedRun,
+)
 
 VERDICTS = ("violation", "validation")
 MAX_TABLE_STATES = 4_096
@@ -241,7 +248,7 @@ StepFunction = Callable[[int, int], Categories]
 Made = tuple[StepFunction, Callable[[], Any]]
 
 
-class PastRun:
+class PastRun(UntimedRun):
     """A run of a past formula; ``step`` is the compiled function itself, ``twin`` makes one that goes on from here."""
 
     __slots__ = ("step", "twin")
@@ -252,15 +259,6 @@ class PastRun:
 
     def __copy__(self) -> "PastRun":
         return PastRun(*self.twin())
-
-    @property
-    def deadline(self) -> int | None:
-        """None: the verdict comes with each event."""
-        return None
-
-    def expire(self) -> Categories:
-        """Never right: there is no deadline."""
-        raise ValueError("this run has no deadline")
 
 
 class PastProperty(CompiledProperty):

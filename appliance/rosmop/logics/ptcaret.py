@@ -13,7 +13,15 @@ bound beyond which a ``begin`` is a fault of the specification. (Rosu, Chen and 
 """
 
 from appliance.rosmop.logics.formula import NOT, Formula, Level, Syntax, boolean_levels, nodes, read_formula
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, twin
+from appliance.rosmop.logics.interface import (
+    Categories,
+    CompiledProperty,
+    Run,
+    RunFaultError,
+    Source,
+    UntimedRun,
+    twin,
+)
 from appliance.rosmop.logics.past import VERDICTS, Program, Stepper
 from appliance.rosmop.logics.ptltl import SYNTAX as PTLTL
 
@@ -71,7 +79,7 @@ class CaretProperty(CompiledProperty):
         return CaretRun(self)
 
 
-class CaretRun:
+class CaretRun(UntimedRun):
     """A run: what is remembered of the last event, and the abstract past before each open call."""
 
     __slots__ = ("_begin", "_bits", "_end", "_mask", "_stack", "_step")
@@ -88,11 +96,6 @@ class CaretRun:
         made._stack = self._stack.copy()
         return made
 
-    @property
-    def deadline(self) -> int | None:
-        """None: the verdict comes with each event."""
-        return None
-
     def step(self, event: int, time_ns: int) -> Categories:
         """Take the event; the time plays no part. Raises RunFaultError, and is unchanged then."""
         del time_ns
@@ -105,10 +108,6 @@ class CaretRun:
             bits = (bits & ~self._mask) | (self._stack.pop() if self._stack else 0)
         self._bits = bits
         return ("validation",) if holds else ("violation",)
-
-    def expire(self) -> Categories:
-        """Never right: there is no deadline."""
-        raise ValueError("this run has no deadline")
 
 
 def plain(formula: Formula) -> Formula:

@@ -11,7 +11,15 @@ A run has bounds on its string and on the work of one event; what exceeds them i
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source, twin
+from appliance.rosmop.logics.interface import (
+    Categories,
+    CompiledProperty,
+    Run,
+    RunFaultError,
+    Source,
+    UntimedRun,
+    twin,
+)
 from appliance.rosmop.logics.lexer import Token, TokenReader
 
 CATEGORIES: Categories = ("fail", "succeed")
@@ -55,7 +63,7 @@ class RewritingProperty(CompiledProperty):
         return frozenset(rule.verdict for rule in self.rules if rule.verdict)
 
 
-class RewritingRun:
+class RewritingRun(UntimedRun):
     """A run: its string, to which no rule applies between two events, or the verdict that it came to."""
 
     __slots__ = ("_property", "string", "verdict")
@@ -66,21 +74,12 @@ class RewritingRun:
         self.string: list[int] = []
         self.verdict: Categories = ()
 
-    @property
-    def deadline(self) -> int | None:
-        """None: nothing is waited for."""
-        return None
-
     def step(self, event: int, time_ns: int) -> Categories:
         """Append the event and rewrite; the time plays no part. Raises RunFaultError, and is unchanged then."""
         del time_ns
         if not self.verdict:
             self.string, self.verdict = self._rewritten([*self.string, event])
         return self.verdict
-
-    def expire(self) -> Categories:
-        """Never right: there is no deadline."""
-        raise ValueError("this run has no deadline")
 
     def _rewritten(self, string: list[int]) -> tuple[list[int], Categories]:
         """Nothing matches before ``place``: that was looked at, and what has changed since is further behind."""

@@ -1,4 +1,4 @@
-"""What the form of an event means, as terms: `ir/interpreter.py` line by line, for every message at once.
+"""What the form of an event means, as terms: line by line the interpreter of the tests, for every message at once.
 
 - Positions and counts are 64 bits here and any number there: a function without loops adds up a few products of a
   count below 2**32 and a size, and never comes to more. Times are 64 bits, too, and sums of two of them fit.
@@ -15,7 +15,6 @@ from typing import Any
 import z3
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.interpreter import CHARGED, SHORT
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.prove.terms import (
     DOUBLE,
@@ -92,7 +91,7 @@ class Meaning:
         self._exits: list[tuple[State, Term]] = []
         self._returned: list[tuple[State, Term]] | None = None
         self._calls = 0
-        self._call = 0
+        self._frame = 0
         self._shared: Sequence[str] = self._function.shared
 
     def result(self) -> Result:
@@ -154,16 +153,18 @@ class Meaning:
         self._block(node.no, no)
         state.join(test, yes, no)
 
-    def _repeat(self, node: form.Statement, state: State) -> None:
+    def _repeat(self, node: form.Statement | form.Expression, state: State) -> None:
         del node, state
         raise NotProvedError("not loop-free")
+
+    _loop = _for_each = _skip = _accumulate = _repeat
 
     def _select(self, node: form.Select, state: State) -> None:
         value = self._value(node.value, state)
         number = integer(node.default, 32)
         for wanted, index in reversed(node.table):
             number = z3.If(value == integer(wanted, value.size()), integer(index, 32), number)
-        state.slots[self._call, node.name] = number
+        state.slots[self._frame, node.name] = number
 
     def _return(self, node: form.Return, state: State) -> None:
         if node.references or self._returned is None:
@@ -187,7 +188,7 @@ class Meaning:
             self._make(integer(node.size, 64), state)
             return
         size = z3.ZeroExt(32, self._beginning.size)
-        many = size > CHARGED
+        many = size > form.CHARGED
         yes, no = state.where(many), state.where(opposite(many))
         self._make(size, yes)
         state.join(many, yes, no)
@@ -205,7 +206,9 @@ class Meaning:
         del node
         self._leave_to_python(state, z3.BoolVal(True))
 
-    def _nothing(self, node: form.Statement, state: State) -> None:
+    _publish = _log = _acts
+
+    def _pending(self, node: form.Pending, state: State) -> None:
         """Only `Whole` asks for it."""
 
     def _require(self, node: form.Require, state: State) -> None:
@@ -214,18 +217,18 @@ class Meaning:
         state.require(test)
 
     def _not_past(self, node: form.NotPast, state: State) -> None:
-        self._leave_to_python(state, state.slots[self._call, node.count] <= node.index)
+        self._leave_to_python(state, state.slots[self._frame, node.count] <= node.index)
 
     # Fields of the message
 
     def _position(self, at: form.Spot, state: State) -> Term:
         offset = integer(at.offset, 64)
-        return offset if at.base is None else state.slots[self._call, at.base] + offset
+        return offset if at.base is None else state.slots[self._frame, at.base] + offset
 
     def _place(self, at: form.Spot, state: State) -> Term:
         """The same where it is known to be within the message."""
         offset = integer(at.offset, 32)
-        return offset if at.base is None else z3.Extract(31, 0, state.slots[self._call, at.base]) + offset
+        return offset if at.base is None else z3.Extract(31, 0, state.slots[self._frame, at.base]) + offset
 
     def _within(self, at: form.Spot, size: int, state: State) -> None:
         short = z3.ULT(z3.ZeroExt(32, self._beginning.size), self._position(at.plus(size), state))
@@ -237,10 +240,10 @@ class Meaning:
 
     def _after_text(self, node: form.AfterText, state: State) -> None:
         length = self._length(node.at, state)
-        state.slots[self._call, node.name] = self._position(node.at.plus(4), state) + length
+        state.slots[self._frame, node.name] = self._position(node.at.plus(4), state) + length
 
     def _count(self, node: form.Count, state: State) -> None:
-        state.slots[self._call, node.name] = self._counted(node.at, node.least, state)
+        state.slots[self._frame, node.name] = self._counted(node.at, node.least, state)
 
     def _counted(self, at: form.Spot, least: int, state: State) -> Term:
         count = self._length(at, state)
@@ -251,15 +254,15 @@ class Meaning:
 
     def _after_elements(self, node: form.AfterElements, state: State) -> None:
         count = (
-            integer(node.count, 64) if isinstance(node.count, int) else state.slots[self._call, node.count]
+            integer(node.count, 64) if isinstance(node.count, int) else state.slots[self._frame, node.count]
         )
-        state.slots[self._call, node.name] = self._position(node.at, state) + count * node.size
+        state.slots[self._frame, node.name] = self._position(node.at, state) + count * node.size
 
     def _read_numbers(self, node: form.ReadNumbers, state: State) -> None:
         self._within(node.at, max(offset + self._size(kind) for _, kind, offset in node.fields), state)
         for name, kind, offset in node.fields:
             place = self._place(node.at.plus(offset), state)
-            state.slots[self._call, name] = self._number(state.slots[_MESSAGE], place, kind)
+            state.slots[self._frame, name] = self._number(state.slots[_MESSAGE], place, kind)
 
     def _number(self, message: Term, place: Term, kind: Type) -> Term:
         if isinstance(kind, kinds.Time | kinds.Duration):
@@ -303,8 +306,8 @@ class Meaning:
             self._within(node.at, size, state)
             if isinstance(kind, kinds.Vector):
                 count, size = integer(kind.length or 0, 64), self._size(kind.element)
-        state.slots[self._call, node.name] = _View(state.slots[_MESSAGE], start, count)
-        state.slots[self._call, node.end] = start + count * size
+        state.slots[self._frame, node.name] = _View(state.slots[_MESSAGE], start, count)
+        state.slots[self._frame, node.end] = start + count * size
 
     def _write_back(self, node: form.WriteBack, state: State) -> None:
         dropped = state.slots[_DROPPED]
@@ -312,7 +315,7 @@ class Meaning:
         state.require(opposite(dropped))
         puts = []
         for write in node.writes:
-            flag = state.slots[self._call, write.flag]
+            flag = state.slots[self._frame, write.flag]
             if write.end is not None:
                 self._ignore(state.where(flag), "a string or vector that is written")
                 state.require(opposite(flag))
@@ -377,7 +380,7 @@ class Meaning:
         return self._whole_number(0, node.type)
 
     def _read(self, node: form.Read, state: State) -> Any:
-        own, shared = (self._call, node.name), ("shared", node.name)
+        own, shared = (self._frame, node.name), ("shared", node.name)
         value = state.slots.get(own if own in state.slots else shared)
         if value is None or value is MIXED:
             raise UnknownError(f"a variable of type {node.type}")
@@ -385,7 +388,7 @@ class Meaning:
 
     def _assign(self, node: form.Assign, state: State) -> Any:
         value = self._value(node.value, state)
-        where: int | str = "shared" if node.name in self._shared else self._call
+        where: int | str = "shared" if node.name in self._shared else self._frame
         if where == "shared" and node.name not in self._beginning.variables:
             raise UnknownError(f"a variable of type {node.type}")
         state.slots[where, node.name] = value
@@ -508,7 +511,7 @@ class Meaning:
         if node.operator not in ("==", "!=") or not node.short or not isinstance(text, bytes):
             raise UnknownError("a comparison of strings")
         view = self._value(given, state)
-        if not isinstance(view, _View) or len(text) > SHORT:
+        if not isinstance(view, _View) or len(text) > form.SHORT:
             raise UnknownError("a comparison of strings")
         place = z3.Extract(31, 0, view.start)
         letters = [number_at(view.message, place + more, 1) == one for more, one in enumerate(text)]
@@ -559,13 +562,6 @@ class Meaning:
         self._leave_to_python(state, opposite(both(last <= now, before)))
         return z3.BoolVal(False)
 
-    def _accumulate(self, node: form.Expression, state: State) -> Any:
-        del node, state
-        raise NotProvedError("not loop-free")
-
-    def _log(self, node: form.Log, state: State) -> None:
-        self._acts(node, state)
-
     def _item(self, node: form.Item, state: State) -> Any:
         view = self._value(node.base, state)
         if not isinstance(view, _View) or not isinstance(node.base.type, kinds.Record):
@@ -592,7 +588,7 @@ class Meaning:
             raise UnknownError(f"a copy of type {kind}")
         return view
 
-    def _call_function(self, node: form.Call, state: State) -> Any:
+    def _call(self, node: form.Call, state: State) -> Any:
         name, arguments = node.function, node.arguments
         if name in ("a_part",):
             return self._with_part(node, state)
@@ -646,18 +642,18 @@ class Meaning:
             raise UnknownError("recursion")
         function = self._functions[node.function]
         values = [self._value(argument, state) for argument in node.arguments]
-        outer = self._call, self._shared, self._returned
+        outer = self._frame, self._shared, self._returned
         self._calls += 1
-        self._call, self._shared, self._returned = self._calls, function.shared, []
+        self._frame, self._shared, self._returned = self._calls, function.shared, []
         state.slots |= {
-            (self._call, name): value for name, value in zip(function.parameters, values, strict=False)
+            (self._frame, name): value for name, value in zip(function.parameters, values, strict=False)
         }
         inner = state.where(z3.BoolVal(True))
         try:
             self._block(function.body, inner)
             ends = [*self._returned, (inner, None)]
         finally:
-            self._call, self._shared, self._returned = outer
+            self._frame, self._shared, self._returned = outer
         ends = [(end, value) for end, value in ends if not z3.is_false(end.alive)]
         if not ends:
             state.alive = z3.BoolVal(False)
@@ -737,57 +733,9 @@ _OF_MOMENTS: Mapping[str, Callable[[Meaning, Term], Term]] = MappingProxyType(
     }
 )
 
-_STATEMENTS: Mapping[type[Any], Callable[[Meaning, Any, State], None]] = MappingProxyType(
-    {
-        form.Evaluate: Meaning._evaluate,
-        form.If: Meaning._if,
-        form.Loop: Meaning._repeat,
-        form.ForEach: Meaning._repeat,
-        form.Skip: Meaning._repeat,
-        form.Select: Meaning._select,
-        form.Return: Meaning._return,
-        form.Leave: Meaning._leave,
-        form.Charge: Meaning._charge,
-        form.Allocate: Meaning._allocate,
-        form.Drop: Meaning._drop,
-        form.Publish: Meaning._acts,
-        form.AfterText: Meaning._after_text,
-        form.Count: Meaning._count,
-        form.AfterElements: Meaning._after_elements,
-        form.NotPast: Meaning._not_past,
-        form.ReadNumbers: Meaning._read_numbers,
-        form.ReadValue: Meaning._read_value,
-        form.Require: Meaning._require,
-        form.Pending: Meaning._nothing,
-        form.WriteBack: Meaning._write_back,
-    }
+_STATEMENTS: Mapping[type[Any], Callable[[Meaning, Any, State], None]] = form.methods_of(
+    Meaning, form.Statement
 )
-
-_EXPRESSIONS: Mapping[type[Any], Callable[[Meaning, Any, State], Any]] = MappingProxyType(
-    {
-        form.Literal: Meaning._literal,
-        form.Zero: Meaning._zero,
-        form.Read: Meaning._read,
-        form.Assign: Meaning._assign,
-        form.Convert: Meaning._convert,
-        form.Arithmetic: Meaning._arithmetic,
-        form.Unary: Meaning._unary,
-        form.Moment: Meaning._moment,
-        form.MomentOf: Meaning._moment_of,
-        form.Compare: Meaning._compare,
-        form.CompareTexts: Meaning._compare_texts,
-        form.Logical: Meaning._logical,
-        form.Not: Meaning._not,
-        form.Conditional: Meaning._conditional,
-        form.Sequence: Meaning._sequence,
-        form.Discard: Meaning._discard,
-        form.Item: Meaning._item,
-        form.Copy: Meaning._copy,
-        form.Call: Meaning._call_function,
-        form.Accumulate: Meaning._accumulate,
-        form.Invoke: Meaning._invoke,
-        form.Log: Meaning._log,
-        form.Throttle: Meaning._throttle,
-        form.Now: Meaning._now,
-    }
+_EXPRESSIONS: Mapping[type[Any], Callable[[Meaning, Any, State], Any]] = form.methods_of(
+    Meaning, form.Expression
 )

@@ -94,7 +94,7 @@ def as_bits(truth: Term, bits: int = 32) -> Term:
 
 
 def number_at(message: Term, position: Term, size: int) -> Term:
-    """So many bytes from a position on, little-endian."""
+    """The number in so many bytes from a position on, little-endian."""
     every = [z3.Select(message, position + integer(more, 32) if more else position) for more in range(size)]
     return every[0] if size == 1 else z3.Concat(*reversed(every))
 
@@ -211,7 +211,7 @@ def abstracted(terms: Sequence[Term]) -> list[Term]:
 
 
 def _is_cheap(kind: int, operands: Sequence[Term]) -> bool:
-    """Of constants, or a product with a small one."""
+    """Whether it is an operation on constants, or a product with a small one."""
     small = any(z3.is_bv_value(one) and one.as_long() < _SMALL for one in operands)
     return (kind == z3.Z3_OP_BMUL and small) or all(map(_is_number, operands))
 

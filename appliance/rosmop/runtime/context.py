@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import FrameType
+from typing import Any
 
 BUDGET = 1_000_000
 """Instructions that a specification may spend on one message."""
@@ -56,21 +57,25 @@ class LogLine:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """A message to be published by a monitor."""
+    """A message to be published by a monitor; `site` is that of the statement."""
 
     monitor: str
     topic: str
     type: str
     data: bytes
+    site: int
 
 
 @dataclass(slots=True)
 class Turn:
-    """What the actions run for one message (or one tick) share: its time, and what comes out."""
+    """What the actions run for one message (or one tick) share: its time, what comes out, and what conditions that were
+    met have compared, by their sites.
+    """
 
     now: int = 0
     log: list[LogLine] = field(default_factory=list)
     published: list[Published] = field(default_factory=list)
+    looked: dict[int, tuple[Any, ...]] = field(default_factory=dict)
     reset: bool = False  # `__RESET;` was met, for the property whose handlers run
 
 
@@ -114,7 +119,7 @@ class Context:
             )
 
     def walk(self, elements: int) -> None:
-        """So many elements of arrays are about to be walked over, one by one, to a field behind them."""
+        """Charge for a walk over so many elements of arrays, one by one, to a field behind them."""
         self.budget -= elements
         if self.budget < 0:
             raise FaultError(
@@ -151,7 +156,7 @@ class Context:
         self.spend(OUTPUT_COST, site)
         self.allocate(len(data), site)
         self._pending += len(data)
-        self.turn.published.append(Published(self.monitor, topic, kind, data))
+        self.turn.published.append(Published(self.monitor, topic, kind, data, site))
 
     def _measure(self, size: int, site: int) -> None:
         held = size + sum(len(message.data) for message in self.turn.published)

@@ -115,9 +115,8 @@ class Message:
     """The message that events look at: its bytes as changed so far, and what has become of it.
 
     Numbers are written where they stand, and only the bytes that were there are kept: a picture of a camera is not
-    copied for a changed stamp. `touched` is set by whatever writes other bytes than were there; who wants to know
-    which event did clears it after each. `looked` are the values that conditions have compared, by their sites, and
-    `cause` is the site of the statement that dropped it.
+    copied for a changed stamp. `touched` is set by every write of other bytes than were there; cleared after each
+    event, it says which event wrote. `cause` is the site of the statement that dropped it.
     """
 
     __slots__ = (
@@ -125,7 +124,6 @@ class Message:
         "buffer",
         "cause",
         "dropped",
-        "looked",
         "past",
         "time",
         "touched",
@@ -139,7 +137,6 @@ class Message:
         self._replaced: bytes | None = None  # the bytes as received, once the buffer is another
         self.dropped = False
         self.cause: int | None = None
-        self.looked: dict[int, tuple[Any, ...]] = {}
         self.touched = False
         self.past: tuple[int, int, int] | None = None  # an index was past the end: site, index, elements
 

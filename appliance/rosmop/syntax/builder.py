@@ -32,12 +32,24 @@ def _binary(operator: str) -> Callable[..., tree.Binary]:
     return build
 
 
-def _word(kind: Callable[[Position], _T]) -> Callable[..., _T]:
+def _made(kind: Callable[..., _T], first: int = 0, **more: bool) -> Callable[..., _T]:
+    """Of a rule whose children, from the `first` on, are the fields of its node."""
+
     def build(self: "Builder", meta: Meta, children: list[Any]) -> _T:
-        del children
-        return kind(self.at(meta))
+        given = (str(child) if isinstance(child, Token) else child for child in children[first:])
+        return kind(self.at(meta), *given, **more)
 
     return build
+
+
+def _all(self: "Builder", meta: Meta, children: list[Any]) -> tuple[Any, ...]:
+    del self, meta
+    return tuple(children)
+
+
+def _unsaid(self: "Builder", meta: Meta, children: list[Any]) -> _Unsaid:
+    del self, meta, children
+    return _Unsaid()
 
 
 @v_args(meta=True)
@@ -69,9 +81,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         found = tuple(child for child in children if isinstance(child, tree.Specification))
         return tree.File(self._file, self._text, found)
 
-    def using(self, meta: Meta, children: list[Any]) -> _Unsaid:
-        del meta, children
-        return _Unsaid()
+    using = _unsaid
 
     def nothing(self, meta: Meta, children: list[Any]) -> tree.Statement:
         del children
@@ -105,9 +115,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
             return self.init(meta, [parameters, body])
         return tree.Function(self.at(meta), kind, str(name), parameters or (), body)
 
-    def prototype(self, meta: Meta, children: list[Any]) -> _Unsaid:
-        del meta, children
-        return _Unsaid()
+    prototype = _unsaid
 
     def procedure(self, meta: Meta, children: list[Any]) -> tree.Function:
         name, parameters, body = children
@@ -119,18 +127,14 @@ class Builder(Transformer_NonRecursive[Token, Any]):
             self.refuse(meta, "`init` takes no parameters: it runs before the first message")
         return tree.Init(self.at(meta), body)
 
-    def parameters(self, meta: Meta, children: list[Any]) -> tuple[tree.Parameter, ...]:
-        del meta
-        return tuple(children)
+    parameters = _all
 
     def unnamed_parameters(self, meta: Meta, children: list[Any]) -> tuple[tree.Parameter, ...]:
         if children != ["void"]:
             self.refuse(meta, f"give the parameter a name: `{' '.join(children)} x`")
         return ()
 
-    def parameter(self, meta: Meta, children: list[Any]) -> tree.Parameter:
-        kind, name = children
-        return tree.Parameter(self.at(meta), kind, str(name))
+    parameter = _made(tree.Parameter)
 
     def reference_parameter(self, meta: Meta, children: list[Any]) -> tree.Parameter:
         return tree.Parameter(self.at(meta), _referenced(children[0]), str(children[-1]))
@@ -193,9 +197,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         path, inner = children
         return [replace(binding, path=(*path, *binding.path)) for binding in inner or ()]
 
-    def path(self, meta: Meta, children: list[Any]) -> _Path:
-        del meta
-        return tuple(children)
+    path = _all
 
     def path_step(self, meta: Meta, children: list[Any]) -> tree.PathStep:
         name, index = children
@@ -212,9 +214,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         origin = self.at(formula).within(formula, len(formula) - len(stripped))
         return tree.Property(self.at(meta), str(logic), stripped.rstrip(), origin, tuple(handlers))
 
-    def handler(self, meta: Meta, children: list[Any]) -> tree.Handler:
-        _, category, body = children
-        return tree.Handler(self.at(meta), str(category), body)
+    handler = _made(tree.Handler, 1)
 
     # Types
 
@@ -262,16 +262,9 @@ class Builder(Transformer_NonRecursive[Token, Any]):
     def block(self, meta: Meta, children: list[Any]) -> tree.Block:
         return tree.Block(self.at(meta), tuple(children))
 
-    def evaluate(self, meta: Meta, children: list[Any]) -> tree.Evaluate:
-        return tree.Evaluate(self.at(meta), children[0])
-
-    def if_(self, meta: Meta, children: list[Any]) -> tree.If:
-        _, condition, yes, no = children
-        return tree.If(self.at(meta), condition, yes, no)
-
-    def while_(self, meta: Meta, children: list[Any]) -> tree.While:
-        _, condition, body = children
-        return tree.While(self.at(meta), condition, body)
+    evaluate = _made(tree.Evaluate)
+    if_ = _made(tree.If, 1)
+    while_ = _made(tree.While, 1)
 
     def do_(self, meta: Meta, children: list[Any]) -> tree.While:
         _, body, condition = (child for child in children if not _is_word(child, "WHILE"))
@@ -282,9 +275,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         empty = isinstance(start, tree.Block)
         return tree.For(self.at(meta), None if empty else start, condition, step, body)
 
-    def range_for(self, meta: Meta, children: list[Any]) -> tree.RangeFor:
-        _, kind, name, values, body = children
-        return tree.RangeFor(self.at(meta), kind, str(name), values, body)
+    range_for = _made(tree.RangeFor, 1)
 
     def range_for_reference(self, meta: Meta, children: list[Any]) -> tree.RangeFor:
         word, kind, *more = children
@@ -301,13 +292,11 @@ class Builder(Transformer_NonRecursive[Token, Any]):
     def default(self, meta: Meta, children: list[Any]) -> tree.Case:
         return tree.Case(self.at(meta), None, tuple(children[1:]))
 
-    break_ = _word(tree.Break)
-    continue_ = _word(tree.Continue)
-    drop = _word(tree.Drop)
-    reset = _word(tree.Reset)
-
-    def return_(self, meta: Meta, children: list[Any]) -> tree.Return:
-        return tree.Return(self.at(meta), children[1])
+    break_ = _made(tree.Break, 1)
+    continue_ = _made(tree.Continue, 1)
+    drop = _made(tree.Drop, 1)
+    reset = _made(tree.Reset, 1)
+    return_ = _made(tree.Return, 1)
 
     def delete(self, meta: Meta, children: list[Any]) -> tree.Delete:
         return tree.Delete(self.at(meta), children[-1])
@@ -321,12 +310,8 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         kind, *declarators = children
         return tree.Declaration(self.at(meta), kind, tuple(declarators))
 
-    def plain_declarator(self, meta: Meta, children: list[Any]) -> tree.Declarator:
-        return tree.Declarator(self.at(meta), str(children[0]))
-
-    def initialized(self, meta: Meta, children: list[Any]) -> tree.Declarator:
-        name, value = children
-        return tree.Declarator(self.at(meta), str(name), value=value)
+    plain_declarator = _made(tree.Declarator)
+    initialized = _made(tree.Declarator)
 
     def constructed(self, meta: Meta, children: list[Any]) -> tree.Declarator:
         name, arguments = children
@@ -370,8 +355,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         target, value = children
         return tree.Assign(self.at(meta), "=", target, value)
 
-    def conditional(self, meta: Meta, children: list[Any]) -> tree.Conditional:
-        return tree.Conditional(self.at(meta), *children)
+    conditional = _made(tree.Conditional)
 
     def binary(self, meta: Meta, children: list[Any]) -> tree.Binary:
         left, operator, right = children
@@ -390,13 +374,8 @@ class Builder(Transformer_NonRecursive[Token, Any]):
     divide = _binary("/")
     remainder = _binary("%")
 
-    def prefix(self, meta: Meta, children: list[Any]) -> tree.Unary:
-        operator, operand = children
-        return tree.Unary(self.at(meta), str(operator), operand)
-
-    def step_before(self, meta: Meta, children: list[Any]) -> tree.Step:
-        operator, target = children
-        return tree.Step(self.at(meta), str(operator), target, prefix=True)
+    prefix = _made(tree.Unary)
+    step_before = _made(tree.Step, prefix=True)
 
     def step_after(self, meta: Meta, children: list[Any]) -> tree.Step:
         target, operator = children
@@ -436,24 +415,15 @@ class Builder(Transformer_NonRecursive[Token, Any]):
             )
         return tree.NewCharacters(self.at(meta), children[-1])
 
-    def limit(self, meta: Meta, children: list[Any]) -> tree.Limit:
-        _, kind, name = children
-        return tree.Limit(self.at(meta), kind, str(name))
-
-    def index(self, meta: Meta, children: list[Any]) -> tree.Index:
-        return tree.Index(self.at(meta), *children)
-
-    def member(self, meta: Meta, children: list[Any]) -> tree.Member:
-        base, name = children
-        return tree.Member(self.at(meta), base, str(name))
+    limit = _made(tree.Limit, 1)
+    index = _made(tree.Index)
+    member = _made(tree.Member)
 
     def call(self, meta: Meta, children: list[Any]) -> tree.Call:
         callee, *arguments = (child for child in children if not isinstance(child, Token))
         return tree.Call(self.at(meta), callee, arguments[0] or ())
 
-    def arguments(self, meta: Meta, children: list[Any]) -> tuple[tree.Expression, ...]:
-        del meta
-        return tuple(children)
+    arguments = _all
 
     def number(self, meta: Meta, children: list[Any]) -> tree.Number:
         return tree.Number(self.at(meta), str(children[-1]))

@@ -1,14 +1,34 @@
 """Monitors whose functions the interpreter runs, beside those that run generated code: both do the same."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from appliance.rosmop.compile.module import Module
 from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.ir.interpreter import Interpreter
 from appliance.rosmop.outcomes import Fault, Outcome
 from appliance.rosmop.runtime.context import Context, Turn
+from tests.unit.rosmop.interpreter import Interpreter
+
+
+class _Interpreted(Module):
+    """Knows where faults of the interpreter were, by the sites of the generated code."""
+
+    def __init__(self, module: Module, interpreter: Interpreter) -> None:
+        super().__init__()
+        self.sites = module.sites
+        self._interpreter = interpreter
+
+    def place_of(self, error: Exception) -> tuple[int, Mapping[str, Any]]:
+        """The site of a fault, and the variables there."""
+        fault = self._interpreter.fault
+        return (fault.site, fault.variables) if error is fault.error else (-1, {})
+
+    def has_begun(self, line: int, error: Exception) -> bool:
+        """Whether the event had happened."""
+        return error is self._interpreter.fault.error and self._interpreter.fault.happened
 
 
 def interpreted(compiled: Compiled) -> Compiled:
@@ -22,7 +42,9 @@ def interpreted(compiled: Compiled) -> Compiled:
     for name in compiled.functions:
         run = interpreter.key if name in keys else interpreter.event if name in events else interpreter.action
         namespace[name] = partial(run, name)
-    return replace(compiled, namespace=namespace, turn=turn)
+    return replace(
+        compiled, namespace=namespace, turn=turn, module=_Interpreted(compiled.module, interpreter)
+    )
 
 
 def beside(monitors: MonitorSet) -> MonitorSet:

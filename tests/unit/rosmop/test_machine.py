@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from appliance.rosmop import machine
 from appliance.rosmop.machine import PAGE, Machine, MachineError, MachineTrap
+from tests.support.examples import examples
 
 LIMIT = 4 * PAGE
 FUEL = 1_000_000
@@ -214,7 +215,7 @@ RICH = bytes(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(
     changes=st.lists(st.tuples(st.integers(0, len(RICH) - 1), st.integers(0, 255)), max_size=4),
     length=st.sampled_from([len(RICH)] * 9 + [len(RICH) // 2]),

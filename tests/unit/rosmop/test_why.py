@@ -84,6 +84,16 @@ def metric(random: Random) -> str:
     return part(3)
 
 
+def ahead(random: Random) -> str:
+    """A formula of mtl about the future."""
+    one, other = random.sample(EVENTS, 2)
+    bounds = f"[{random.choice([0, 1])}ms,{random.randrange(2, 6)}ms]"
+    return random.choice([
+        f"{one} => eventually{bounds} {other}", f"{one} => always{bounds} !{other}", f"!{one} or next{bounds} {other}",
+        f"{one} => (!{other} until{bounds} {one})", f"eventually{bounds} ({one} and next{bounds} {other})",
+    ])  # fmt: skip
+
+
 def pattern(random: Random) -> str:
     """A pattern, with a time bound or without."""
     scope = random.choice(["globally", "after a", "until b", "after a until b"])
@@ -121,6 +131,7 @@ MAKERS = {
     "ltl": future,
     "ptltl": past,
     "mtl": metric,
+    "mtl future": ahead,
     "pattern": pattern,
     "cfg": grammar,
     "srs": rewriting,
@@ -211,7 +222,9 @@ def test_the_named_events_alone_give_the_verdict(logic: str) -> None:
     count = cut = 0
     for _ in range(40):
         try:
-            made = compiled(logic, MAKERS[logic](random), CALLS if logic == "ptcaret" else EVENTS)
+            made = compiled(
+                logic.split(maxsplit=1)[0], MAKERS[logic](random), CALLS if logic == "ptcaret" else EVENTS
+            )
         except FormulaError:
             continue
         for explanation, target, category, before in explained(made, random, 30):
@@ -237,7 +250,9 @@ def test_what_is_cut_says_so(logic: str, monkeypatch: pytest.MonkeyPatch) -> Non
     whole = cut = 0
     for _ in range(40):
         try:
-            made = compiled(logic, MAKERS[logic](random), CALLS if logic == "ptcaret" else EVENTS)
+            made = compiled(
+                logic.split(maxsplit=1)[0], MAKERS[logic](random), CALLS if logic == "ptcaret" else EVENTS
+            )
         except FormulaError:
             continue
         for explanation, target, category, before in explained(made, random, 30):
@@ -336,6 +351,27 @@ def test_what_was_long_ago_is_known_by_what_it_led_to() -> None:
     assert deciding(made.source, explanation) == []
 
 
+@pytest.mark.parametrize("between", [10, 1500])
+@pytest.mark.parametrize(
+    ("formula", "last", "because"),
+    [("a => eventually[0,1s] b", 2, [0]), ("a => always[0,1s] !b", 1, [0, 1])],
+    ids=["by a deadline", "by an event"],
+)
+def test_a_long_trace_of_the_future(formula: str, last: int, because: list[int], between: int) -> None:
+    """The event that the formula was asked at explains it, with what decides it, however many came between the two."""
+    made = compiled("mtl", formula)
+    run, history, now = made.start(0), history_of(made, 0), 0
+    for event in [1, *[2] * 30, 0, *[2] * between, last]:
+        now += MILLISECOND // 10
+        told = history.step(run, event, now, NOBODY)
+    while run.deadline is not None:
+        told = history.expire(run)
+    assert "violation" in told
+    explanation = history.explain("violation")
+    assert explanation is not None
+    assert ([one.event for one in explanation.events], explanation.fewest) == (because, True)
+
+
 def test_a_verdict_of_a_slice_is_explained_by_its_own_events() -> None:
     """Not by those of another binding, though they came between, and though most of them need no more than a table."""
     text = """goals(int id) {
@@ -373,7 +409,7 @@ def test_what_was_compared_and_which_statement_dropped() -> None:
     monitors.start(0)
     passed = monitors.process("/fire", message("std_msgs/Int32", data=5), 1)
     assert passed.conditions == {"gun.rv:3:65": {"x": 5, "count": 0}}
-    assert passed.statement is None
+    assert passed.dropped_at is None
     dropped = monitors.process("/fire", message("std_msgs/Int32", data=7), 2)
-    assert str(dropped.statement) == "gun.rv:6:17"
+    assert str(dropped.dropped_at) == "gun.rv:6:17"
     assert dropped.conditions == {"gun.rv:3:65": {"x": 7, "count": 1}, "gun.rv:4:17": {"x": 7}}

@@ -18,6 +18,7 @@ from appliance.relay.connections.frames import (
 )
 from appliance.relay.connections.memory import HostShare
 from appliance.ros.errors import LimitExceededError, PeerError
+from tests.support.examples import examples
 from tests.support.relay_memory import share
 
 LIMIT = 16 << 20
@@ -56,7 +57,7 @@ sizes = st.lists(
 cut_sizes = st.lists(st.integers(1, 2 * LARGE), min_size=1, max_size=20)
 
 
-@settings(max_examples=150)
+@settings(max_examples=examples(150))
 @given(sizes, cut_sizes)
 def test_every_way_of_cutting_the_stream_gives_the_same_frames(lengths: list[int], cuts: list[int]) -> None:
     """Nothing is lost, repeated or torn, and each batch says where its last frame begins."""

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from appliance.relay.connections.outbox import Outbox
 from appliance.relay.limits import Limits
+from tests.support.examples import examples
 from tests.support.relay_memory import share
 
 LIMITS = replace(Limits(), queue_messages=5, queue_bytes=100)
@@ -52,7 +53,7 @@ batches = st.lists(st.integers(0, 40), min_size=1, max_size=8)
 steps = st.lists(st.one_of(batches, st.floats(0, 1), st.none()), max_size=30)
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(steps)
 def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | float | None]) -> None:
     """Whatever is queued, sent in parts and trimmed: same bytes, same counts, and memory accounted for."""

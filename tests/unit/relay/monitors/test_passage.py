@@ -1,7 +1,7 @@
 """A batch through the monitors together is what its messages are one by one: bytes, records, counters, state."""
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -51,10 +51,18 @@ class Monitored:
     """Monitors in the middle, with a clock that is set, with or without the module that takes messages together."""
 
     def __init__(
-        self, texts: dict[str, str], known: Definitions, *, together: bool, on_fault: Any = "drop"
+        self,
+        texts: dict[str, str],
+        known: Definitions,
+        *,
+        together: bool,
+        on_fault: Any = "drop",
+        trials: Collection[str] = (),
+        restarted: bool = False,
+        began: int = 1_000_000_000,
     ) -> None:
         self.heard = Heard()
-        self.time = 1_000_000_000
+        self.time = began
         self._loop = Loop()
         self.middle = Middle(
             self._loop,
@@ -63,18 +71,20 @@ class Monitored:
             changed=lambda _topics: None,
         )
         self.middle.now = lambda: self.time  # type: ignore[method-assign]  # the test sets the time
-        self._lanes: dict[str, Lane] = {}
-        self.set = MonitorSet.load(texts, known, on_fault)
+        self._lanes: dict[tuple[str, str], Lane] = {}
+        self.set = MonitorSet.load(texts, known, on_fault, trials=trials)
         if together:
             self.set.write_module()
-        self.middle.compiled(SpecificationsStated(1, [], {}, {}, restarted=False), self.set)
+        self.middle.compiled(SpecificationsStated(1, [], {}, {}, restarted=restarted), self.set)
 
     def close(self) -> None:
         """End."""
         self.middle.close()
         self._loop.close()
 
-    def through(self, traffic: Traffic, first: int = 1) -> tuple[int, bytes, bytes]:
+    def through(
+        self, traffic: Traffic, first: int = 1, publisher: str = "/talker"
+    ) -> tuple[int, bytes, bytes]:
         """What is left of the messages: how many, all of them, the last."""
         scratch = Scratch()
         scratch.move(self.set.area)
@@ -84,9 +94,8 @@ class Monitored:
         assert batch is not None
         assert batch.messages == traffic.messages
         batch.first = first
-        lane = self._lanes.setdefault(
-            traffic.topic, self.middle.lane(Place("key", traffic.topic, "10.0.0.7", "/talker"))
-        )
+        place = Place("key", traffic.topic, "10.0.0.7", publisher)
+        lane = self._lanes.setdefault((traffic.topic, publisher), self.middle.lane(place))
         left = lane.through(batch)
         if left is None:
             return 0, b"", b""

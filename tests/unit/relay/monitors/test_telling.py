@@ -67,6 +67,7 @@ def test_a_change_is_recorded_under_the_monitor_that_made_it(told: Told) -> None
         "changed_by": ["stop.drive"],
         "number": 1,
         "at": ["0.rv:1:30"],
+        "conditions": {"0.rv:2:9": {"v": 5.0}},
     }
     assert told.counts() == {"stop": (0, 1), "turn": (0, 0), "look": (0, 0)}
 
@@ -219,6 +220,15 @@ def test_a_verdict_names_its_binding(together: bool) -> None:
         ("property 1 of turns (ere) with x = 5.0: match", {"x": 5.0}),
         ("property 1 of turns (ere) with x = 6.0: match", {"x": 6.0}),
     ]
+    told.monitored.close()
+
+
+def test_how_many_slices_there_are() -> None:
+    """Beside how many there may be; none of what has no parameters."""
+    told = Told(together=False, texts=(AGAIN, TURNED))
+    told.send((5, 0, 0), (6, 0, 0), (5, 0, 0))
+    rows = {row.name: (row.slices, row.slice_limit) for row in told.monitored.rows()}
+    assert rows == {"again": (2, 100_000), "turned": (0, 0)}
     told.monitored.close()
 
 

@@ -1,4 +1,4 @@
-"""What the form means: runs it node by node, plainly and slowly.
+"""What the form means: runs it node by node, plainly and slowly. Every faster way is held against it.
 
 One method for each kind of expression and statement, in the order of `form.py`. Strings are bytes, vectors and messages
 lists, times and durations integers; everything else is the Python value that is closest. What the functions of the
@@ -6,32 +6,26 @@ form do is in `runtime/`, how values stand in a message in `values.py`.
 
 Invariants:
 
-1. A fault stops the function that faults and all that have called it, and comes out as `Stopped`.
+1. A fault stops the function that faults and all that have called it; where it was is in `fault` then.
 2. A name is that of a variable of the set, or of one call: nothing outlives a call but those and what is in them.
 """
 
 import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from appliance.ros.definitions import Definitions
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.functions import CHARGING, FAULTING, FUNCTIONS
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.runtime import numbers, output, texts, times, vectors, wire
-from appliance.rosmop.runtime.context import MAX_CALLS, Context, FaultError, Turn
+from appliance.rosmop.runtime.context import MAX_CALLS, Context, FaultError
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import Messages
-
-CHARGED = 1024
-"""A message longer than this is charged when an array or all of it is decoded."""
-
-SHORT = 64
-"""To compare with a string of so many bytes takes no longer than any other instruction."""
 
 _FRAMES = 40_000  # of Python's: those of `MAX_CALLS` calls, each deep in expressions
 
@@ -57,18 +51,17 @@ _CALCULATED: Mapping[str, Callable[[Any, Any], Any]] = MappingProxyType(
 )
 
 
-class Stopped(Exception):  # noqa: N818  what stopped is told by `error`
-    """A fault: of which kind, at which site (-1: nowhere in particular), and the variables that had values there.
+@dataclass
+class Fault:
+    """Where the last error came: at which site (-1: nowhere in particular), with which values of variables.
 
     `happened`: the event had happened by then.
     """
 
-    def __init__(self, error: Exception, site: int, variables: Mapping[str, Any]) -> None:
-        super().__init__(str(error))
-        self.error = error
-        self.site = site
-        self.variables = variables
-        self.happened = False
+    error: Exception | None = None
+    site: int = -1
+    variables: Mapping[str, Any] = field(default_factory=dict)
+    happened: bool = False
 
 
 class Frame:
@@ -111,6 +104,7 @@ class Interpreter:
         self._contexts = contexts
         self._values = Values(messages)
         self._frames: list[Frame] = []
+        self.fault = Fault()
         for context in contexts.values():
             context.live = self._live
 
@@ -136,11 +130,11 @@ class Interpreter:
         limit = sys.getrecursionlimit()
         sys.setrecursionlimit(max(limit, _FRAMES))
         try:
-            return self._call(function, Frame(self._contexts[function.context], function.shared, message))
+            return self._run_in(function, Frame(self._contexts[function.context], function.shared, message))
         finally:
             sys.setrecursionlimit(limit)
 
-    def _call(self, function: form.Function, frame: Frame) -> Any:
+    def _run_in(self, function: form.Function, frame: Frame) -> Any:
         self._frames.append(frame)
         done = 0
         try:
@@ -148,14 +142,12 @@ class Interpreter:
                 if self._statement(statement, frame) is not None:
                     break
                 done += 1
-        except Stopped as stopped:
-            stopped.happened = function.happens is not None and done >= function.happens
+        except Exception as error:
+            if error is not self.fault.error:
+                site = error.site if isinstance(error, FaultError) and error.site >= 0 else self._site
+                self.fault = Fault(error, site, frame.variables | self._shared)
+            self.fault.happened = function.happens is not None and done >= function.happens
             raise
-        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this function
-            site = error.site if isinstance(error, FaultError) and error.site >= 0 else self._site
-            fault = Stopped(error, site, frame.variables | self._shared)
-            fault.happened = function.happens is not None and done >= function.happens
-            raise fault from None
         finally:
             self._frames.pop()
         return frame.result
@@ -223,7 +215,7 @@ class Interpreter:
     def _allocate(self, node: form.Allocate, frame: Frame) -> None:
         if node.size is not None:
             frame.context.allocate(node.size, node.site)
-        elif len(frame.buffer) > CHARGED:
+        elif len(frame.buffer) > form.CHARGED:
             frame.context.allocate(len(frame.buffer), node.site)
 
     def _limit_depth(self, node: form.LimitDepth, frame: Frame) -> None:
@@ -246,7 +238,7 @@ class Interpreter:
     # Fields of the message
 
     def _message(self, frame: Frame) -> wire.Message:
-        assert frame.message is not None  # noqa: S101  only functions of messages look at one
+        assert frame.message is not None
         return frame.message
 
     def _after_text(self, node: form.AfterText, frame: Frame) -> None:
@@ -350,7 +342,7 @@ class Interpreter:
         if isinstance(kind, kinds.Floating):
             result = numbers.ratio(left, right) if operator == "/" else _CALCULATED[operator](left, right)
             return numbers.f32(result) if kind.bits == 32 else result
-        assert isinstance(kind, kinds.Integer)  # noqa: S101  numbers that are calculated with are one of the two
+        assert isinstance(kind, kinds.Integer)
         if operator == "/":
             result = numbers.divide(left, right, node.site)
         elif operator == "%":
@@ -383,7 +375,7 @@ class Interpreter:
         return _COMPARED[node.operator](left, self.value(node.right, frame))
 
     def _compare_texts(self, node: form.CompareTexts, frame: Frame) -> bool:
-        few = isinstance(node.right, form.Read) and len(self.value(node.right, frame)) <= SHORT
+        few = isinstance(node.right, form.Read) and len(self.value(node.right, frame)) <= form.SHORT
         left = self.value(node.left, frame)
         if not (node.short or few):
             texts.charged(frame.context, left, node.site)
@@ -429,14 +421,14 @@ class Interpreter:
             return self._values.measure(node.of)
         return lambda value: self._values.copier(node.of)(frame.context, value, node.site)
 
-    def _call_function(self, node: form.Call, frame: Frame) -> Any:
+    def _call(self, node: form.Call, frame: Frame) -> Any:
         before = (frame.context,) if node.function in CHARGING else ()
         after = (node.site,) if node.function in FAULTING else ()
         arguments = [self.value(argument, frame) for argument in node.arguments]
         return FUNCTIONS[node.function](*before, *arguments, *after)
 
     def _accumulate(self, node: form.Accumulate, frame: Frame) -> Any:
-        assert isinstance(node.vector.type, kinds.Vector)  # noqa: S101  it has elements to add
+        assert isinstance(node.vector.type, kinds.Vector)
         element, wide = node.vector.type.element, node.wide
 
         def add(sum_of_them: Any, each: Any) -> Any:
@@ -457,7 +449,7 @@ class Interpreter:
         inner.variables = dict(zip(function.parameters, values, strict=False))
         inner.depth = frame.depth + 1 if node.depth else 0
         site = self._site
-        result = self._call(function, inner)
+        result = self._run_in(function, inner)
         self._site = site
         return result
 
@@ -498,7 +490,7 @@ def converted(value: Any, source: Type, target: Type) -> Any:
         if target.bits == 64:
             return float(value)
         return numbers.f32_of_integer(value) if isinstance(source, kinds.Integer) else numbers.f32(value)
-    assert isinstance(target, kinds.Integer)  # noqa: S101  numbers are one of the three
+    assert isinstance(target, kinds.Integer)
     if isinstance(source, kinds.Floating):
         return numbers.truncate(value, target.least, target.most)
     return numbers.wrap(int(value), target.bits, target.signed)
@@ -519,76 +511,9 @@ def _recast(context: Context, values: list[Any], element: Type, site: int) -> li
     )
 
 
-def constant_of(node: form.Expression) -> bool | int | float:
-    """The value of an expression of numbers without variables. Raises `FaultError`."""
-    value: bool | int | float = _NOTHING.value(node, _NOWHERE)
-    return value
-
-
-_EXPRESSIONS: Mapping[type[Any], Callable[[Interpreter, Any, Frame], Any]] = MappingProxyType(
-    {
-        form.Literal: Interpreter._literal,
-        form.Read: Interpreter._read,
-        form.Assign: Interpreter._assign,
-        form.Convert: Interpreter._convert,
-        form.Arithmetic: Interpreter._arithmetic,
-        form.Unary: Interpreter._unary,
-        form.Moment: Interpreter._moment,
-        form.MomentOf: Interpreter._moment_of,
-        form.Compare: Interpreter._compare,
-        form.CompareTexts: Interpreter._compare_texts,
-        form.Logical: Interpreter._logical,
-        form.Not: Interpreter._not,
-        form.Conditional: Interpreter._conditional,
-        form.Sequence: Interpreter._sequence,
-        form.Discard: Interpreter._discard,
-        form.Item: Interpreter._item,
-        form.Vector: Interpreter._vector,
-        form.Zero: Interpreter._zero,
-        form.Copy: Interpreter._copy,
-        form.Recast: Interpreter._recast,
-        form.OfType: Interpreter._of_type,
-        form.Call: Interpreter._call_function,
-        form.Accumulate: Interpreter._accumulate,
-        form.Invoke: Interpreter._invoke,
-        form.Format: Interpreter._format,
-        form.Join: Interpreter._join,
-        form.Log: Interpreter._log,
-        form.Throttle: Interpreter._throttle,
-        form.Now: Interpreter._now,
-        form.Whole: Interpreter._whole,
-    }
+_EXPRESSIONS: Mapping[type[Any], Callable[[Interpreter, Any, Frame], Any]] = form.methods_of(
+    Interpreter, form.Expression
 )
-
-_STATEMENTS: Mapping[type[Any], Callable[[Interpreter, Any, Frame], str | None]] = MappingProxyType(
-    {
-        form.Evaluate: Interpreter._evaluate,
-        form.If: Interpreter._if,
-        form.Loop: Interpreter._loop,
-        form.ForEach: Interpreter._for_each,
-        form.Break: Interpreter._break,
-        form.Continue: Interpreter._continue,
-        form.Select: Interpreter._select,
-        form.Return: Interpreter._return,
-        form.Leave: Interpreter._leave,
-        form.Charge: Interpreter._charge,
-        form.Allocate: Interpreter._allocate,
-        form.LimitDepth: Interpreter._limit_depth,
-        form.Drop: Interpreter._drop,
-        form.Reset: Interpreter._reset,
-        form.Publish: Interpreter._publish,
-        form.AfterText: Interpreter._after_text,
-        form.Count: Interpreter._count,
-        form.AfterElements: Interpreter._after_elements,
-        form.Skip: Interpreter._skip,
-        form.NotPast: Interpreter._not_past,
-        form.ReadNumbers: Interpreter._read_numbers,
-        form.ReadValue: Interpreter._read_value,
-        form.Require: Interpreter._require,
-        form.Pending: Interpreter._pending,
-        form.WriteBack: Interpreter._write_back,
-    }
+_STATEMENTS: Mapping[type[Any], Callable[[Interpreter, Any, Frame], str | None]] = form.methods_of(
+    Interpreter, form.Statement
 )
-
-_NOTHING = Interpreter({}, {}, {}, Messages(Definitions({})))
-_NOWHERE = Frame(Context("", Turn(), {}))

@@ -1,0 +1,370 @@
+"""Everything that a monitor does explains itself: who, which events, which values, which line.
+
+Each row of the tables is a kind of event and what comes of it. The events that a record names are given alone to the
+same specification, which begins anew; they must bring about the same. The lines for people are made of the record as
+`rosrv audit why`, REST and the console show them.
+"""
+
+import struct
+import time
+from collections.abc import Collection, Iterable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple, cast
+
+import pytest
+
+from appliance.audit.output import Entry, without_contents
+from appliance.audit.record import Record, Severity
+from appliance.audit.why import lines_of
+from appliance.audit_trail import AuditTrail
+from appliance.channel.messages import MonitorEvent
+from appliance.relay.monitors.places import Place
+from appliance.rosmop.explained import moment
+from appliance.specifications.observed import MonitorRecords
+from tests.support.idle import idle_class
+from tests.unit.relay.monitors.test_passage import Monitored
+from tests.unit.rosmop.acting import message
+from tests.unit.rosmop.random_specifications import Traffic, definitions
+
+MS = 1_000_000
+START = time.time_ns() + 3_600_000 * MS
+"""Later than now: specifications on trial look at the clock, which is not to be ahead of the messages."""
+
+
+class Given(NamedTuple):
+    """A message of a topic, or what a client or a server says; milliseconds after the beginning."""
+
+    at: int
+    where: str
+    value: int
+    who: str
+
+
+class Row(NamedTuple):
+    """What is written, what comes, which kind of event is told of it, and what that has to say."""
+
+    text: str
+    given: list[Given]
+    kind: str
+    by: str
+    """The caller id; empty of what time alone has done."""
+    at: str
+    """The text that begins where it is written."""
+    because: list[tuple[str, str]]
+    """The events that explain a verdict, or the verdict in whose handler it happened, and who sent each."""
+    where: dict[str, dict[str, object]]
+    """Conditions by the text that they begin with."""
+    values: Mapping[str, object] = MappingProxyType({})
+    restarted: bool = False
+
+
+class Trail(idle_class(AuditTrail)):  # type: ignore[misc]  # it is made
+    """Keeps records."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+
+    def happened(
+        self, event: str, reason: str, *, severity: Severity, host: str | None, caller_id: str | None, category: str,
+        resource: str, more: dict[str, Any], **detail: Any,
+    ) -> str:  # fmt: skip
+        """As `AuditTrail`."""
+        self.records.append(
+            Record(
+                id="1", time=1, event=event, severity=severity, host=host, caller_id=caller_id, category=category,
+                resource=resource, reason=reason, detail={**more, **detail},
+            )
+        )  # fmt: skip
+        return "1"
+
+
+def events_of(
+    row: Row, given: Iterable[Given], *, together: bool, trials: Collection[str] = ()
+) -> list[MonitorEvent]:
+    """What control is told when these have come."""
+    monitored = Monitored(
+        {"x.rv": row.text},
+        definitions(),
+        together=together,
+        trials=trials,
+        restarted=row.restarted,
+        began=START,
+    )
+    try:
+        for one in given:
+            monitored.time = START + one.at * MS
+            if one.where == "request":
+                place = Place("k", "/mode", "10.0.0.8", one.who)
+                monitored.middle.request(place, bytes([one.value]))
+            elif one.where == "response":
+                place = Place("k", "/mode", "10.0.0.9", one.who)
+                monitored.middle.response(place, struct.pack("<BI", one.value, 0))
+            else:
+                body = message("std_msgs/Int32", data=one.value)
+                monitored.through(
+                    Traffic(one.where, struct.pack("<I", len(body)) + body, 1), publisher=one.who
+                )
+            if trials:
+                monitored.middle.trials.have_turn()
+        monitored.middle.observations.flush()
+        return [one for one in monitored.sent() if isinstance(one, MonitorEvent)]
+    finally:
+        monitored.close()
+
+
+def told(row: Row, given: Iterable[Given], *, together: bool, trial: bool = False) -> MonitorEvent | None:
+    """The first event of the row's kind that is told in full."""
+    names = [row.text.removeprefix("hold ").split("(")[0].strip()] if trial else []
+    kind = f"trial {row.kind}" if trial else row.kind
+    found = events_of(row, given, together=together, trials=names)
+    return next((one for one in found if one.kind == kind and not one.count), None)
+
+
+def place(text: str, piece: str) -> str:
+    """Where a piece of a text stands; of the head of a property where its formula does."""
+    before = text[: text.index(piece) + (len(piece) + 1) * piece.endswith(":")]
+    return f"x.rv:{before.count(chr(10)) + 1}:{len(before) - before.rfind(chr(10))}"
+
+
+def check(row: Row, *, together: bool, trial: bool = False) -> None:
+    """The event, the record of it and its lines say what the row does, and the events named are enough."""
+    found = told(row, row.given, together=together, trial=trial)
+    assert found is not None
+    detail = found.detail
+    assert found.caller_id == row.by
+    assert bool(found.host) is bool(row.by)
+    at = place(row.text, row.at)
+    assert at in detail["at"]
+    where = {place(row.text, piece): values for piece, values in row.where.items()}
+    assert detail.get("conditions", {}) == where
+    assert detail.get("values", {}) == row.values
+    named = detail.get("why", {}).get("events", [])
+    assert [(one["event"], one.get("node", "")) for one in named] == row.because
+    trail = Trail()
+    MonitorRecords(cast(Any, trail), lambda _topic, _data: None, []).reported([found], 0)
+    (record,) = trail.records
+    lines = list(lines_of(record))
+    assert lines[0] == record.reason
+    assert any(line.startswith("by: ") and f"{row.by} on {found.host}" in line for line in lines) is bool(
+        row.by
+    )
+    assert any(line.startswith("at: ") and at in line for line in lines)
+    assert [line.split(",")[0] for line in lines if line.startswith("where: ")] == [
+        f"where: {one}" for one in where
+    ]
+    assert [line for line in lines if line.startswith("because: ")] == [
+        line
+        for line in lines
+        if any(line.startswith(f"because: {event} at ") for event, _node in row.because)
+    ]
+    assert sum(line.startswith("because: ") for line in lines) == len(row.because)
+    for name, value in (*row.values.items(), *(pair for one in where.values() for pair in one.items())):
+        assert any(f"{name} = {value}" in line for line in lines)
+    hidden = "\n".join(lines_of(without_contents(Entry(1, record)).record))
+    assert "because: " not in hidden
+    assert "where: " not in hidden
+    assert "with: " not in hidden
+    if named:
+        times = {one["time"] for one in named}
+        alone = [one for one in row.given if moment(START + one.at * MS) in times]
+        again = told(
+            row, [*alone, Given(row.given[-1].at, "/clock", 0, "/clock")], together=together, trial=trial
+        )
+        assert again is not None
+        assert again.text == found.text
+
+
+INT = "std_msgs/Int32 '{data:%s}'"
+CLOCK = "event clock() /clock std_msgs/Int32 '{}' { }"
+A, B = (f"event {name}(int {name}) /{name} std_msgs/Int32 '{{data:{name}}}'" for name in "ab")
+ARM, STICK = "/arm", "/stick"
+BOTH = [("a", ARM), ("b", STICK)]
+
+
+def given(text: str) -> list[Given]:
+    """Messages `a5` (5 on /a, of the arm) and `b1` (1 on /b, of the stick), 10 ms after each other; `.` is 10 ms more;
+    `c0` lets the time pass.
+    """
+    who = {"a": ARM, "b": STICK, "c": "/clock", "q": "/client", "r": "/server"}
+    where = {"c": "/clock", "q": "request", "r": "response"}
+    found, now = [], 0
+    for word in text.split():
+        now += 10
+        if word != ".":
+            found.append(Given(now, where.get(word[0], f"/{word[0]}"), int(word[1:]), who[word[0]]))
+    return found
+
+
+def logic(formula: str, words: str, because: list[tuple[str, str]], by: str = STICK) -> Row:
+    """A verdict of a formula over `a` and `b`."""
+    text = f"m() {{ {A} {{ }} {B} {{ }} {CLOCK}\n {formula} {{ }} }}"
+    return Row(text, given(words), "verdict", by, formula[: formula.index(":") + 1], because, {})
+
+
+VERDICTS = {
+    "fsm": logic(
+        "fsm: up [ a -> armed, clock -> up ] armed [ b -> bad, clock -> armed ] bad [ ] @bad", "c1 a1 b1", BOTH
+    ),
+    "ere": logic("ere: a b @match", "a1 b1", BOTH),
+    "ltl": logic("ltl: [] (a => o !b) @violation", "c1 a1 b1", BOTH),
+    "ptltl": logic("ptltl: b -> !(<*> a) @violation", "a1 c1 b1", BOTH),
+    "mtl past": logic("mtl: b -> !(once[0,1s] a) @violation", "a1 c1 b1", BOTH),
+    "mtl future": logic("mtl: a => !(eventually[0,1s] b) @violation", "a1 c1 b1", BOTH),
+    "cfg": logic("cfg: S -> a S b | epsilon @fail", "c1", [("clock", "/clock")], by="/clock"),
+    "srs": logic("srs: a b -> #fail . clock -> #epsilon . @fail", "c1 a1 b1", BOTH),
+    "ptcaret": logic("ptcaret: b -> !(<*> a) @violation", "a1 c1 b1", BOTH),
+    "tfsm": logic(
+        "tfsm: up [ a -> armed, default up ] armed [ b -> bad, timeout 1s -> up ] bad [ ] @bad", "a1 b1", BOTH
+    ),
+    "a timeout of a tfsm": logic(
+        "tfsm: up [ a -> armed, default up ] armed [ b -> up, timeout 20ms -> late ] late [ default up ] @late",
+        "b1 a1 . . . c0", [("a", ARM)], by="",
+    ),
+    "a deadline of a pattern": logic(
+        "pattern: globally: a causes b within 20ms @violation", "b1 a1 . . . c0", [("a", ARM)], by=""
+    ),
+    "a deadline of mtl": logic("mtl: a => eventually[0,20ms] b @violation", "b1 a1 . . . c0", [("a", ARM)], by=""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("trial", [False, True], ids=["in force", "on trial"])
+@pytest.mark.parametrize("name", VERDICTS)
+def test_a_verdict(name: str, *, trial: bool) -> None:
+    """Of each logic, by a message or by the time that passes: the events that alone give it, and who sent them."""
+    check(VERDICTS[name], together=not trial, trial=trial)
+
+
+WHEN = "when (b > 2)"
+ALARM = "std_msgs::Int32 x; PUBLISH(/alarm, std_msgs/Int32, x);"
+ERE = "ere: a b @match"
+ASK = "event q(bool on) service /mode std_srvs/SetBool request '{data:on}'"
+REPLY = "event r(bool ok) service /mode std_srvs/SetBool response '{success:ok}'"
+SLICED = f"m(int a) {{ event begin(int a) /a {INT % 'a'} {{ }} event end(int a) /b {INT % 'a'} {{ }}\n"
+PAIR = [("begin", ARM), ("end", STICK)]
+
+OUTCOMES = {
+    "a verdict with a guard": Row(
+        f"m() {{ {A} {{ }} {B} {WHEN} {{ }} {ERE} {{ }} }}", given("a1 b7"), "verdict", STICK, "ere:", BOTH,
+        {"(b > 2)"[1:-1]: {"b": 7}},
+    ),
+    "a drop": Row(
+        f"m() {{ {B} {WHEN} {{ if (b == 7) {{ DROP; }} }} }}", given("b7"), "drop", STICK, "DROP;", [],
+        {"b > 2": {"b": 7}, "b == 7": {"b": 7}},
+    ),
+    "a drop by return": Row(
+        f"m() {{ {B} {{ if (b == 7) {{ return; }} }} }}", given("b7"), "drop", STICK, "return;", [],
+        {"b == 7": {"b": 7}},
+    ),
+    "a drop in a handler": Row(
+        f"m() {{ {A} {{ }} {B} {{ }} {ERE} {{ DROP; }} }}", given("a1 b1"), "drop", STICK, "DROP;", BOTH, {}
+    ),
+    "a drop by a fault": Row(
+        f"m() {{ {B} {{ int zero = b - 7; b = 1 / zero; }} }}", given("b7"), "drop", STICK, "1 / zero", [], {},
+        {"zero": 0},
+    ),
+    "a drop by a fault in a handler": Row(
+        f"m() {{ int zero = 0; {A} {{ }} {B} {{ }} {ERE} {{ zero = 1 / zero; }} }}", given("a1 b1"), "drop", STICK,
+        "1 / zero", BOTH, {}, {"zero": 0},
+    ),
+    "what is held": Row(
+        f"hold m() {{ {B} {{ }} }}", given("b1"), "drop", STICK, "hold", [], {}, restarted=True
+    ),
+    "what could not begin": Row(
+        f"m() {{ int zero = 0; init() {{ zero = 1 / zero; }} {B} {{ }} }}", given("b1"), "drop", STICK, "m()", [], {}
+    ),
+    "a change": Row(
+        f"m() {{ {B} {WHEN} {{ if (b == 7) {{ b = 1; }} }} }}", given("b7"), "change", STICK, "event b", [],
+        {"b > 2": {"b": 7}, "b == 7": {"b": 7}},
+    ),
+    "a publication": Row(
+        f"m() {{ {B} {WHEN} {{ if (b == 7) {{ {ALARM} }} }} }}", given("b7"), "publish", STICK, "PUBLISH", [],
+        {"b > 2": {"b": 7}, "b == 7": {"b": 7}},
+    ),
+    "a publication of a function": Row(
+        f"m() {{ warn(int level) {{ if (level == 7) {{ {ALARM} }} }} {B} {{ warn(b); }} }}", given("b7"), "publish",
+        STICK, "PUBLISH", [], {"level == 7": {"level": 7}},
+    ),
+    "a publication in a handler": Row(
+        f"m() {{ {A} {{ }} {B} {{ }} {ERE} {{ {ALARM} }} }}", given("a1 b1"), "publish", STICK, "PUBLISH", BOTH, {}
+    ),
+    "a publication that is enforced": Row(
+        f"m() {{ warn() {{ {ALARM} }} {A} {{ }} {B} {{ }} {CLOCK}\n"
+        " pattern: globally: a causes b within 20ms enforced by warn @violation { } }",
+        given("b1 a1 . . . c0"), "publish", "", "PUBLISH", [("a", ARM)], {},
+    ),
+    "a verdict of what is enforced": Row(
+        f"m() {{ warn() {{ {ALARM} }} {A} {{ }} {B} {{ }} {CLOCK}\n"
+        " pattern: globally: a causes b within 20ms enforced by warn @violation { } }",
+        given("b1 a1 . . . c0"), "verdict", "", "pattern:", [("a", ARM)], {},
+    ),
+    "a fault": Row(
+        f"m() {{ {B} {WHEN} {{ int zero = b - 7; b = 1 / zero; }} }}", given("b7"), "fault", STICK, "1 / zero", [],
+        {"b > 2": {"b": 7}}, {"zero": 0},
+    ),
+    "a publication of a tick": Row(
+        f"m() {{ int seen = 0; {B} {{ seen = b; }} {CLOCK}\n"
+        f" event tick() every 10ms {{ if (seen == 7) {{ {ALARM} }} }} }}",
+        given("b7 . . c0"), "publish", "", "PUBLISH", [], {"seen == 7": {"seen": 7}},
+    ),
+    "a verdict of a tick": Row(
+        f"m() {{ {B} {{ }} event tick() every 10ms {{ }} {CLOCK}\n ptltl: tick -> !(<*> b) @violation {{ }} }}",
+        given("b7 . . c0"), "verdict", "", "ptltl:", [("b", STICK), ("tick", "")], {},
+    ),
+    "a fault of a tick": Row(
+        f"m() {{ int zero = 0; {B} {{ }} event tick() every 10ms {{ zero = 1 / zero; }} {CLOCK} }}",
+        given("b7 . . c0"), "fault", "", "1 / zero", [], {}, {"zero": 0},
+    ),
+    "a verdict of a request": Row(
+        f"m() {{ {A} {{ }} {ASK} when (on) {{ }} ere: a q @match {{ }} }}", given("a1 q1"), "verdict", "/client",
+        "ere:", [("a", ARM), ("q", "/client")], {"on) {": {"on": True}},
+    ),
+    "a verdict of a reply": Row(
+        f"m() {{ {ASK} {{ }} {REPLY} {{ }} ere: q r @match {{ }} }}", given("q1 r1"), "verdict", "/server", "ere:",
+        [("q", "/client"), ("r", "/server")], {},
+    ),
+    "a request that is refused": Row(
+        f"m() {{ {ASK} {{ if (on) {{ DROP; }} }} }}", given("q1"), "drop", "/client", "DROP;", [],
+        {"on) { D": {"on": True}},
+    ),
+    "a request that a handler refuses": Row(
+        f"m() {{ {A} {{ }} {ASK} {{ }} ere: a q @match {{ DROP; }} }}", given("a1 q1"), "drop", "/client", "DROP;",
+        [("a", ARM), ("q", "/client")], {},
+    ),
+    "a reply that is refused": Row(
+        f"m() {{ {REPLY} {{ if (ok) {{ DROP; }} }} }}", given("r1"), "drop", "/server", "DROP;", [],
+        {"ok) { D": {"ok": True}},
+    ),
+    "a request that is changed": Row(
+        f"m() {{ {ASK} {{ if (on) {{ on = false; }} }} }}", given("q1"), "change", "/client", "event q", [],
+        {"on) { o": {"on": True}},
+    ),
+    "a reply that is changed": Row(
+        f"m() {{ {REPLY} {{ if (ok) {{ ok = false; }} }} }}", given("r1"), "change", "/server", "event r", [],
+        {"ok) { o": {"ok": True}},
+    ),
+    "a fault of a request": Row(
+        f"m() {{ {ASK} {{ int zero = 0; zero = 1 / zero; }} }}", given("q1"), "fault", "/client", "1 / zero", [], {},
+        {"zero": 0},
+    ),
+    "a verdict of a slice": Row(
+        f"{SLICED} ere: begin end @match {{ }} }}", given("a1 a2 b2"), "verdict", STICK, "ere:", PAIR, {}
+    ),
+    "a drop in a handler of a slice": Row(
+        f"{SLICED} ere: begin end @match {{ DROP; }} }}", given("a1 a2 b2"), "drop", STICK, "DROP;", PAIR, {}
+    ),
+    "a publication in a handler of a slice": Row(
+        f"{SLICED} ere: begin end @match {{ {ALARM} }} }}", given("a1 a2 b2"), "publish", STICK, "PUBLISH", PAIR, {}
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OUTCOMES)
+def test_what_comes_of_an_event(name: str) -> None:
+    """Every kind of event with every outcome."""
+    check(OUTCOMES[name], together=True)
+
+
+@pytest.mark.parametrize("name", [name for name in OUTCOMES if name not in ("what is held",)])
+def test_what_would_come_of_it_on_trial(name: str) -> None:
+    """The same of a specification that is given copies; it holds nothing."""
+    check(OUTCOMES[name], together=False, trial=True)
