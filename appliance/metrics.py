@@ -82,6 +82,8 @@ METRICS = (
         ("monitor", "place", "holds"),
         "how close a comparison of numbers at this line and column came today (UTC) while it was true, and while not",
     ),
+    Metric("rosrv_monitor_slices", "gauge", ("monitor",), "slices that a parametric specification has now"),
+    Metric("rosrv_monitor_slice_limit", "gauge", ("monitor",), "slices that it may have at a time"),
     Metric("rosrv_monitors", "gauge", ("state",), "monitors: enabled, trial, disabled, holding, failing"),
     Metric("rosrv_nodes", "gauge", ("state",), "nodes: live, or lost and awaited"),
     Metric("rosrv_registrations", "gauge", ("kind",), "registrations of live nodes"),

@@ -41,20 +41,19 @@ _MONITOR = (
     "monitor", "happened", "number", "seq", "stamp", "before", "after", "before_fields", "after_fields", "size",
     "count",
 )  # fmt: skip
+_LED = ("at", "events", "timer", "conditions")
 ELSEWHERE: dict[str, tuple[str, ...]] = {
     **_LOGS_OWN,
     "decision": ("call", "key", "node", "subgraph", "needs", "parts", "stranger"),
     "denials folded": _FOLDED,
     "repetitions folded": _FOLDED,
-    **dict.fromkeys(
-        ("monitor fault", "monitor log"),
-        _MONITOR,
-    ),
-    "monitor verdict": (*_MONITOR, "at", "conditions", "why"),
-    "message dropped": (*_MONITOR, "at", "conditions"),
-    "monitor published": (*_MONITOR, "because_of"),
-    "message changed": (*_MONITOR, "changed_by", "at", "conditions"),
-    "trial observed": (*_MONITOR, "changed_by", "trial", "would", "at", "conditions", "why"),
+    "monitor log": _MONITOR,
+    "monitor fault": (*_MONITOR, *_LED, "values"),
+    "monitor verdict": (*_MONITOR, *_LED, "why"),
+    "message dropped": (*_MONITOR, *_LED, "values", "handler", "why"),
+    "monitor published": (*_MONITOR, "because_of", *_LED, "handler", "why"),
+    "message changed": (*_MONITOR, "changed_by", *_LED),
+    "trial observed": (*_MONITOR, "changed_by", "trial", "would", *_LED, "values", "handler", "why"),
 }  # fmt: skip
 
 _HEAD = """\

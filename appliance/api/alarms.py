@@ -62,6 +62,11 @@ def _policy(status: Status) -> Iterator[Alarm]:
     if policy.confirm_by is not None:
         text = f"revision {policy.revision} goes back by itself unless it is confirmed"
         yield Alarm(kind="policy-unconfirmed", severity="warning", text=text, about="policy")
+    if policy.audit_only:
+        text = (
+            f"the policy refuses nothing by [{'], ['.join(policy.audit_only)}], it only records (audit-only)"
+        )
+        yield Alarm(kind="policy-audit-only", severity="warning", text=text, about="policy")
     if policy.differs_from_file:
         text = f"revision {policy.revision} is not what {policy.file} says"
         yield Alarm(kind="policy-differs", severity="notice", text=text, about="policy")

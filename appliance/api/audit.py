@@ -22,9 +22,9 @@ from appliance.api.judgement import explained, granted, is_refusal
 from appliance.api.moments import given
 from appliance.api.problems import ProblemError
 from appliance.api.roles import OPERATOR, VIEWER, Viewer, ask, reads_contents
-from appliance.api.routing import Responses, Routes
+from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
-from appliance.api.streams import Held, Streams, peer_of, turn
+from appliance.api.streams import Held, Streams, in_thread, peer_of, turn
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.evidence import evidence, evidence_line
@@ -33,7 +33,7 @@ from appliance.audit.output import Entry, as_json, as_object, without_contents
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
 from appliance.audit.schema import json_schema
-from appliance.audit.search import Follower, export, search, show
+from appliance.audit.search import Follower, Shown, export, search, show
 from appliance.audit.signatures import KeyUnreadableError
 from appliance.audit.verify import verify
 from appliance.channel.admin import PolicyWanted
@@ -151,6 +151,13 @@ class Desk:
         async with turn(self.searches, "searches of the audit log"):
             return await self.in_thread(function, *arguments, **named)
 
+    async def record(self, record_id: str, neighbours: int) -> Shown:
+        """A record with what was around it. Raises `ProblemError`."""
+        shown = await self.read(show, self.path, record_id, neighbours)
+        if shown is None:
+            raise ProblemError(404, "unknown", f"there is no record {record_id}")
+        return shown
+
     async def in_thread(self, function: Callable[..., _T], *arguments: Any, **named: Any) -> _T:
         """The same without waiting for a turn."""
         try:
@@ -166,7 +173,7 @@ def routes(services: Services) -> Routes:
     router = Routes(prefix="/v1/audit", tags=["audit"])
     desk = Desk(services)
 
-    @router.get("", operation_id="search_audit", responses=_json(_PAGE))
+    @router.get("", responses=_json(_PAGE))
     async def search_audit(
         bearer: Viewer,
         wanted: Wanted,
@@ -175,15 +182,11 @@ def routes(services: Services) -> Routes:
         order: Annotated[Literal["newest", "oldest"], Query(description="which comes first")] = "newest",
     ) -> JSONResponse:
         """Records that match, a page at a time; for viewers without what messages said (`detail.withheld`)."""
-        page = await desk.read(search, desk.path, wanted, cursor, limit, newest_first=order == "newest")
-        return JSONResponse({"records": _shown(page.entries, bearer, wanted.text), "cursor": page.cursor})
+        return JSONResponse(
+            await desk.read(page_of, desk.path, wanted, cursor, limit, bearer, newest_first=order == "newest")
+        )
 
-    @router.get(
-        "/stream",
-        operation_id="follow_audit",
-        responses=_text("text/event-stream", "Events `record`."),
-        response_class=Response,
-    )
+    @router.get("/stream", responses=file("text/event-stream", "Events `record`."), response_class=Response)
     async def follow_audit(
         request: Request,
         bearer: Viewer,
@@ -201,7 +204,7 @@ def routes(services: Services) -> Routes:
         following = _follow(services, desk, follower, bearer, wanted.text)
         return Held(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
-    @router.get("/verify", operation_id="verify_audit", dependencies=[OPERATOR])
+    @router.get("/verify", dependencies=[OPERATOR])
     async def verify_audit() -> Verification:
         """Prove that the log is complete and unchanged; for operators, one at a time.
 
@@ -210,7 +213,7 @@ def routes(services: Services) -> Routes:
         async with turn(desk.verification, "verifications"):
             return await desk.in_thread(verify, desk.path)
 
-    @router.get("/checkpoints", operation_id="audit_checkpoints", dependencies=[VIEWER])
+    @router.get("/checkpoints", dependencies=[VIEWER])
     async def audit_checkpoints(
         after: Annotated[int, Query(ge=0, le=10**18, description="only those with a greater number")] = 0,
         limit: Limit = 1000,
@@ -221,8 +224,7 @@ def routes(services: Services) -> Routes:
 
     @router.get(
         "/export",
-        operation_id="export_audit",
-        responses=_text("application/x-ndjson", "A record a line."),
+        responses=file("application/x-ndjson", "A record a line."),
         response_class=Response,
     )
     async def export_audit(request: Request, bearer: Viewer, wanted: Wanted) -> Response:
@@ -234,31 +236,29 @@ def routes(services: Services) -> Routes:
         """
         found = await desk.read(_exported, desk.path, wanted, bearer)
         give_back = services.exports.take(bearer, peer_of(request), "exports")
-        return Held(StreamingResponse(_pieces(found), media_type="application/x-ndjson"), give_back)
+        return Held(
+            StreamingResponse(in_thread(_joined(found)), media_type="application/x-ndjson"), give_back
+        )
 
-    @router.get("/{record_id}", operation_id="audit_record", responses=_json(_ONE) | _UNKNOWN)
+    @router.get("/{record_id}", responses=_json(_ONE) | _UNKNOWN)
     async def audit_record(
         bearer: Viewer,
         record_id: OneRecord,
         neighbours: Annotated[int, Query(ge=0, le=_MOST_NEIGHBOURS)] = 5,
     ) -> JSONResponse:
         """One record (by id, or by sequence), and what the same host or caller did around it."""
-        shown = await desk.read(show, desk.path, record_id, neighbours)
-        if shown is None:
-            raise ProblemError(404, "unknown", f"there is no record {record_id}")
+        shown = await desk.record(record_id, neighbours)
         around = {"before": _shown(shown.before, bearer), "after": _shown(shown.after, bearer)}
         return JSONResponse({"record": _shown([shown.entry], bearer)[0], **around})
 
-    @router.get("/{record_id}/why", operation_id="why_of_record", responses=_UNKNOWN)
+    @router.get("/{record_id}/why", responses=_UNKNOWN)
     async def why_of_record(record_id: OneRecord, bearer: Viewer) -> Why:
         """Why what a record tells happened: who did it, which events and values (not for viewers) made it so, where.
 
         Of a monitor's verdict the events are such that they alone give it; of a refusal there is the smallest change of
         the policy in force that would allow it.
         """
-        shown = await desk.read(show, desk.path, record_id, 0)
-        if shown is None:
-            raise ProblemError(404, "unknown", f"there is no record {record_id}")
+        shown = await desk.record(record_id, 0)
         record = _readable(shown.entry, bearer).record
         known = None
         if is_refusal(record):
@@ -266,12 +266,10 @@ def routes(services: Services) -> Routes:
         async with services.judging:
             return await asyncio.to_thread(explained, record, known)
 
-    @router.get("/{record_id}/grant", operation_id="grant_of_record", responses=_UNKNOWN | _NO_GRANT)
+    @router.get("/{record_id}/grant", responses=_UNKNOWN | _NO_GRANT)
     async def grant_of_record(record_id: OneRecord, bearer: Viewer) -> Granted:
         """The smallest change of the policy in force that grants what this record says was refused."""
-        shown = await desk.read(show, desk.path, record_id, 0)
-        if shown is None:
-            raise ProblemError(404, "unknown", f"there is no record {record_id}")
+        shown = await desk.record(record_id, 0)
         known = await ask(services.control, PolicyWanted(), bearer)
         async with services.judging:
             try:
@@ -290,10 +288,6 @@ def _json(schema: dict[str, Any]) -> Responses:
     return {200: {"description": "OK", "content": {"application/json": {"schema": schema}}}}
 
 
-def _text(media_type: str, description: str) -> Responses:
-    return {200: {"description": description, "content": {media_type: {"schema": {"type": "string"}}}}}
-
-
 async def _follow(
     services: Services, desk: Desk, follower: Follower, bearer: Bearer, text: str | None
 ) -> AsyncIterator[ServerSentEvent]:
@@ -308,6 +302,23 @@ async def _follow(
         if not entries:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(services.stopping.wait(), _POLL_SECONDS)
+
+
+def page_of(
+    path: pathlib.Path, wanted: Filter, cursor: str | None, limit: int, bearer: Bearer, *, newest_first: bool
+) -> dict[str, Any]:
+    """A page as who asks may read it: its cursor, too, tells nothing of records that he is not shown."""
+    shown: list[dict[str, Any]] = []
+    more: str | None = cursor
+    count = limit + 1
+    while len(shown) <= limit:
+        entries, more = search(path, wanted, more, count, newest_first=newest_first)
+        shown += _shown(entries, bearer, wanted.text)
+        if more is None:
+            break
+        count = _STREAM_PAGE  # what is not shown may be much: it is not looked through in small steps
+    last = str(shown[limit - 1]["sequence"]) if len(shown) > limit else None
+    return {"records": shown[:limit], "cursor": last}
 
 
 def _shown(entries: Iterable[Entry], bearer: Bearer, text: str | None = None) -> list[dict[str, Any]]:
@@ -335,21 +346,13 @@ def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer) -> Iterator[st
 def _begun(entries: Iterator[_T]) -> Iterator[_T]:
     """The same entries, the first of them read: what is wrong with a search is known before the answer begins."""
     first = next(entries, None)
-    return iter(()) if first is None else _chain(first, entries)
+    return iter(()) if first is None else itertools.chain((first,), entries)
 
 
-def _chain(first: _T, rest: Iterator[_T]) -> Iterator[_T]:
-    yield first
-    yield from rest
-
-
-async def _pieces(lines: Iterator[str]) -> AsyncIterator[str]:
-    while piece := await asyncio.to_thread(_piece, lines):
+def _joined(lines: Iterator[str]) -> Iterator[str]:
+    """So many lines at once."""
+    while piece := "".join(f"{line}\n" for line in itertools.islice(lines, _STREAM_PAGE)):
         yield piece
-
-
-def _piece(lines: Iterator[str]) -> str:
-    return "".join(f"{line}\n" for line in itertools.islice(lines, _STREAM_PAGE))
 
 
 def _as_line(record: dict[str, Any]) -> str:

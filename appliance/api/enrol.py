@@ -23,7 +23,7 @@ from appliance.api.kits import Wishes, kit_of
 from appliance.api.problems import ProblemError
 from appliance.api.rates import Buckets
 from appliance.api.roles import answered
-from appliance.api.routing import Responses, Routes, answer, body, content
+from appliance.api.routing import Responses, Routes, answer, body, content, file
 from appliance.api.services import Services
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
@@ -45,9 +45,8 @@ _TUNNEL: Responses = {
     403: {"description": "Not from this host's tunnel, or not signed by its key."},
     503: {"description": "The appliance cannot answer now."},
 }
-_PEM: Responses = {
-    200: {"description": "PEM", "content": {"application/x-pem-file": {"schema": {"type": "string"}}}},
-    503: {"description": "The appliance cannot answer now."},
+_PEM: Responses = file("application/x-pem-file", "PEM") | {
+    503: {"description": "The appliance cannot answer now."}
 }
 
 
@@ -62,7 +61,7 @@ def routes(services: Services) -> Routes:
 def _add_enrolment(router: Routes, services: Services) -> None:
     patience = _Patience(services.settings.api_limits.failures_per_minute)
 
-    @router.post("/v1/enrol", operation_id="enrol", responses=_KIT, response_class=Response)
+    @router.post("/v1/enrol", responses=_KIT, response_class=Response)
     async def enrol(
         brought: Annotated[Enrolment, body(Enrolment)],
         request: Request,
@@ -114,13 +113,13 @@ def _add_renewal(router: Routes, services: Services) -> None:
         """For a host in its tunnel: the new certificate is in place; the one before ends, the tunnel comes anew."""
         await _ask(services, admin.HostRenewed(name, _peer(request)))
 
-    @router.get("/v1/revocations", operation_id="revocations", responses=_PEM, response_class=Response)
+    @router.get("/v1/revocations", responses=_PEM, response_class=Response)
     async def revocations() -> Response:
         """The signed list of revoked certificates (CRL)."""
         listed = await _ask(services, admin.RevocationsWanted())
         return Response(listed.revocations, media_type="application/x-pem-file")
 
-    @router.get("/v1/authority", operation_id="authority", responses=_PEM, response_class=Response)
+    @router.get("/v1/authority", responses=_PEM, response_class=Response)
     async def authority() -> Response:
         """The certificate of the appliance's authority."""
         own = await _ask(services, admin.AuthorityWanted())

@@ -17,7 +17,7 @@ def routes(services: Services) -> Routes:
     """The route."""
     router = Routes(prefix="/v1", tags=["graph"])
 
-    @router.get("/graph", operation_id="graph")
+    @router.get("/graph")
     async def graph(bearer: Viewer) -> Graph:
         """Nodes, topics and services, who is mediated, and rates."""
         return await ask(services.control, GraphWanted(), bearer)

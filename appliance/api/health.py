@@ -50,12 +50,12 @@ def routes(services: Services) -> Routes:
         router.add_api_route(f"{prefix}/healthz", live, operation_id=f"live{name}")
         router.add_api_route(f"{prefix}/readyz", ready, operation_id=f"ready{name}", responses=unready)
 
-    @router.get("/v1/status", operation_id="status")
+    @router.get("/v1/status")
     async def status(bearer: Viewer) -> Status:
         """The running appliance: processes, isolation, policy, graph, audit log."""
         return await ask(services.control, StatusWanted(), bearer)
 
-    @router.get("/v1/inventory", operation_id="inventory")
+    @router.get("/v1/inventory")
     async def inventory(bearer: Viewer) -> Inventory:
         """What runs: version, build, parts with their licences, what is used of the kernel."""
         return await ask(services.control, InventoryWanted(), bearer)

@@ -71,13 +71,13 @@ def routes(services: Services) -> Routes:
 def _add_looks(router: Routes, services: Services) -> None:
     control = services.control
 
-    @router.get("", operation_id="hosts")
+    @router.get("")
     async def hosts(bearer: Viewer) -> Tagged[answers.Hosts]:
         """Every host that is enrolled, declared or awaited, with its tunnel; and machines that nodes run on."""
         found = await ask(control, admin.HostList(), bearer)
         return Tagged(found, found.revision)
 
-    @router.get("/{name}", operation_id="host", responses=_UNKNOWN)
+    @router.get("/{name}", responses=_UNKNOWN)
     async def host(name: OneName, bearer: Viewer) -> Tagged[answers.Host]:
         """One host."""
         found = await ask(control, admin.HostList(), bearer)
@@ -101,9 +101,7 @@ def _add_looks(router: Routes, services: Services) -> None:
 
 
 def _add_enrolment(router: Routes, services: Services) -> None:
-    @router.post(
-        "", operation_id="enrol_host", responses=_NEW | _CHANGES, response_class=Response, status_code=201
-    )
+    @router.post("", responses=_NEW | _CHANGES, response_class=Response, status_code=201)
     async def enrol_host(
         new: Annotated[NewHost, body(NewHost)], bearer: Admin, if_match: IfMatch = None
     ) -> Response:

@@ -15,7 +15,7 @@ from prometheus_client.utils import floatToGoString
 from starlette.responses import Response
 
 from appliance.api.roles import Viewer, ask
-from appliance.api.routing import Responses, Routes
+from appliance.api.routing import Routes, file
 from appliance.api.services import Services
 from appliance.channel.admin import MetricsWanted
 from appliance.channel.answers.hosts import Host
@@ -26,12 +26,7 @@ from appliance.metrics import METRICS, Metric
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _Samples = Iterable[tuple[tuple[str, ...], Any]]
-_TEXT: Responses = {
-    200: {
-        "description": "Prometheus's text format",
-        "content": {"text/plain": {"schema": {"type": "string"}}},
-    }
-}
+_TEXT = file("text/plain", "Prometheus's text format")
 
 
 def routes(services: Services) -> Routes:
@@ -122,6 +117,8 @@ def _samples(body: Measures) -> dict[str, _Samples]:
             ((name, place, "true" if holds else "false"), distance)
             for name, place, holds, distance in body.margins
         ],
+        "rosrv_monitor_slices": [((name,), count) for name, (count, _) in body.slices.items()],
+        "rosrv_monitor_slice_limit": [((name,), most) for name, (_, most) in body.slices.items()],
         "rosrv_monitors": [
             (("enabled",), monitors.enabled),
             (("trial",), len(monitors.trials)),

@@ -51,7 +51,7 @@ def routes(services: Services) -> Routes:
 def _add_texts(router: Routes, services: Services) -> None:
     control = services.control
 
-    @router.post("", operation_id="load_monitors", responses=_CHANGES)
+    @router.post("", responses=_CHANGES)
     async def load_monitors(
         new: Annotated[NewSpecifications, body(NewSpecifications)],
         bearer: Operator,
@@ -71,7 +71,7 @@ def _add_texts(router: Routes, services: Services) -> None:
         )
         return await (_tried(services, order, bearer) if dry_run else _replaced(control, order, bearer))
 
-    @router.put("/{name}", operation_id="replace_monitor", responses=_CHANGES | UNKNOWN)
+    @router.put("/{name}", responses=_CHANGES | UNKNOWN)
     async def replace_monitor(
         *,
         name: OneName,
@@ -104,7 +104,7 @@ def _add_texts(router: Routes, services: Services) -> None:
         tried = admin.MonitorLoad({file: new.text}, new.definitions, new.note, expected, None, signatures)
         return await _tried(services, tried, bearer)
 
-    @router.post("/reload", operation_id="reload_monitors", responses=_CHANGES)
+    @router.post("/reload", responses=_CHANGES)
     async def reload_monitors(
         bearer: Operator, *, if_match: IfMatch = None, prune: Prune = False, confirm_within: Confirm = None
     ) -> Tagged[Replaced]:
@@ -117,20 +117,20 @@ def _add_texts(router: Routes, services: Services) -> None:
             control, admin.MonitorReload(_expected(if_match), prune, confirm_within), bearer
         )
 
-    @router.post("/rollback", operation_id="roll_back_monitors", responses=_CHANGES)
+    @router.post("/rollback", responses=_CHANGES)
     async def roll_back_monitors(
         to: Annotated[Rollback, body(Rollback)], bearer: Admin, if_match: IfMatch = None
     ) -> Tagged[Replaced]:
         """Bring a kept revision into force again, as a new one; what comes back is switched as it was."""
         return await _replaced(control, admin.MonitorRollback(to.revision, _expected(if_match)), bearer)
 
-    @router.post("/confirm", operation_id="confirm_monitors", responses=_CHANGES)
+    @router.post("/confirm", responses=_CHANGES)
     async def confirm_monitors(bearer: Operator, if_match: IfMatch = None) -> Tagged[MonitorsConfirmed]:
         """Keep specifications that were loaded with `confirm_within`."""
         done = await _ordered(control, admin.MonitorConfirm(_expected(if_match)), bearer)
         return Tagged(done, done.tag)
 
-    @router.delete("/{name}", operation_id="remove_monitor", responses=_CHANGES | UNKNOWN)
+    @router.delete("/{name}", responses=_CHANGES | UNKNOWN)
     async def remove_monitor(
         name: OneName, bearer: Admin, if_match: IfMatch = None, confirm_within: Confirm = None
     ) -> Tagged[Replaced]:
@@ -139,7 +139,7 @@ def _add_texts(router: Routes, services: Services) -> None:
             control, admin.MonitorRemove([name], _expected(if_match), confirm_within), bearer
         )
 
-    @router.delete("", operation_id="remove_monitors", responses=_CHANGES | UNKNOWN)
+    @router.delete("", responses=_CHANGES | UNKNOWN)
     async def remove_monitors(
         name: Annotated[
             list[Annotated[str, StringConstraints(min_length=1, max_length=256)]],
@@ -156,7 +156,7 @@ def _add_texts(router: Routes, services: Services) -> None:
 
 
 def _add_switches(router: Routes, control: ControlLink) -> None:
-    @router.patch("/{name}", operation_id="switch_monitor", responses=_CHANGES | UNKNOWN)
+    @router.patch("/{name}", responses=_CHANGES | UNKNOWN)
     async def switch_monitor(
         name: OneName, to: Annotated[Switch, body(Switch)], bearer: Operator, if_match: IfMatch = None
     ) -> Tagged[Switched]:
@@ -166,7 +166,7 @@ def _add_switches(router: Routes, control: ControlLink) -> None:
         """
         return await _switched(control, [name], to, _expected(if_match), bearer)
 
-    @router.patch("", operation_id="switch_monitors", responses=_CHANGES | UNKNOWN)
+    @router.patch("", responses=_CHANGES | UNKNOWN)
     async def switch_monitors(
         to: Annotated[SwitchMany, body(SwitchMany)], bearer: Operator, if_match: IfMatch = None
     ) -> Tagged[Switched]:

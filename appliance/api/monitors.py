@@ -13,7 +13,7 @@ from appliance.api.monitor_models import Happened, History, Monitor
 from appliance.api.policy_models import OneRevision
 from appliance.api.problems import ProblemError
 from appliance.api.roles import VIEWER, Viewer, ask
-from appliance.api.routing import Responses, Routes, Tagged
+from appliance.api.routing import Responses, Routes, Tagged, file
 from appliance.api.services import Services
 from appliance.audit.output import Entry, rfc3339
 from appliance.audit.query import Filter
@@ -22,9 +22,7 @@ from appliance.channel.admin import MonitorRevisions, MonitorRevisionWanted, Mon
 from appliance.channel.answers.monitors import MonitorRevisionList, Monitors, MonitorState, RevisionTexts
 
 UNKNOWN: Responses = {404: {"description": "There is no such monitor, or revision."}}
-_PICTURE: Responses = {
-    200: {"description": "OK", "content": {"image/svg+xml": {"schema": {"type": "string"}}}}
-}
+_PICTURE = file("image/svg+xml", "OK")
 OneName = Annotated[str, Path(min_length=1, max_length=256, description="of a monitor", examples=["censor"])]
 
 
@@ -60,7 +58,7 @@ def routes(services: Services) -> Routes:
     router = Routes(prefix="/v1/monitors", tags=["monitors"])
     looking = _Looking(services)
 
-    @router.get("", operation_id="monitors")
+    @router.get("")
     async def monitors(
         bearer: Viewer,
         texts: Annotated[bool, Query(description="with the texts of the specifications")] = False,
@@ -79,7 +77,7 @@ def routes(services: Services) -> Routes:
         """A kept revision with its texts."""
         return await ask(services.control, MonitorRevisionWanted(revision), bearer)
 
-    @router.get("/{name}", operation_id="monitor", responses=UNKNOWN)
+    @router.get("/{name}", responses=UNKNOWN)
     async def monitor(name: OneName, bearer: Viewer) -> Tagged[Monitor]:
         """One monitor: state, counters, the text of its file, its events and properties."""
         loaded, state = await looking.state(bearer, name)
@@ -97,12 +95,7 @@ def routes(services: Services) -> Routes:
         )
         return Tagged(shown, loaded.tag)
 
-    @router.get(
-        "/{name}/picture",
-        operation_id="monitor_picture",
-        responses=_PICTURE | UNKNOWN,
-        response_class=Response,
-    )
+    @router.get("/{name}/picture", responses=_PICTURE | UNKNOWN, response_class=Response)
     async def monitor_picture(name: OneName, bearer: Viewer) -> Response:
         """The automata of its properties (SVG); 404 when it has none that is finite."""
         loaded, _state = await looking.state(bearer, name)
@@ -111,7 +104,7 @@ def routes(services: Services) -> Routes:
             raise ProblemError(404, "unknown", f"{name} has no property whose monitor is a finite automaton")
         return Response(drawn, media_type="image/svg+xml")
 
-    @router.get("/{name}/history", operation_id="monitor_history", dependencies=[VIEWER])
+    @router.get("/{name}/history", dependencies=[VIEWER])
     async def monitor_history(
         name: OneName,
         cursor: Annotated[str | None, Query(max_length=18, description="of the page before")] = None,

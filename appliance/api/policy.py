@@ -67,7 +67,7 @@ def routes(services: Services) -> Routes:
     router = Routes(prefix="/v1/policy", tags=["policy"])
     control = services.control
 
-    @router.get("", operation_id="policy")
+    @router.get("")
     async def policy(bearer: Viewer) -> Tagged[PolicyInForce]:
         """The policy in force, with its ETag."""
         known = await ask(control, PolicyWanted(), bearer)
@@ -111,12 +111,12 @@ def routes(services: Services) -> Routes:
         """Why the policy in force decides a request as it does."""
         return await explained(Question(host=host, node=node, category=category, resource=resource), bearer)
 
-    @router.post("/explain", operation_id="explain_under")
+    @router.post("/explain")
     async def explain_under(question: Annotated[Question, body(Question)], bearer: Viewer) -> Explained:
         """The same under another text, which is not loaded."""
         return await explained(question, bearer)
 
-    @router.post("/test", operation_id="test_policy")
+    @router.post("/test")
     async def test_policy(draft: Annotated[Draft, body(Draft)], bearer: Viewer) -> Tested:
         """Run the policy's tests on a text; nothing is loaded. A text with errors is refused with every finding."""
         current = await ask(control, PolicyWanted(), bearer)

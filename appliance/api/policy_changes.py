@@ -40,7 +40,7 @@ def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1/policy", tags=["policy"])
 
-    @router.post("", operation_id="load_policy", responses=_CHANGES)
+    @router.post("", responses=_CHANGES)
     async def load_policy(
         posted: Annotated[PolicyText, body(PolicyText, text="the policy")],
         bearer: Operator,

@@ -64,6 +64,12 @@ def content(kind: Any) -> dict[str, Any]:
     return {_JSON: {"schema": CONTRACT.reference(kind)}}
 
 
+def file(media_type: str, description: str, *, binary: bool = False) -> Responses:
+    """An answer that is no JSON, as `responses=` of a route takes it."""
+    schema = {"type": "string"} | ({"format": "binary"} if binary else {})
+    return {200: {"description": description, "content": {media_type: {"schema": schema}}}}
+
+
 class _Body:
     """Reads a body of one kind; `text` names what may also be sent as text/plain, the field `text` of the kind."""
 
@@ -178,7 +184,8 @@ class Routes(APIRouter):
     """FastAPI's router, for handlers that take and give structs."""
 
     def add_api_route(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
-        """Add a handler; its answer, its ETag and its body are put into the contract."""
+        """Add a handler; its name, answer, ETag and body are put into the contract."""
+        options["operation_id"] = options.get("operation_id") or endpoint.__name__
         hints = typing.get_type_hints(endpoint, include_extras=True)
         for hint in hints.values():
             for part in getattr(hint, "__metadata__", ()):

@@ -7,7 +7,8 @@ with many tokens does not, either. Places are given back when the response is ov
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterator
+from typing import TypeVar
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -19,6 +20,7 @@ from appliance.shares.pool import Pool, Standing
 from appliance.shares.table import Share
 
 _PATIENCE_SECONDS = 5.0
+A = TypeVar("A", str, bytes)
 
 
 def peer_of(request: Request) -> str:
@@ -80,6 +82,13 @@ async def turn(turns: asyncio.Semaphore, what: str) -> AsyncIterator[None]:
         yield
     finally:
         turns.release()
+
+
+async def in_thread(pieces: Iterator[A]) -> AsyncIterator[A]:
+    """What an iterator gives that takes its time, without the empty pieces."""
+    while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
+        if piece:
+            yield piece
 
 
 class Held(Response):

@@ -21,12 +21,12 @@ def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1/tokens", tags=["tokens"])
 
-    @router.get("", operation_id="tokens")
+    @router.get("")
     async def tokens(bearer: Admin) -> Tokens:
         """All access tokens that were made, without their secrets; for admins."""
         return await ask(services.control, TokenList(), bearer)
 
-    @router.delete("/{name}", operation_id="revoke_token", responses=_UNKNOWN)
+    @router.delete("/{name}", responses=_UNKNOWN)
     async def revoke_token(
         name: Annotated[str, Path(min_length=1, max_length=80, examples=["shift"])], bearer: Admin
     ) -> Token:

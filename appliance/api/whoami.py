@@ -24,12 +24,12 @@ def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1", tags=["status"])
 
-    @router.get("/whoami", operation_id="whoami")
+    @router.get("/whoami")
     async def whoami(bearer: Viewer) -> Holder:
         """The name and role of the token that asks, and when it ends."""
         return Holder(bearer.name, cast(TokenRole, bearer.role.name.lower()), bearer.expires)
 
-    @router.get("/challenge", operation_id="challenge")
+    @router.get("/challenge")
     async def challenge(bearer: Viewer) -> Challenge:
         """A challenge: an order that changes something is signed under one, and each is good once."""
         return await ask(services.control, ChallengeWanted(), bearer)

@@ -48,12 +48,14 @@ EVENTS: dict[str, str] = {
     " parametric specification the `binding`, `at` its place, `why` which events alone give the verdict,"
     " and `conditions` what they compared.",
     "message dropped": "A monitor dropped a message; the first of a second in full, the rest as `detail.count`. `at` is"
-    " where the statement stands that did, `conditions` has what led there: each with the values that it compared.",
+    " where the statement stands that did, `conditions` has what led there: each with the values that it compared;"
+    " `handler` the verdict in whose handler it was, with its `why`.",
     "message changed": "Monitors changed a message; `detail` has the bytes before and after, `changed_by` the events"
     " that did, in order, `monitor` whose the last is. A `count` has `changed_by` if it was more than one monitor.",
-    "monitor fault": "An action of a monitor could not go on; `detail` has file, line and values.",
+    "monitor fault": "An action of a monitor could not go on; `detail` has file, line, values and `conditions`.",
     "monitor log": "A monitor wrote a line.",
-    "monitor published": "A monitor published a message.",
+    "monitor published": "A monitor published a message; `at` is where the statement stands, `conditions` has what led"
+    " there; `handler` the verdict in whose handler it was, with its `why`.",
     "publication refused": "A publisher or service has another definition than the specifications; it is not carried.",
     "recording ordered": "Somebody had messages recorded; `detail` has who, and the seconds before and after.",
     "recording closed": "The flight recorder has a recording; `detail` has its sha256, and what triggered it.",

@@ -12,10 +12,13 @@ class MomentError(ValueError):
 
 
 def parse_moment(text: str, now: int) -> int:
-    """Nanoseconds since the epoch. `now` is what `1h` is counted back from; without a zone it is UTC."""
-    ago = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)([smhdw])", text)
+    """Nanoseconds since the epoch. `now` is what `1h` is counted back from; without a zone it is UTC.
+
+    What is before or after all times that the log can have is the first or last of them. Raises `MomentError`.
+    """
+    ago = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)([smhdw])", text, re.ASCII)
     if ago is not None:
-        return now - int(float(ago[1]) * _UNITS[ago[2]] * _SECOND)
+        return _bounded(now - int(float(ago[1]) * _UNITS[ago[2]] * _SECOND))
     # datetime knows microseconds only; the log's times have nanoseconds and can be given as they are shown.
     fraction = re.search(r"\.(\d{1,9})", text)
     whole = text if fraction is None else text.replace(fraction[0], "", 1)
@@ -29,4 +32,8 @@ def parse_moment(text: str, now: int) -> int:
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=UTC)
     nanoseconds = 0 if fraction is None else int(fraction[1].ljust(9, "0"))
-    return int(moment.timestamp()) * _SECOND + nanoseconds
+    return _bounded(int(moment.timestamp()) * _SECOND + nanoseconds)
+
+
+def _bounded(time: int) -> int:
+    return max(-(1 << 63), min(time, (1 << 63) - 1))

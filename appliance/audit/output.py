@@ -23,7 +23,7 @@ _OF_THE_RECORD = (
 )  # fmt: skip
 
 
-_CONTENTS = ("before", "after", "before_fields", "after_fields", "conditions", "why")
+_CONTENTS = ("before", "after", "before_fields", "after_fields", "conditions", "values", "why")
 """What messages said, in the detail of a monitor's record: as bytes, as fields, and what was compared of them."""
 
 

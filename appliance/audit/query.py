@@ -91,9 +91,9 @@ def conditions(wanted: Filter) -> list[Condition]:
     if wanted.without_looks:
         found.append(Condition(_NO_LOOK, ()))
     if wanted.since is not None:
-        found.append(Condition("time >= ?", (_bounded(wanted.since),), "record_time"))
+        found.append(Condition("time >= ?", (wanted.since,), "record_time"))
     if wanted.until is not None:
-        found.append(Condition("time < ?", (_bounded(wanted.until),), "record_time"))
+        found.append(Condition("time < ?", (wanted.until,), "record_time"))
     return found
 
 
@@ -114,10 +114,6 @@ def _checked(name: str, value: str) -> str:
     except UnicodeEncodeError as error:
         raise FilterError(f"{name}: not valid Unicode") from error
     return value
-
-
-def _bounded(time: int) -> int:
-    return max(-(1 << 63), min(time, (1 << 63) - 1))
 
 
 def text_condition(text: str) -> Condition:

@@ -10,7 +10,7 @@ from appliance.audit.record import Record
 def lines_of(record: Record) -> Iterator[str]:
     """The lines; strangers' text is in them as it is."""
     detail = record.detail
-    yield record.reason
+    yield record.reason or record.event
     sent = [f"{name} {detail[name]}" for name in ("number", "seq") if name in detail]
     who = [part for part in (record.caller_id, record.host and f"on {record.host}") if part]
     if who or sent:
@@ -21,13 +21,23 @@ def lines_of(record: Record) -> Iterator[str]:
     places = _list(detail.get("at"))
     if places:
         yield f"at: {', '.join(map(str, places))}"
+    if "timer" in detail:
+        yield f"timer: {detail['timer']}"
+    events = _list(detail.get("events"))
+    if events:
+        yield f"events: {', '.join(map(str, events))}"
     for place, values in _mapping(detail.get("conditions")).items():
-        yield f"where: {place}" + "".join(f", {name} = {value}" for name, value in _mapping(values).items())
+        yield f"where: {place}{_valued(values)}"
+    if values := _valued(detail.get("values")):
+        yield f"with: {values.removeprefix(', ')}"
+    if "handler" in detail:
+        yield f"in the handler of: {detail['handler']}"
     if "withheld" in detail:
         yield "what messages said is not for this role"
         return
     yield from lines_of_why(_mapping(detail.get("why")))
-    if record.event == "monitor verdict" and "why" not in detail and "count" not in detail:
+    is_verdict = record.event == "monitor verdict" or detail.get("would") == "verdict" or "handler" in detail
+    if is_verdict and "why" not in detail and "count" not in detail:
         yield "because: which events made it so is not known any more, or too many verdicts were told in that second"
 
 
@@ -64,6 +74,10 @@ def named(event: Mapping[str, Any]) -> str:
     )
     state = f" -> {event['state']}" if event.get("state") else ""
     return f"{event.get('event')}{index} at {event.get('time')}{who}{seq}{state}"
+
+
+def _valued(values: object) -> str:
+    return "".join(f", {name} = {value}" for name, value in _mapping(values).items())
 
 
 def _mapping(value: object) -> Mapping[str, Any]:

@@ -7,7 +7,7 @@ characters in them, and are never read as markup.
 import datetime
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any
 
 import msgspec
@@ -37,8 +37,15 @@ def moment(seconds: float) -> str:
 
 def usage_error(text: str, verb: str = "rosrv") -> typer.Exit:
     """Write what was wrong with the command line; raise the result (exit status 2)."""
-    typer.echo(f"{verb}: {text}", err=True)
+    typer.echo(f"{verb}: {printable(text)}", err=True)
     return typer.Exit(2)
+
+
+def refused(findings: Iterable[object]) -> typer.Exit:
+    """Write what is wrong with a text, a finding a line; raise the result (exit status 1)."""
+    for finding in findings:
+        typer.echo(printable(str(finding)), err=True)
+    return typer.Exit(1)
 
 
 def say(line: str, style: str = "") -> None:

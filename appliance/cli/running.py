@@ -18,7 +18,7 @@ import typer
 
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
-from appliance.cli.output import say_json, usage_error
+from appliance.cli.output import printable, say_json, usage_error
 
 if TYPE_CHECKING:
     from appliance.cli.audit.rest import RestLog
@@ -135,9 +135,11 @@ def _chosen(context: typer.Context, state: Path, api: str | None, authority: Pat
     from appliance.cli.rest.way import RestWay  # noqa: PLC0415  httpx is not imported for the socket
 
     try:
-        return Appliance(RestWay(api, os.environ.get(TOKEN), authority), said=True, place=api)
+        way = RestWay(api, os.environ.get(TOKEN), authority)
     except ValueError as error:
         raise usage_error(str(error)) from None
+    context.call_on_close(way.client.close)
+    return Appliance(way, said=True, place=api)
 
 
 def body_or_exit(answer: AdminAnswer[A], *, as_json: bool) -> A:
@@ -148,6 +150,6 @@ def body_or_exit(answer: AdminAnswer[A], *, as_json: bool) -> A:
         typer.echo(msgspec.json.encode({"error": answer.error, "findings": answer.findings}).decode())
     else:
         for finding in answer.findings:
-            typer.echo(finding, err=True)
-        typer.echo(f"rosrv: {answer.error}", err=True)
+            typer.echo(printable(finding), err=True)
+        typer.echo(f"rosrv: {printable(answer.error)}", err=True)
     raise typer.Exit(1)

@@ -12,7 +12,7 @@ from rich.text import Text
 from appliance.api.moments import in_full
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.hosts import PortsSeen
-from appliance.channel.answers.status import FirewallState, IpsecState, Status
+from appliance.channel.answers.status import FirewallState, IpsecState, PolicyState, Status
 from appliance.channel.serving import no_relay, probe_failed
 from appliance.cli.output import counted, say_json
 from appliance.cli.running import Appliance, speaks
@@ -87,7 +87,7 @@ def troubles_of(body: Status) -> list[str]:
 def show(body: Status, troubles: list[str]) -> None:
     """Print a status for a person, what is wrong first."""
     console = Console(highlight=False)
-    policy, audit = body.policy, body.audit
+    audit = body.audit
     for trouble in shortened(troubles, _MOST_TROUBLES):
         console.print(Text(f"! {trouble}", style=_RED))
     grid = Table.grid(padding=(0, 2))
@@ -102,13 +102,7 @@ def show(body: Status, troubles: list[str]) -> None:
         grid.add_row("clock", Text(doubted, style=_YELLOW))
     for name, text in _others_rules(body.firewall):
         grid.add_row(name, text)
-    differs = ""
-    if policy.differs_from_file:
-        theirs = policy.who != "disk"
-        differs = f"; loaded by {policy.who}, not what the file has" if theirs else "; the file now differs"
-        differs += "" if theirs else ": rosrv policy reload takes the file"
-    warnings = f", {counted(policy.warnings, 'warning')}" if policy.warnings else ""
-    grid.add_row("policy", f"revision {policy.revision} of {policy.file}{warnings}{differs}")
+    grid.add_row("policy", _policy(body.policy))
     monitors = body.monitors
     loaded = counted(monitors.loaded, "monitor")
     shown = f"revision {monitors.revision}, {monitors.enabled} of {loaded} enabled"
@@ -139,6 +133,19 @@ def show(body: Status, troubles: list[str]) -> None:
     console.print(grid)
     table = processes_table(body.processes, console.width)
     console.print(table)
+
+
+def _policy(policy: PolicyState) -> Text:
+    differs = ""
+    if policy.differs_from_file:
+        theirs = policy.who != "disk"
+        differs = f"; loaded by {policy.who}, not what the file has" if theirs else "; the file now differs"
+        differs += "" if theirs else ": rosrv policy reload takes the file"
+    warnings = f", {counted(policy.warnings, 'warning')}" if policy.warnings else ""
+    line = Text(f"revision {policy.revision} of {policy.file}{warnings}{differs}")
+    if policy.audit_only:
+        line.append(f"; AUDIT-ONLY: refuses nothing by {', '.join(policy.audit_only)}", style=_YELLOW)
+    return line
 
 
 def _tunnels(ipsec: IpsecState) -> str:

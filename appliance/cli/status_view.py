@@ -9,6 +9,7 @@ from rich.text import Text
 
 from appliance.channel.answers.status import ClockState, ProcessInfo
 from appliance.channel.serving import process_names
+from appliance.cli.tables import table_of
 
 _YELLOW = "yellow"
 _COLUMN = 38  # columns that one process takes
@@ -18,9 +19,7 @@ def processes_table(rows: Sequence[ProcessInfo], width: int, now: float | None =
     """The processes in as many columns as fit, read downwards; processes of one role are numbered from 0."""
     across = max(1, min(3, width // _COLUMN))
     high = -(-len(rows) // across)
-    table = Table(
-        *["process", "pid", "for", "restarts"] * across, box=None, padding=(0, 2, 0, 0), header_style="dim"
-    )
+    table = table_of(*["process", "pid", "for", "restarts"] * across)
     shown = [_cells(row, name, now) for row, name in zip(rows, process_names(rows), strict=True)]
     for line in range(high):
         cells: list[Text] = []

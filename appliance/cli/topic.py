@@ -60,7 +60,7 @@ def info(appliance: Appliance, topic: _Topic, as_json: Json = False) -> None:
     body = appliance.ask_or_exit(admin.GraphWanted(), as_json=as_json)
     found = next((row for row in body.topics if row.name == topic), None)
     if found is None:
-        raise usage_error(f"no node publishes or subscribes to {printable(topic)}")
+        raise usage_error(f"no node publishes or subscribes to {topic}")
     if as_json:
         say_json(found)
     else:
@@ -102,9 +102,7 @@ def _part(fields: Any, path: str) -> Any:
             value = value[int(name)]
         else:
             known = ", ".join(map(str, value)) if isinstance(value, Mapping) else "no fields"
-            raise usage_error(
-                f"there is no field {printable(path)}: {printable(name)} is not among {printable(known)}"
-            )
+            raise usage_error(f"there is no field {path}: {name} is not among {known}")
     return value
 
 

@@ -109,6 +109,11 @@ def _audit_only(entry: Entry, findings: Findings) -> frozenset[str]:
             guess = meant(word.text, ["all", *by_fold.values()])
             known = "" if guess else f"; all, or some of {', '.join(by_fold.values())}"
             findings.error(word.line, word.column, f"{quoted(word.text)} decides nothing{guess}{known}")
+    if chosen:
+        what = "nothing" if len(chosen) == len(by_fold) else f"nothing by [{'], ['.join(sorted(chosen))}]"
+        findings.warn(
+            entry.key.line, entry.key.column, f"audit-only: this policy refuses {what}, it only records"
+        )
     return frozenset(chosen)
 
 

@@ -141,7 +141,7 @@ def _over_rest(appliance: Appliance, record: str, what: str) -> dict[str, Any]:
 
     assert isinstance(appliance.way, RestWay)  # noqa: S101  the other way to an appliance
     if not record.isalnum():
-        raise usage_error(f"{printable(record)} is no id of a record")
+        raise usage_error(f"{record} is no id of a record")
     try:
         return appliance.way.client.call("GET", f"/v1/audit/{record}/{what}")
     except ProblemError as problem:

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from appliance.cli.admin_socket import NotRunningError
-from appliance.cli.output import Json, counted, printable, say, say_json
+from appliance.cli.output import Json, counted, refused, say, say_json
 from appliance.cli.policy.granting import grant
 from appliance.cli.policy.input import (
     Enrolled,
@@ -315,6 +315,4 @@ def _judge_or_exit(
     try:
         return _judge(file, robot, enrolled, cases)
     except PolicyError as error:
-        for finding in error.findings:
-            typer.echo(printable(str(finding)), err=True)
-        raise typer.Exit(1) from error
+        raise refused(error.findings) from error

@@ -69,6 +69,10 @@ class RestClient:
             follow_redirects=False,
         )
 
+    def close(self) -> None:
+        """End the connections that are kept for the next request."""
+        self._client.close()
+
     def call(
         self,
         method: str,

@@ -15,6 +15,7 @@ from appliance.cli.admin_socket import ADMIN_SOCKET, AdminSocket
 from appliance.cli.output import counted, printable, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.selftest.findings import Found, fail
+from appliance.cli.tables import say_table
 from appliance.config import Settings, load_resolved
 from appliance.config_sources import ConfigError, resolve
 
@@ -58,7 +59,7 @@ def selftest(
                 )
             table.add_row(Text(found.outcome, style=_STYLES[found.outcome]), found.check, text)
     if not as_json:
-        Console(highlight=False, width=None if sys.stdout.isatty() else 200).print(table)
+        say_table(table)
         end = f"{failed} failed, {counted(warned, 'warning')}" if failed else counted(warned, "warning")
         Console(highlight=False).print(Text(end, style="bold red" if failed else "green"))
     raise typer.Exit(1 if failed else 0)

@@ -42,6 +42,7 @@ def test_a_healthy_appliance_has_none() -> None:
         ("audit.forwarding", FORWARDING | {"trouble": "refused"}, "audit-not-forwarded", "warning", "audit"),
         ("audit.degraded", "fsync is slow", "audit-degraded", "warning", "audit"),
         ("policy.confirm_by", 1.0, "policy-unconfirmed", "warning", "policy"),
+        ("policy.audit_only", ["Publishers"], "policy-audit-only", "warning", "policy"),
         ("policy.differs_from_file", True, "policy-differs", "notice", "policy"),
         ("monitors.held", ["safeTrigger"], "monitor-held:safeTrigger", "alarm", "monitors"),
         ("monitors.failing", ["logging"], "monitor-failing:logging", "alarm", "monitors"),

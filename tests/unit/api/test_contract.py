@@ -8,17 +8,8 @@ import jsonschema_rs
 import pytest
 from fastapi import FastAPI
 
-from appliance.api.access import Doorkeeper
-from appliance.api.app import build_app
 from appliance.api.contract import EXAMPLES, is_described
-from appliance.api.control import ControlLink
 from appliance.api.field_words import WORDS
-from appliance.api.history import History
-from appliance.api.journal import Journal
-from appliance.api.services import Services
-from appliance.channel.answers.measures import Measures
-from appliance.config import Settings
-from tests.support.answers import example
 
 _OF_CHANGES = {"/v1/policy", "/v1/hosts", "/v1/hosts/{name}", "/v1/monitors", "/v1/monitors/{name}"}
 _UNITS = ("seconds", "days")
@@ -32,17 +23,6 @@ _IN_WORDS = (
     "unit",
     "until the certificate ends",
 )
-
-
-@pytest.fixture(scope="module")
-def app() -> FastAPI:
-    """The interface, of an appliance that says nothing."""
-
-    async def nothing() -> Measures:
-        return example(Measures)
-
-    control, journal = ControlLink(lambda _tokens: None, lambda: None), Journal(lambda _call: None)
-    return build_app(Services(Settings(), control, Doorkeeper(1), journal, asyncio.Event(), History(nothing)))
 
 
 @pytest.fixture(scope="module")

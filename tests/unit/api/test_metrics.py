@@ -49,6 +49,7 @@ def body(
         registrations={"publication": 3},
         monitors=[("drop", "safeTrigger", 4)],
         margins=[("safeTrigger", "8:35", False, 0.025)],
+        slices={"goals": (12, 100)},
         relayed={"/a\"\\\n": [1, 2, 3]},
         delayed={"/a": [5, 4, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0.25]},
         drop_at={"/b": 5}, change_at={"/b": 6, "(others)": 1},
@@ -91,6 +92,9 @@ def test_values_are_what_was_counted() -> None:
     assert samples["rosrv_monitor_events_total", (("kind", "drop"), ("monitor", "safeTrigger"))] == 4
     place = (("holds", "false"), ("monitor", "safeTrigger"), ("place", "8:35"))
     assert samples["rosrv_monitor_margin", place] == 0.025
+    goals = (("monitor", "goals"),)
+    assert samples["rosrv_monitor_slices", goals] == 12
+    assert samples["rosrv_monitor_slice_limit", goals] == 100
     assert samples["rosrv_monitors", (("state", "disabled"),)] == 1
     assert samples["rosrv_decision_seconds_bucket", (("le", "0.00025"),)] == 0
     assert samples["rosrv_decision_seconds_bucket", (("le", "0.0005"),)] == 1

@@ -30,7 +30,18 @@ def test_moments(text: str, moment: int) -> None:
     assert parse_moment(text, _NOW) == moment
 
 
-@pytest.mark.parametrize("text", ["", "yesterday", "1y", "-1h", "1", "2026-13-01", "25:00", "9" * 400 + "h"])
+@pytest.mark.parametrize(
+    ("text", "moment"),
+    [("0001-01-01", -(1 << 63)), ("999999999w", -(1 << 63)), ("9999-12-31T23:59:59.9Z", (1 << 63) - 1)],
+)
+def test_a_moment_beyond_all_times_of_the_log_is_its_first_or_last(text: str, moment: int) -> None:
+    """Whoever compares it with a record's, or sends it on, has a number of 64 bits."""
+    assert parse_moment(text, _NOW) == moment
+
+
+@pytest.mark.parametrize(
+    "text", ["", "yesterday", "\u0661h", "1y", "-1h", "1", "2026-13-01", "25:00", "9" * 400 + "h"]
+)
 def test_no_moment(text: str) -> None:
     """What is no moment is an error that says what is."""
     with pytest.raises(MomentError, match="1h, 2d"):

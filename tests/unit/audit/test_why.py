@@ -55,3 +55,8 @@ def test_a_refusal() -> None:
         id="1", time=1, event="policy loaded", reason="by somebody", detail={"why": "strange", "at": 3}
     )
     assert list(lines_of(other)) == ["by somebody"]
+
+
+def test_an_event_without_a_reason() -> None:
+    """What happened is said all the same, instead of an empty line."""
+    assert list(lines_of(Record(id="1", time=1, event="log begun"))) == ["log begun"]

@@ -4,13 +4,19 @@ import json
 
 import pytest
 
-from appliance.cli.output import counted, moment, printable, say, say_json
+from appliance.cli.output import counted, moment, printable, say, say_json, usage_error
 
 
 def test_control_characters_never_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     """A stranger's name that would clear the screen, or begin a line of its own, is shown as what it is."""
     say("/evil\x1b[2J\nallow \u202e[red]")
     assert capsys.readouterr().out == "/evil\\x1b[2J\\nallow \\u202e[red]\n"
+
+
+def test_a_refusal_repeats_nothing_that_a_terminal_acts_on(capsys: pytest.CaptureFixture[str]) -> None:
+    """What was given, or what an appliance elsewhere answered, stands in it as what it is."""
+    assert usage_error("no topic /\x1b[2J\u202e", "rosrv topic").exit_code == 2
+    assert capsys.readouterr().err == "rosrv topic: no topic /\\x1b[2J\\u202e\n"
 
 
 def test_what_is_printable_stays() -> None:

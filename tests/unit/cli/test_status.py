@@ -138,3 +138,12 @@ def test_what_a_kernel_lacks_of_the_walls_is_shown(
     lines = "\n".join(screen(monkeypatch, capsys, 100, shown))
     assert "walled in" not in lines
     assert "signer: no Landlock and 1 more (rosrv status --json)" in lines
+
+
+def test_a_policy_that_refuses_nothing_is_said_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In the line of the policy, with the sections; a policy in force says nothing of it."""
+    trial = screen(monkeypatch, capsys, 160, body(policy={"audit_only": ["Nodes", "Publishers"]}))
+    assert any("AUDIT-ONLY: refuses nothing by Nodes, Publishers" in line for line in trial)
+    assert "AUDIT-ONLY" not in " ".join(screen(monkeypatch, capsys, 160, body()))

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from appliance.policy import CaseResult, PolicyError, compile_policy, run_cases
 from appliance.policy.actions import VERBS
+from tests.support.examples import examples
 
 POLICY = compile_policy(
     """[Groups]
@@ -112,7 +113,7 @@ WORDS = "cases: given: host: node: allow: deny: - [ ] { } , /a ::1 robot & *a &a
 PIECES = [*VERBS, *WORDS.split(), "\n  "]
 
 
-@settings(max_examples=200)
+@settings(max_examples=examples(200))
 @given(st.one_of(st.text(), st.lists(st.sampled_from(PIECES), max_size=40).map(" ".join)))
 def test_any_text_gives_results_or_a_policy_error(text: str) -> None:
     """Whatever the text, there are results or a PolicyError; nothing else."""

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.policy import Category, PolicyError, Request, compile_policy
+from tests.support.examples import examples
 
 Rules = list[tuple[str, str, list[str]]]  # section, key, words of the value
 
@@ -91,7 +92,7 @@ def policies(draw: st.DrawFn) -> tuple[Rules, dict[str, list[str]]]:
     return rules, groups
 
 
-@settings(max_examples=400)
+@settings(max_examples=examples(400))
 @given(policies(), st.lists(st.tuples(HOSTS, NAME), min_size=1, max_size=20))
 def test_compiled_decisions_are_those_of_the_naive_decider(
     policy: tuple[Rules, dict[str, list[str]]], requests: list[tuple[str, str]]
@@ -114,7 +115,7 @@ BELOW = ["/" + "/".join(parts) for depth in (1, 2, 3) for parts in itertools.pro
 BELOW += [f"{below}/zz" for below in BELOW if below.count("/") == 3]
 
 
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 @given(policies(), HOSTS, st.sampled_from(["/", "/a", "/b", "/arm", "/a/b", "/a/arm"]))
 def test_namespace_may_be_touched_only_if_everything_in_it_may(
     policy: tuple[Rules, dict[str, list[str]]], host: str, key: str
@@ -135,7 +136,7 @@ def test_namespace_may_be_touched_only_if_everything_in_it_may(
         assert allowed == wanted
 
 
-@settings(max_examples=400)
+@settings(max_examples=examples(400))
 @given(st.lists(KEYS, min_size=2, max_size=2, unique=True), st.lists(NAME, max_size=30))
 def test_keys_that_load_together_never_tie(keys: list[str], names: list[str]) -> None:
     """Two keys that load together never match a name with the same rank; refused ones have the same."""

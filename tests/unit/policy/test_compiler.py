@@ -11,6 +11,7 @@ from appliance.policy import Policy, PolicyError, Severity, compile_policy
 from appliance.policy.findings import MAXIMUM_FINDINGS
 from appliance.policy.model import TELLS
 from appliance.policy.reader import MAXIMUM_CHARACTERS
+from tests.support.examples import examples
 
 SAMPLE_OF_ROSRV = """# machine-a: 192.168.15.69
 # OCU
@@ -205,12 +206,12 @@ def test_file_beyond_the_limit_is_refused_by_name_of_the_limit() -> None:
 )
 def test_hostile_file_is_judged_in_bounded_time(text: str) -> None:
     """The worst texts of the allowed length are loaded or refused within seconds, with a bounded list."""
-    start = time.monotonic()
+    start = time.process_time()
     try:
         compile_policy(text, file="p.ini")
     except PolicyError as error:
         assert len(error.findings) <= 2 * MAXIMUM_FINDINGS + 1
-    assert time.monotonic() - start < 60
+    assert time.process_time() - start < 60
 
 
 WORDS = """
@@ -222,7 +223,7 @@ PIECES = st.sampled_from([*WORDS.split(), " ", "\n", "\r", "\t", "\x00", "\ufeff
 TEXTS = st.one_of(st.text(), *(st.lists(PIECES, max_size=60).map(glue.join) for glue in ("", " ")))
 
 
-@settings(max_examples=500)
+@settings(max_examples=examples(500))
 @given(TEXTS)
 @example("[Groups]\nrobot\n=")
 def test_any_text_is_a_policy_or_a_policy_error(text: str) -> None:

@@ -55,6 +55,16 @@ def test_right_policy_has_no_warning() -> None:
         ("/ocu = op", "/ocu = op op", '5:11: "op" is said twice'),
         ("/ocu = op", "/ocu = op host:x", '5:11: no host "x" is enrolled: host:x matches nobody'),
         ("[Subscribers]\ndefault = op\n", "", "1:1: there is no [Subscribers] section"),
+        (
+            "[Groups]",
+            "[Options]\naudit-only = Nodes publishers\n[Groups]",
+            "2:1: audit-only: this policy refuses nothing by [Nodes], [Publishers], it only records",
+        ),
+        (
+            "[Groups]",
+            "[Options]\naudit-only = all\n[Groups]",
+            "2:1: audit-only: this policy refuses nothing, it only records",
+        ),
     ],
 )
 def test_doubtful_policy_is_warned_about_with_its_place(old: str, new: str, expected: str) -> None:

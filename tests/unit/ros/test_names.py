@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from appliance.ros import names
 from appliance.ros.errors import InvalidNameError, PeerError
+from tests.support.examples import examples
 
 Oracle = Callable[[str, str], tuple[str, str | None]]
 
@@ -40,7 +41,7 @@ def rosmaster() -> Iterator[Oracle]:
         to_oracle.close()
 
 
-@settings(max_examples=2000)
+@settings(max_examples=examples(2000))
 @given(name=NAME_LIKE, caller_id=CALLER_IDS)
 def test_resolve_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: str) -> None:
     """Whatever is not refused resolves to what rosmaster acts on, is canonical and resolves to itself."""
@@ -53,7 +54,7 @@ def test_resolve_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: 
     assert names.resolve(resolved, "/other/node") == resolved
 
 
-@settings(max_examples=1000)
+@settings(max_examples=examples(1000))
 @given(name=NAME_LIKE, caller_id=CALLER_IDS)
 def test_resolve_parameter_agrees_with_rosmaster(rosmaster: Oracle, name: str, caller_id: str) -> None:
     """Parameter keys and namespaces that are not refused resolve as rosmaster resolves them."""
@@ -67,7 +68,7 @@ def test_resolve_parameter_agrees_with_rosmaster(rosmaster: Oracle, name: str, c
         assert resolved == "/" or not resolved.endswith("/")
 
 
-@settings(max_examples=500)
+@settings(max_examples=examples(500))
 @given(name=st.from_regex(r"[A-Za-z/~][A-Za-z0-9_/]{0,12}", fullmatch=True), caller_id=NODE_IDS)
 def test_every_ros_name_resolves(rosmaster: Oracle, name: str, caller_id: str) -> None:
     """No name of the ROS grammar is refused but those that mean the global namespace."""

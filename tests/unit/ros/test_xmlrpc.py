@@ -22,6 +22,7 @@ from appliance.ros.xmlrpc import (
     parse_call,
     parse_response,
 )
+from tests.support.examples import examples
 
 XML_TEXT = st.text(
     st.one_of(
@@ -473,7 +474,7 @@ SCRAPS = st.one_of(
 )
 
 
-@settings(max_examples=500)
+@settings(max_examples=examples(500))
 @given(scraps=st.lists(SCRAPS, max_size=12), whole=st.booleans(), raw=st.binary(max_size=3))
 def test_scraps_raise_only_the_error_for_the_peer(scraps: list[str], whole: bool, raw: bytes) -> None:
     """No mixture of XML-RPC's own elements makes the parsers raise anything but PeerError."""
@@ -488,7 +489,7 @@ def test_scraps_raise_only_the_error_for_the_peer(scraps: list[str], whole: bool
             assert whole or isinstance(result, MethodCall) or "<methodResponse>" in text
 
 
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 @given(data=st.data())
 def test_damaged_calls_raise_only_the_error_for_the_peer(data: st.DataObject) -> None:
     """A call with bytes changed, cut or doubled is refused, or read as rosmaster would read it."""

@@ -19,8 +19,8 @@ import { Grant } from "./grant.js";
 import { Why } from "./why.js";
 
 const EXPLAINED = new Set(["publish", "subscribe", "offer", "call", "command", "node", "read", "write"]);
-const SHOWN_APART = new Set(["before", "after", "before_fields", "after_fields", "at", "conditions", "why"]);
-const MONITORS = new Set(["monitor verdict", "message dropped", "message changed", "trial observed"]);
+const SHOWN_APART = new Set(["before", "after", "before_fields", "after_fields", "at", "timer", "conditions", "values", "handler", "why"]);
+const MONITORS = new Set(["monitor verdict", "message dropped", "message changed", "monitor fault", "monitor published", "trial observed"]);
 
 /** @param {{id: string, filter: Record<string, string>}} given */
 export function RecordPanel({ id, filter }) {

@@ -1,4 +1,4 @@
-/** Why a monitor's verdict, drop or change happened: the events that alone make it so, the values compared, the lines. */
+/** Why a monitor's verdict, drop, change, fault or publication happened: the events that alone make it so, the values compared, the lines. */
 
 import { html } from "../html.js";
 import { Given } from "../parts/given.js";

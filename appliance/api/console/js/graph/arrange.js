@@ -1,6 +1,7 @@
 /**
- * Where everything stands: from left to right in the direction the messages go. What stands somewhere stays there
- * while the graph changes a little; what is new is put beside what it belongs to.
+ * Where everything stands: from left to right in the direction the messages go; in a narrow frame from above downwards,
+ * in two columns. What stands somewhere stays there while the graph changes a little; what is new is put beside what it
+ * belongs to, in a narrow frame below the rest.
  */
 
 import { Graph, layout } from "/console/static/vendor/dagre.js";
@@ -13,19 +14,20 @@ export const SIZES = {
 const GAP = 16;
 const COLUMN = 52;
 const GROUP = [206, 50];
+const BETWEEN = 44; // the two columns of a narrow frame: the lines are there
 const TALLEST = 12; // parts of an opened group in one column
 const LITTLE = 0.25; // of what is shown may be new before all is arranged afresh
 
 /**
- * @param {Map<string, any>} items @param {Map<string, any>} lines @param {Map<string, Spot>} before
+ * @param {Map<string, any>} items @param {Map<string, any>} lines @param {Map<string, Spot>} before @param {boolean} narrow
  * @returns {Map<string, Spot>}
  */
-export function arrange(items, lines, before) {
+export function arrange(items, lines, before, narrow) {
   before = unfolded(items, before);
   const fresh = [...items.keys()].filter((key) => !before.has(key));
-  if (before.size && fresh.length && fresh.length <= Math.max(2, items.size * LITTLE)) return added(items, lines, before, fresh);
+  if (before.size && fresh.length && fresh.length <= Math.max(2, items.size * LITTLE)) return added(items, narrow ? new Map() : lines, before, fresh);
   if (before.size && !fresh.length) return new Map([...items.keys()].map((key) => [key, /** @type {Spot} */ (before.get(key))]));
-  return afresh(items, lines);
+  return afresh(items, lines, narrow);
 }
 
 /**
@@ -72,8 +74,8 @@ function inColumns(parts, left, top) {
   return spots;
 }
 
-/** All of it anew. @param {Map<string, any>} items @param {Map<string, any>} lines */
-export function afresh(items, lines) {
+/** All of it anew. @param {Map<string, any>} items @param {Map<string, any>} lines @param {boolean} narrow */
+export function afresh(items, lines, narrow) {
   const graph = new Graph({ multigraph: false });
   graph.setGraph({ rankdir: "LR", nodesep: GAP, ranksep: COLUMN, edgesep: 8, ranker: items.size > 150 ? "longest-path" : "tight-tree", acyclicer: "greedy" });
   graph.setDefaultEdgeLabel(() => ({}));
@@ -95,7 +97,21 @@ export function afresh(items, lines) {
     const [w, h] = sizeOf(items.get(key));
     spots.set(key, { x, y, w, h });
   }
-  return spots;
+  return narrow ? stacked(spots) : spots;
+}
+
+/** Each column below the one before it, two boxes in a row. */
+function stacked(/** @type {Map<string, Spot>} */ spots) {
+  /** @type {Map<string, Spot>} */
+  const placed = new Map();
+  let [column, place, top] = [NaN, 0, 0];
+  for (const [key, { x, w, h }] of [...spots].sort(([, a], [, b]) => a.x - b.x || a.y - b.y)) {
+    if (x !== column) [column, place, top] = [x, 0, top + (placed.size ? GROUP[1] + COLUMN : 0)];
+    else if (place % 2 === 0) top += GROUP[1] + GAP;
+    placed.set(key, { x: ((GROUP[0] + BETWEEN) / 2) * (place % 2 ? 1 : -1), y: top, w, h });
+    place += 1;
+  }
+  return placed;
 }
 
 /** The new ones at the nearest free place beside what they are connected to. */

@@ -10,16 +10,17 @@ const MARGIN = 24;
 const CLOSEST = 2.5;
 const FARTHEST = 0.27; // a box is then as high as its name, which is never drawn smaller than it is read
 const BOW = 46;
+const NARROW_BOW = 10;
 const NAME = 11.5; // size of a name on the screen, as in graph.css
 const GLYPH = 0.61; // width of a letter of the name's typeface, of its size
 
 /** @typedef {{x: number, y: number, zoom: number}} Look the corner of what is seen, and how large it is drawn */
 
-/** @param {{items: Map<string, any>, lines: Map<string, any>, spots: Map<string, any>, chosen: string | null, choose: (key: string | null) => void, arranged: number}} given */
-export function Drawing({ items, lines, spots, chosen, choose, arranged }) {
+/** @param {{items: Map<string, any>, lines: Map<string, any>, spots: Map<string, any>, chosen: string | null, choose: (key: string | null) => void, arranged: number, narrow: boolean}} given */
+export function Drawing({ items, lines, spots, chosen, choose, arranged, narrow }) {
   const box = useRef(/** @type {HTMLElement | null} */ (null));
   const [look, setLook] = useState(/** @type {Look} */ ({ x: 0, y: 0, zoom: 1 }));
-  const all = withBows(extent(spots.values()));
+  const all = withBows(extent(spots.values()), narrow ? NARROW_BOW : BOW);
   const own = useRef(false); // whether the reader chose what is seen; until then all is
   const fit = () => {
     own.current = false;
@@ -62,7 +63,7 @@ export function Drawing({ items, lines, spots, chosen, choose, arranged }) {
     <svg role="group" aria-label="Graph of nodes and topics" onClick=${(/** @type {any} */ event) => event.target === event.currentTarget && choose(null)}>
       <defs><${Tip} id="tip-flow" /><${Tip} id="tip-mediated" /><${Tip} id="tip-denied" /><${Tip} id="tip-would" /></defs>
       <g transform=${`scale(${look.zoom}) translate(${-look.x} ${-look.y})`}>
-        ${[...lines.values()].map((line) => html`<${Line} key=${line.key} line=${line} spots=${spots} chosen=${chosen} near=${near} choose=${choose} />`)}
+        ${[...lines.values()].map((line) => html`<${Line} key=${line.key} line=${line} spots=${spots} chosen=${chosen} near=${near} choose=${choose} narrow=${narrow} />`)}
         ${[...items.values()].map((item) => html`<${Box} key=${item.key} item=${item} spot=${spots.get(item.key)} chosen=${chosen === item.key} faint=${near !== null && !near.has(item.key)} zoom=${look.zoom} choose=${choose} />`)}
       </g></svg>
     <div class="drawing-tools">
@@ -103,11 +104,11 @@ function Box(/** @type {any} */ { item, spot, chosen, faint, zoom, choose }) {
     <title>${said}</title></g>`;
 }
 
-function Line(/** @type {any} */ { line, spots, chosen, near, choose }) {
+function Line(/** @type {any} */ { line, spots, chosen, near, choose, narrow }) {
   const from = spots.get(line.from);
   const to = spots.get(line.to);
   if (!from || !to) return null;
-  const path = curve(from, to);
+  const path = narrow ? between(from, to) : curve(from, to);
   const own = chosen === line.key;
   const touched = near === null || own || line.from === chosen || line.to === chosen;
   const kind = line.kind === "denied" ? (line.would ? "would" : "denied") : line.mediated ? "mediated" : "flow";
@@ -136,6 +137,12 @@ function curve(/** @type {any} */ from, /** @type {any} */ to) {
   return `M${x1} ${from.y}C${x1 + 56} ${from.y} ${x1 + 48} ${low} ${(x1 + x2) / 2} ${low}S${x2 - 56} ${to.y} ${x2} ${to.y}`;
 }
 
+/** In two columns: out of the inner side of a box into the space between them, and into the inner side of the other. */
+function between(/** @type {any} */ from, /** @type {any} */ to) {
+  const inner = (/** @type {any} */ spot, /** @type {number} */ out) => spot.x + (spot.x < 0 ? 1 : -1) * (spot.w / 2 + out);
+  return `M${inner(from, 0)} ${from.y}C${inner(from, BOW)} ${from.y} ${inner(to, BOW)} ${to.y} ${inner(to, 2)} ${to.y}`;
+}
+
 function shortened(/** @type {string} */ text, /** @type {number} */ most) {
   const said = plain(text, 400);
   const points = [...said];
@@ -156,8 +163,8 @@ function neighbours(/** @type {string} */ chosen, /** @type {Map<string, any>} *
 }
 
 /** The same with room for the lines that go back, around the outermost boxes. */
-function withBows(/** @type {{x: number, y: number, w: number, h: number}} */ { x, y, w, h }) {
-  return { x: x - BOW, y, w: w + 2 * BOW, h: h + BOW };
+function withBows(/** @type {{x: number, y: number, w: number, h: number}} */ { x, y, w, h }, /** @type {number} */ bow) {
+  return { x: x - bow, y, w: w + 2 * bow, h: h + bow };
 }
 
 function fitted(/** @type {{x: number, y: number, w: number, h: number}} */ all, /** @type {HTMLElement} */ box) {

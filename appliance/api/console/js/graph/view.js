@@ -14,6 +14,7 @@ import { Drawing } from "./drawing.js";
 import { TopicList } from "./list.js";
 import { modelOf } from "./model.js";
 
+const NARROW = matchMedia("(max-width: 620px)"); // as in graph.css
 const MOST = 42; // things of a kind that are drawn before they are grouped
 const RECENT_HOURS = 1;
 
@@ -30,7 +31,7 @@ export function GraphView() {
   const recent = useMemo(() => recentOf(denials ?? []), [denials]);
   const model = useMemo(() => (graph ? narrowed(modelOf(graph, recent, wanted), search) : null), [graph, recent, wanted, search]);
   const shown = useMemo(() => (model ? collapse(model, opened, by, MOST) : null), [model, opened, by]);
-  const { spots, arranged } = useSpots(shown, round, `${search}|${JSON.stringify(wanted)}|${by}`);
+  const { spots, arranged, narrow } = useSpots(shown, round, `${search}|${JSON.stringify(wanted)}|${by}`, NARROW.matches);
   const head = html`<div class="head"><h1>Graph</h1>${graph && html`<span class="head-sub">${counted(graph.nodes.length, "node")}, ${counted(graph.topics.length, "topic")}, ${counted(graph.services.length, "service")}</span>`}
     <div class="head-actions"><div class="row" role="group" aria-label="Form">
       ${[["drawing", "Drawing"], ["list", "Table"]].map(([name, word]) => html`<button key=${name} class="button" aria-pressed=${String(form === name)} onClick=${() => setForm(name)}>${word}</button>`)}</div></div></div>`;
@@ -63,7 +64,7 @@ export function GraphView() {
             ${form === "drawing" && html`<button class="button small" onClick=${() => setRound(round + 1)} title="Place everything anew">Arrange</button>`}</span></div>
         ${form === "list" ? html`<${TopicList} topics=${topics} denials=${recent} choose=${choose} chosen=${chosen} />`
           : shown.items.size === 0 ? html`<${Empty} icon="graph" title=${search ? "Nothing matches" : "No node has registered yet"}>${search ? "Search for a part of a name, a type or a host." : "Point nodes at the appliance: export ROS_MASTER_URI to its address, and start them."}</${Empty}>`
-          : html`<${Drawing} items=${shown.items} lines=${shown.lines} spots=${spots} chosen=${chosen} choose=${choose} arranged=${arranged} /><${Legend} />`}
+          : html`<${Drawing} items=${shown.items} lines=${shown.lines} spots=${spots} chosen=${chosen} choose=${choose} arranged=${arranged} narrow=${narrow} /><${Legend} />`}
       </section>
       ${(item || line) && html`<${Details} key=${chosen} item=${item} line=${line} shown=${shown} denials=${recent} choose=${choose} open=${open} />`}
     </div>`;
@@ -81,17 +82,17 @@ function Legend() {
 }
 
 /** Places that hold while the graph changes; a search, a filter or an opened group arranges afresh. */
-function useSpots(/** @type {any} */ shown, /** @type {number} */ round, /** @type {string} */ cause) {
-  const kept = useRef({ spots: new Map(), cause: "", round: -1, arranged: 0 });
+function useSpots(/** @type {any} */ shown, /** @type {number} */ round, /** @type {string} */ cause, /** @type {boolean} */ narrow) {
+  const kept = useRef({ spots: new Map(), cause: "", round: -1, arranged: 0, narrow });
   return useMemo(() => {
     if (!shown) return kept.current;
-    const anew = kept.current.cause !== cause || kept.current.round !== round;
+    const anew = kept.current.cause !== cause || kept.current.round !== round || kept.current.narrow !== narrow;
     const before = kept.current.spots;
-    const spots = anew ? afresh(shown.items, shown.lines) : arrange(shown.items, shown.lines, before);
+    const spots = anew ? afresh(shown.items, shown.lines, narrow) : arrange(shown.items, shown.lines, before, narrow);
     const moved = anew || [...before].some(([key, spot]) => spots.has(key) && spots.get(key) !== spot);
-    kept.current = { spots, cause, round, arranged: kept.current.arranged + (moved || !before.size ? 1 : 0) };
+    kept.current = { spots, cause, round, narrow, arranged: kept.current.arranged + (moved || !before.size ? 1 : 0) };
     return kept.current;
-  }, [shown, round, cause]);
+  }, [shown, round, cause, narrow]);
 }
 
 function recentOf(/** @type {any[]} */ denials) {

@@ -47,7 +47,7 @@ function Verdicts(/** @type {{name: string, row: any}} */ { name, row }) {
   const [span, setSpan] = useState(900);
   const series = /** @type {any[]} */ ([["verdicts", "c1", 0], ["dropped", "c2", 1], ["changed", "c3", 2], ["faults", "c4", 3]]).map(([word, colour, place]) => ({ name: word, colour, points: counters(samples, name, place) }));
   return html`<section class="panel" aria-labelledby="verdicts"><div class="panel-head"><h2 id="verdicts">What it does</h2><span class="end">${[[900, "15 min"], [3600, "1 h"]].map(([seconds, word]) => html`<button key=${word} class="button small" aria-pressed=${String(span === seconds)} onClick=${() => setSpan(Number(seconds))}>${word}</button>`)}</span></div>
-    <div class="panel-body stack"><dl class="figures">${[["Events", row.events], ["Verdicts", row.verdicts], ...(row.trial ? [["Would have dropped", row.would_drop], ["Would have changed", row.would_change], ["Missed", row.missed]] : [["Dropped", row.drops], ["Changed", row.changes]]), ["Faults", row.faults]].map(([word, value]) => html`<div key=${word}><dt>${word}</dt><dd>${count(value)}</dd></div>`)}</dl>
+    <div class="panel-body stack"><dl class="figures">${[["Events", row.events], ["Verdicts", row.verdicts], ...(row.trial ? [["Would have dropped", row.would_drop], ["Would have changed", row.would_change], ["Missed", row.missed]] : [["Dropped", row.drops], ["Changed", row.changes]]), ["Faults", row.faults], ...(row.slice_limit ? [["Slices", row.slices], ["Slices at most", row.slice_limit]] : [])].map(([word, value]) => html`<div key=${word}><dt>${word}</dt><dd>${count(value)}</dd></div>`)}</dl>
       <${Plot} label=${`What ${name} does`} series=${series} span=${span} /></div></section>`;
 }
 

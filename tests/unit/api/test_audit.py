@@ -1,0 +1,38 @@
+"""Tests of `appliance.api.audit`."""
+
+from appliance.api.access import Role
+from appliance.api.audit import page_of
+from appliance.audit.query import Filter
+from tests.support.audit import decision, settle
+from tests.unit.api.test_streams import bearer
+from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path
+
+__all__ = ["key", "make_log", "notary", "path"]
+
+
+def test_a_viewers_page_tells_nothing_of_what_is_withheld(make_log: MakeLog) -> None:
+    """Neither its records nor its cursor say whether a text stands in a message: a guess is answered as any other."""
+    log = make_log()
+    said = {"monitor": "m", "before_fields": {"data": "password"}}
+    for number in range(40):
+        hidden = number % 4 != 3
+        log.record(decision(log, reason="x" if hidden else "the password", detail=said if hidden else {}))
+    settle(log)
+    for newest in (True, False):
+        for limit in (1, 2, 3, 10, 100):
+            found: list[int] = []
+            cursor, first = None, True
+            while first or cursor is not None:
+                page = page_of(
+                    log.path, Filter(text="password"), cursor, limit, bearer("v"), newest_first=newest
+                )
+                cursor, first = page["cursor"], False
+                assert len(page["records"]) == limit or cursor is None
+                found += [record["sequence"] for record in page["records"]]
+            assert sorted(found, reverse=newest) == found == [*dict.fromkeys(found)]
+            assert len(found) == 10
+    empty: dict[str, object] = {"records": [], "cursor": None}
+    hidden_only = Filter(text="data")
+    assert page_of(log.path, hidden_only, None, 1, bearer("v"), newest_first=True) == empty
+    reader = bearer("o", Role.OPERATOR)
+    assert len(page_of(log.path, hidden_only, None, 1, reader, newest_first=True)["records"]) == 1
