@@ -2,11 +2,15 @@
 # Every target installs what it needs first (scripts/setup; quick when there is nothing to do).
 
 SHELL := /bin/bash
+# What pytest makes of a test file once, it need not make again for each worker and each run.
+unexport PYTHONDONTWRITEBYTECODE
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := appliance tests examples benchmarks distribution
+LONG_PROOFS := $(addprefix tests/proofs/test_,histories.py insertion_traces.py insertion_at_large.py certifier.py events.py)
+PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples' tests/unit)
 
 .PHONY: help setup demo check static unit test test-system test-package prove wheel package image site release bench clean
 
@@ -33,11 +37,12 @@ unit:
 	$(PYTEST) tests/unit -n auto --quiet
 
 test: check ## check, and the tests with real ROS nodes (root: they make network namespaces)
-	$(PYTEST) tests/integration tests/proofs/test_insertion.py tests/proofs/test_histories.py -n auto --dist loadfile --quiet --durations=10
+	$(PYTEST) tests/integration tests/proofs/test_insertion.py -n auto --dist loadfile --quiet --durations=10
 
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
-	$(PYTEST) tests/system tests/proofs/test_insertion_at_large.py tests/proofs/test_certifier.py tests/proofs/test_events.py --quiet --durations=15
+	TESTS_EXAMPLES=all $(PYTEST) $(LONG_PROOFS) $(PROPERTIES) -n auto --dist loadfile --quiet --durations=5
+	$(PYTEST) tests/system --quiet --durations=15
 
 test-package: ## what is installed: the package's life in a virtual machine, image and archive built, the wheel
 	@scripts/setup --system
@@ -68,7 +73,7 @@ bench: setup ## measure: every program in benchmarks/
 
 prove: ## check what is proved: the proofs in Coq, the code of events, the model of the insertion, its mutants and traces (docs/assurance.md)
 	@scripts/setup --proofs
-	$(PYTEST) tests/proofs tests/integration/test_insertion_traces.py -n auto --dist loadfile --quiet --durations=5
+	$(PYTEST) tests/proofs -n auto --dist loadfile --quiet --durations=5
 
 clean: ## remove what was built, .venv included
 	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -7,7 +7,8 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.command import ROSRV
 from tests.support.rosmaster import master_at
 from tests.support.waiting import eventually
 
@@ -55,13 +56,7 @@ def test_backed_up_while_running_and_restored_elsewhere(tmp_path: Path) -> None:
 
     new = Appliance(policy=LOADED, options=("--config", str(config)))
     try:
-        done = subprocess.run(
-            [ROSRV, "restore", str(file), "--state", str(new.state)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
+        new.rosrv("restore", str(file))
         before = json.loads(new.rosrv("audit", "verify", "--json").stdout)
         assert before["ok"], before
         new.start()

@@ -6,7 +6,7 @@ import signal
 import sqlite3
 import tempfile
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -32,8 +32,8 @@ words() {
 """
 
 
-@pytest.fixture
-def folder() -> Iterator[Path]:
+@contextmanager
+def specifications() -> Iterator[Path]:
     """A folder of specifications with one file, which the appliance's users may read."""
     with tempfile.TemporaryDirectory(prefix="rosrv-monitors-") as name:
         path = Path(name)
@@ -43,12 +43,32 @@ def folder() -> Iterator[Path]:
 
 
 @pytest.fixture
-def appliance(folder: Path) -> Iterator[Appliance]:
+def folder() -> Iterator[Path]:
+    """A folder of the test's own."""
+    with specifications() as folder:
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def common_appliance() -> Iterator[Appliance]:
     """An appliance with the monitor `words` on /chatter."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     policy = OPEN_POLICY + "getRVState = *\n"
-    with Appliance(policy=policy, options=("--monitors", str(folder), "--api", "off")) as appliance:
+    with (
+        specifications() as folder,
+        Appliance(policy=policy, options=("--monitors", str(folder), "--api", "127.0.0.1:0")) as appliance,
+    ):
         yield appliance
+
+
+@pytest.fixture
+def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
+    """The same, as it is at its start: `words` alone, in its initial state, and a log of this test."""
+    common_appliance.leave_out_what_was()
+    yield common_appliance
+    common_appliance.rosrv("monitor", "remove", "words", check=False)
+    common_appliance.rosrv("monitor", "reload", "--prune")
+    common_appliance.rosrv("monitor", "enable", "words")
 
 
 @pytest.fixture
@@ -409,6 +429,8 @@ OPERATOR = (
     + """
 aim = rospy.Publisher("/landshark/joint_states", JointState, queue_size=10)
 fire = rospy.Publisher("/landshark_control/trigger", Trigger, queue_size=10)
+while not (aim.get_num_connections() and fire.get_num_connections()):
+    rospy.sleep(0.05)
 print('{"event": "ready"}', flush=True)
 for line in sys.stdin:
     for _ in range(5):
@@ -495,3 +517,48 @@ def test_each_goal_of_an_action_is_monitored_by_itself(appliance: Appliance, ros
     client = ros.node("rospy", "action", "client", name="asker")
     assert client.wait_for(event="result")["result"] == 3
     assert all("twin" in one["reason"] for one in appliance.recorded(event="monitor verdict"))
+
+
+JUDGE = """
+judge() {
+    event said(std::string text) /chatter std_msgs/String '{data:text}' when (text != "") {
+        std_msgs::String report;
+        if (text.find("hello") == 0) { text = "checked"; PUBLISH(/alarm, std_msgs/String, report); }
+    }
+    ere: said said
+    @match { int zero = 0; zero = 1 / zero; }
+}
+"""
+
+
+def test_what_a_monitor_does_explains_itself_on_the_command_line_as_over_rest(
+    appliance: Appliance, ros: RosSession, tmp_path: Path
+) -> None:
+    """Verdict, change, publication, fault and drop of a running appliance: who, which event, value and line."""
+    file = tmp_path / "judge.rv"
+    file.write_text(JUDGE)
+    appliance.rosrv("monitor", "remove", "words")
+    appliance.rosrv("monitor", "load", str(file))
+    ros.listener("rospy", "/chatter")
+    ros.talker("rospy", "/chatter", name="voice").wait_for_count(3, event="sent")
+    rest = appliance.rest()
+    for event, at in (
+        ("message changed", "judge.rv:3:5"),
+        ("monitor published", "judge.rv:5:"),
+        ("monitor verdict", "judge.rv:7:"),
+        ("monitor fault", "judge.rv:8:"),
+        ("message dropped", "judge.rv:8:"),
+    ):
+        full = next(one for one in appliance.recorded(event=event) if "count" not in one["detail"])
+        lines = appliance.rosrv("audit", "why", full["id"]).stdout.splitlines()
+        assert rest.get(f"/v1/audit/{full['id']}/why").json["lines"] == lines
+        assert lines[0] == full["reason"]
+        assert any(line.startswith("by: message number ") and "/voice on 127.0.0.1" in line for line in lines)
+        assert any(line.startswith(f"at: {at}") for line in lines), (event, lines)
+        assert any(line.startswith("where: judge.rv:3:") and "hello" in line for line in lines), (
+            event,
+            lines,
+        )
+        told = [line for line in lines if line.startswith("because: said at ")]
+        assert len(told) == (2 if event in ("monitor verdict", "message dropped") else 0), (event, lines)
+        assert any("zero = 0" in line for line in lines) is (event in ("monitor fault", "message dropped"))

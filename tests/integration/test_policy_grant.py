@@ -29,7 +29,7 @@ def appliance() -> Iterator[Appliance]:
         yield appliance
 
 
-def refused(appliance: Appliance, method: str, *arguments: str) -> str:
+def refused(appliance: Appliance, method: str, *arguments: object) -> str:
     """The id of the record of a call that is refused."""
     with ServerProxy(appliance.master_uri) as master:
         code, text, _value = getattr(master, method)(*arguments)
@@ -73,3 +73,59 @@ def test_what_no_policy_grants_is_said(appliance: Appliance) -> None:
     assert rest.get(f"/v1/audit/{record}/why").json["refusal"]
     started = appliance.recorded("--event", "appliance started")[0]["id"]
     assert "no record of a decision" in appliance.rosrv("policy", "grant", started, check=False).stderr
+
+
+CLOSED = """
+[Groups]
+ocu = 10.9.9.9
+[Nodes]
+/hidden = ocu
+default = ocu 127.0.0.1
+[Publishers]
+default = ocu
+[Subscribers]
+default = ocu
+[Services]
+default = ocu
+[Clients]
+default = ocu
+[Parameters]
+read default = ocu
+write default = ocu
+[Commands]
+lookupNode = ocu
+default = ocu 127.0.0.1
+"""
+HERE = "http://127.0.0.1:4000/"
+DENIALS: dict[str, tuple[tuple[object, ...], list[str]]] = {
+    "a name": (
+        ("registerPublisher", "/hidden", "/t", "std_msgs/String", HERE),
+        ["/t = ocu robot", "/hidden = ocu robot"],
+    ),
+    "a publication": (("registerPublisher", "/n", "/t", "std_msgs/String", HERE), ["/t = ocu robot"]),
+    "a subscription": (("registerSubscriber", "/n", "/t", "std_msgs/String", HERE), ["/t = ocu robot"]),
+    "a service": (("registerService", "/n", "/s", "rosrpc://127.0.0.1:4001", HERE), ["/s = ocu robot"]),
+    "a client": (("lookupService", "/n", "/s"), ["/s = ocu robot"]),
+    "a parameter that is read": (("getParam", "/n", "/p"), ["read /p = ocu robot"]),
+    "a parameter that is written": (("setParam", "/n", "/p", 1), ["write /p = ocu robot"]),
+    "a parameter that is deleted": (("deleteParam", "/n", "/p"), ["write /p = ocu robot"]),
+    "a parameter that is subscribed to": (("subscribeParam", "/n", HERE, "/p"), ["read /p = ocu robot"]),
+    "a question": (("lookupNode", "/n", "/m"), ["lookupNode = ocu robot"]),
+}
+
+
+def test_every_denial_explains_itself(appliance: Appliance) -> None:
+    """Who, which rule in which line, and what would allow it; on the command line as over REST."""
+    appliance.reload(CLOSED)
+    rest = appliance.rest()
+    allowed: dict[str, list[str]] = {}
+    for what, (call, _added) in DENIALS.items():
+        record = refused(appliance, str(call[0]), *call[1:])
+        lines = appliance.rosrv("audit", "why", record).stdout.splitlines()
+        assert rest.get(f"/v1/audit/{record}/why").json["lines"] == lines
+        assert f"by: {call[1]} on 127.0.0.1" in lines, what
+        (rule,) = [line for line in lines if line.startswith("rule: ")]
+        assert rule.rpartition(":")[2].isdecimal(), what
+        head = "would be allowed by: "
+        allowed[what] = [line.removeprefix(head) for line in lines if line.startswith(head)]
+    assert allowed == {what: added for what, (_call, added) in DENIALS.items()}

@@ -88,6 +88,7 @@ def test_no_way_leads_past_the_signature_of_a_policy(appliance: Appliance) -> No
     taken = post(appliance, "/v1/policy", text=OTHER, signature=signed(OTHER))
     assert taken.status == 200, taken.body
     appliance.rosrv("policy", "rollback")
+    appliance.recorded("--event", "policy loaded", count=3)
     appliance.kill("control")
     state = eventually(lambda: in_force(appliance), appliance.story)
     assert (state["revision"], state["signature"], state["site_keys"]) == (3, signed(OPEN_POLICY), [LINE])

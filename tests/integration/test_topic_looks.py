@@ -13,14 +13,14 @@ from tests.support.waiting import eventually
 
 MONITOR = """
 censor() {
-    event said(std::string text) /chatter std_msgs/String '{data:text}' { text = "checked " + text; }
+    event said(std::string text) /TOPIC std_msgs/String '{data:text}' { text = "checked " + text; }
 }
 """
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def appliance() -> Iterator[Appliance]:
-    """An appliance with REST and no monitors yet."""
+    """An appliance with REST and no monitors yet; each test has topics of its own."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with Appliance(options=("--api", "127.0.0.1:0")) as appliance:
         yield appliance
@@ -44,17 +44,18 @@ def test_what_subscribers_get_is_shown_and_recorded(
     appliance: Appliance, ros: RosSession, client: Client, tmp_path: Path
 ) -> None:
     """Before and after a monitor changes it; nobody subscribes, and the publisher need not."""
-    ros.talker(client, "/chatter", "--text", "word", name="voice").wait_for(event="ready")
-    shown = echoed(appliance, "/chatter", "-n", "3")
+    topic = f"/{client}_chatter"
+    ros.talker(client, topic, "--text", "word", name="voice").wait_for(event="ready")
+    shown = echoed(appliance, topic, "-n", "3")
     assert [row["node"] for row in shown] == ["/voice"] * 3
-    echoed(appliance, "/chatter")  # whoever looks on is not recorded again
+    echoed(appliance, topic)  # whoever looks on is not recorded again
     assert all("word" in str(row["fields"]) for row in shown)
-    [record] = appliance.recorded("--event", "topic looked into")
-    assert (record["resource"], record["detail"]) == ("/chatter", {"who": "operator", "seconds": 60.0})
+    [record] = appliance.recorded("--event", "topic looked into", "--topic", topic)
+    assert record["detail"] == {"who": "operator", "seconds": 60.0}
     specification = tmp_path / "censor.rv"
-    specification.write_text(MONITOR)
+    specification.write_text(MONITOR.replace("/TOPIC", topic))
     appliance.rosrv("monitor", "load", str(specification))
-    assert "checked" in str(echoed(appliance, "/chatter", "--field", "data")[0]["fields"])
+    assert "checked" in str(echoed(appliance, topic, "--field", "data")[0]["fields"])
 
 
 def test_a_latched_message_is_shown_once(appliance: Appliance, ros: RosSession) -> None:

@@ -10,17 +10,16 @@ import os
 import signal
 import ssl
 import subprocess
-import sys
 import tempfile
 import urllib.parse
 from pathlib import Path
 from typing import Any, Self
 
+from tests.support.command import ROSRV, rosrv
 from tests.support.processes import LIMIT, Event, Host, Process, ThisMachine
 from tests.support.rest import Rest
 from tests.support.waiting import eventually
 
-ROSRV = str(Path(sys.executable).parent / "rosrv")
 OPEN_POLICY = """\
 [Nodes]
 default = *
@@ -63,6 +62,8 @@ class Appliance:
         self.policy_file.write_text(policy)
         self.process: Process | None = None
         self.ready: Event = {}
+        self.token = ""  # the first one, which is said at the first start
+        self._looked_at = 0  # the last record that `audit` leaves out
 
     @property
     def master_uri(self) -> str:
@@ -91,6 +92,7 @@ class Appliance:
         self.process = Process(self.host, command, env=environment, label="rosrv up")
         if self.json:
             self.ready = self.process.wait_for(event="ready", timeout=2 * LIMIT)
+            self.token = self.ready.get("token", self.token)
         else:
             self.process.wait_for_text("Nodes may connect", timeout=60)
         return self
@@ -100,16 +102,13 @@ class Appliance:
         return self.process.stop(with_signal=signal.SIGTERM, timeout=10) if self.process else 0
 
     def rosrv(
-        self, *arguments: str, check: bool = True, timeout: float = LIMIT, state: bool = True
+        self, *arguments: str, check: bool = True, state: bool = True
     ) -> subprocess.CompletedProcess[str]:
         """Another verb of the command, told of this appliance by `--state` (unless it does not take that)."""
-        command = [ROSRV, *arguments, *(["--state", str(self.state)] if state else [])]
-        done = subprocess.run(
-            command, env=_environment(), capture_output=True, text=True, timeout=timeout, check=False
-        )
+        done = rosrv(*arguments, *(["--state", str(self.state)] if state else []))
         if check and done.returncode:
             raise AssertionError(
-                f"{' '.join(command)}: exit status {done.returncode}\n"
+                f"{' '.join(done.args)}: exit status {done.returncode}\n"
                 f"{done.stdout}\n{done.stderr}\n{self.story()}"
             )
         return done
@@ -124,8 +123,17 @@ class Appliance:
         lines = self.rosrv("audit", "search", *flags, "--json").stdout.splitlines()
         records: list[dict[str, Any]] = [json.loads(line) for line in lines if line.strip()]
         return [
-            record for record in records if all(record.get(key) == value for key, value in fields.items())
+            record
+            for record in records
+            if record["sequence"] > self._looked_at
+            and all(record.get(key) == value for key, value in fields.items())
         ]
+
+    def leave_out_what_was(self) -> None:
+        """From now on `audit` and `recorded` have only what is recorded later: what another test did is not there."""
+        self._looked_at = max(
+            (record["sequence"] for record in self.audit("--limit", "1")), default=self._looked_at
+        )
 
     def recorded(self, *flags: str, count: int = 1, **fields: Any) -> list[dict[str, Any]]:
         """The same, once there are so many: a record is on disk, and a relay's report at control, a little later."""
@@ -151,7 +159,7 @@ class Appliance:
             served = ssl.get_server_certificate((str(place.hostname), place.port or 443), timeout=LIMIT)
             certificate = self.state / "api" / "certificate.pem"
             assert certificate.read_text() == served
-        return Rest(url, token or self.ready["token"], certificate)
+        return Rest(url, token or self.token, certificate)
 
     def processes(self) -> dict[str, dict[str, Any]]:
         """The row of each role in `rosrv status`, once every process has said what walls it is in."""

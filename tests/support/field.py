@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any, Self
 
 from examples.landshark.lab import Host, Lab
-from tests.support.appliance import ROSRV, Appliance
+from tests.support.appliance import Appliance
+from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Event, Process, ThisMachine
 
@@ -47,7 +48,9 @@ class Field:
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
             stack.enter_context(self.appliance)
-            command = [ROSRV, "audit", "tail", "--json", "--state", str(self.appliance.state)]
+            # What is recorded before it is there to look, it has as well.
+            tail = ("audit", "tail", "--lines", "1000", "--json")
+            command = [ROSRV, *tail, "--state", str(self.appliance.state)]
             self.trail = stack.enter_context(
                 Process(ThisMachine(), command, env={"PYTHONUNBUFFERED": "1"}, label="audit tail")
             )

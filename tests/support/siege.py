@@ -20,7 +20,8 @@ from typing import Any, Self
 
 from appliance.ros.xmlrpc import FaultReceived, parse_response
 from examples.landshark.lab import Host, Lab
-from tests.support.appliance import ROSRV, Appliance
+from tests.support.appliance import Appliance
+from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Process, ThisMachine
 from tests.support.waiting import allowed
@@ -167,7 +168,9 @@ class Siege:
             stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
             stack.enter_context(self.appliance)
             stack.callback(self.crowd.leave)
-            command = [ROSRV, "audit", "tail", "--json", "--state", str(self.appliance.state)]
+            # What is recorded before it is there to look, it has as well.
+            tail = ("audit", "tail", "--lines", "1000", "--json")
+            command = [ROSRV, *tail, "--state", str(self.appliance.state)]
             self.trail = stack.enter_context(
                 Process(ThisMachine(), command, env={"PYTHONUNBUFFERED": "1"}, label="audit tail")
             )

@@ -14,7 +14,8 @@ from typing import Any, Self
 
 from appliance.network import links
 from examples.landshark.lab import INTERFACE, Host, Lab
-from tests.support.appliance import ROSRV, Appliance
+from tests.support.appliance import Appliance
+from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Event, Process, ThisMachine
 from tests.support.tunnels import JoinedHost

@@ -25,11 +25,12 @@ def eventually(
 
     `what` says what should have come; as a function it is asked when it did not come.
     """
-    deadline, pause = time.monotonic() + seconds, threading.Event()
+    deadline, pause, moment = time.monotonic() + seconds, threading.Event(), 0.02
     while not (found := condition()):
         if time.monotonic() > deadline:
             raise AssertionError(f"not within {seconds:.0f} s: {what if isinstance(what, str) else what()}")
-        pause.wait(0.02)
+        pause.wait(moment)
+        moment = min(1.5 * moment, 0.25)  # what is slow is not made slower by who asks
     return found
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from appliance.network.namespaces import namespaces
-from tests.support.appliance import ROSRV
+from tests.support.command import ROSRV
 from tests.support.nodes import has_ros
 from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import need_root, needs

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from examples.landshark.lab import Host, Lab
-from tests.support.appliance import ROSRV
+from tests.support.command import ROSRV
 from tests.support.processes import Process
 from tests.support.requirements import need_root
 

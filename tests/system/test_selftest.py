@@ -6,7 +6,8 @@ import subprocess
 import pytest
 
 from examples.landshark.lab import Lab
-from tests.support.appliance import ROSRV, Appliance
+from tests.support.appliance import Appliance
+from tests.support.command import ROSRV
 from tests.support.requirements import need_root
 
 

@@ -27,14 +27,29 @@ OTHER = "count() { event said() /chatter std_msgs/String '{}' { } }\n"
 DROPPING = "speed() { event said() /chatter std_msgs/String '{}' { return; } }\n"
 
 
-@pytest.fixture
-def appliance() -> Iterator[Appliance]:
+@pytest.fixture(scope="module")
+def common_appliance() -> Iterator[Appliance]:
     """An appliance with an empty folder of specifications."""
     appliance = Appliance()
     folder = appliance.directory / "monitors"
     folder.mkdir()
     appliance.options = ("--api", "127.0.0.1:0", "--api-tls", "off", "--monitors", str(folder))
     with appliance as running:
+        yield running
+
+
+@pytest.fixture
+def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
+    """The same without a specification, and a log of this test."""
+    common_appliance.leave_out_what_was()
+    yield common_appliance
+    common_appliance.rosrv("monitor", "reload", "--prune")
+
+
+@pytest.fixture(scope="module")
+def without_folder() -> Iterator[Appliance]:
+    """An appliance that has no folder of specifications."""
+    with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off")) as running:
         yield running
 
 
@@ -76,7 +91,7 @@ def test_a_specification_is_tried_loaded_replaced_and_removed(appliance: Applian
     pruned = send(rest, "POST", "/v1/monitors/reload?prune=1", None, reloaded.etag)
     assert (pruned.json["removed"], pruned.json["monitors"]) == (["count.rv"], [])
     assert rest.get("/v1/monitors").json["who"] == "disk"
-    records = appliance.recorded("--event", "specifications loaded", "--oldest-first", count=5)
+    records = appliance.recorded("--event", "specifications loaded", count=5)
     assert [one["detail"]["who"] for one in records] == ["first"] * 5
 
 
@@ -124,17 +139,16 @@ def test_a_revision_is_gone_back_to_and_a_trial_is_confirmed(appliance: Applianc
     assert appliance.rosrv("monitor", "show", str(kept)).stdout.splitlines()[1:] == LIMIT.splitlines()
 
 
-def test_without_a_folder_a_reload_is_an_error() -> None:
+def test_without_a_folder_a_reload_is_an_error(without_folder: Appliance) -> None:
     """Nothing is taken away, by command or over REST, and the words say how to have a folder."""
-    with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off")) as appliance:
-        rest = appliance.rest()
-        assert load(rest, {"speed.rv": LIMIT}).status == 200
-        done = appliance.rosrv("monitor", "reload", check=False)
-        assert (done.returncode, "no folder of specifications is configured" in done.stderr) == (1, True)
-        assert send(rest, "POST", "/v1/monitors/reload", None, "*").status == 422
-        body = rest.get("/v1/monitors").json
-        assert [one["name"] for one in body["monitors"]] == ["speed"]
-        assert body["differs_from_folder"] is False
+    rest = without_folder.rest()
+    assert load(rest, {"speed.rv": LIMIT}).status == 200
+    done = without_folder.rosrv("monitor", "reload", check=False)
+    assert (done.returncode, "no folder of specifications is configured" in done.stderr) == (1, True)
+    assert send(rest, "POST", "/v1/monitors/reload", None, "*").status == 422
+    body = rest.get("/v1/monitors").json
+    assert [one["name"] for one in body["monitors"]] == ["speed"]
+    assert body["differs_from_folder"] is False
 
 
 def test_one_monitor_is_shown_with_what_it_is_made_of(appliance: Appliance) -> None:
@@ -163,7 +177,7 @@ def test_one_monitor_is_shown_with_what_it_is_made_of(appliance: Appliance) -> N
 def test_a_wrong_specification_changes_nothing_and_says_where(appliance: Appliance) -> None:
     """Tried or loaded, an error is 422 with file, line and column; what was in force stays."""
     rest = appliance.rest()
-    load(rest, {"speed.rv": LIMIT})
+    before = load(rest, {"speed.rv": LIMIT}).json["revision"]
     for query, match in (("?dry_run=1", None), ("", "*")):
         refused = load(rest, {"speed.rv": WRONG, "count.rv": OTHER}, match, query)
         assert refused.status == 422
@@ -173,7 +187,7 @@ def test_a_wrong_specification_changes_nothing_and_says_where(appliance: Applian
         assert refused.json["column"] == finding["column"] > 1
         assert "std_msgs/String" in finding["text"]
     assert send(rest, "PUT", "/v1/monitors/speed", WRONG, "*").status == 422
-    assert rest.get("/v1/monitors").json["revision"] == 1
+    assert rest.get("/v1/monitors").json["revision"] == before
     assert rest.get("/v1/monitors/speed").json["text"] == LIMIT
 
 
@@ -198,7 +212,8 @@ def test_two_engineers_do_not_overwrite_each_other(appliance: Appliance) -> None
 def test_a_switch_is_not_undone_by_who_has_not_seen_it(appliance: Appliance) -> None:
     """A stale ETag is 412 with the present one and changes nothing, after a switch as after a load, and a restart."""
     rest = appliance.rest()
-    seen = load(rest, {"speed.rv": LIMIT}).etag
+    loaded = load(rest, {"speed.rv": LIMIT})
+    seen = loaded.etag
     assert rest.get("/v1/monitors").etag == rest.get("/v1/monitors/speed").etag == seen
     off = send(rest, "PATCH", "/v1/monitors/speed", {"enabled": False}, seen)
     now = off.etag
@@ -212,12 +227,16 @@ def test_a_switch_is_not_undone_by_who_has_not_seen_it(appliance: Appliance) -> 
         ("POST", "?dry_run=1", {"files": {"count.rv": OTHER}}), ("DELETE", "/speed", None),
         ("DELETE", "?name=speed", None),
     )  # fmt: skip
-    for stale in (seen, '"1"'):  # of what was before, and of a version whose ETags were numbers
+    for stale in (
+        seen,
+        f'"{loaded.json["revision"]}"',
+    ):  # of what was before, and of a version whose ETags were numbers
         for method, path, body in changes:
             refused = send(rest, method, f"/v1/monitors{path}", body, stale)
             assert (refused.status, refused.headers.get("etag")) == (412, now), (method, path, refused.body)
     state = rest.get("/v1/monitors").json
-    assert (state["revision"], [one["enabled"] for one in state["monitors"]]) == (1, [False])
+    before = loaded.json["revision"]
+    assert (state["revision"], [one["enabled"] for one in state["monitors"]]) == (before, [False])
     same = send(rest, "PATCH", "/v1/monitors/speed", {"enabled": False}, now)
     assert (same.etag, same.json["names"]) == (now, [])
     appliance.stop()
@@ -300,25 +319,18 @@ def test_each_role_may_what_it_is_for(appliance: Appliance) -> None:
         {"files": {"a.rv": LIMIT}, "note": "x" * 201},
     ],
 )  # fmt: skip
-def test_what_makes_no_sense_is_refused(shared: Rest, body: object) -> None:
+def test_what_makes_no_sense_is_refused(without_folder: Appliance, body: object) -> None:
     """No file, a name that is a path or no `.rv`, a definition that is none, a note without end: 422 in words."""
-    answer = send(shared, "POST", "/v1/monitors", body, "*")
+    answer = send(without_folder.rest(), "POST", "/v1/monitors", body, "*")
     assert answer.status == 422, answer.body
     assert answer.json["errors"]
-
-
-@pytest.fixture(scope="module")
-def shared() -> Iterator[Rest]:
-    """REST of an appliance that several tests share."""
-    with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off")) as running:
-        yield running.rest()
 
 
 def test_what_a_monitor_does_is_counted_and_remembered(appliance: Appliance, tmp_path: Path) -> None:
     """A monitor that drops every message of a real talker: its counters rise, its history has the drops."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     rest = appliance.rest()
-    load(rest, {"speed.rv": DROPPING, "count.rv": OTHER})
+    load(rest, {"speed.rv": DROPPING, "tally.rv": OTHER.replace("count", "tally")})
     with RosSession(appliance.master_uri, tmp_path) as ros:
         ros.talker("rospy", "/chatter", name="talker")
         events = rest.events("/v1/audit/stream?event=message%20dropped&after=0")
@@ -329,7 +341,7 @@ def test_what_a_monitor_does_is_counted_and_remembered(appliance: Appliance, tmp
     happened = rest.get("/v1/monitors/speed/history").json["happened"]
     assert "message dropped" in {one["event"] for one in happened}
     assert {one["resource"] for one in happened if one["event"] == "message dropped"} == {"/chatter"}
-    assert rest.get("/v1/monitors/count/history").json["happened"] == []
+    assert rest.get("/v1/monitors/tally/history").json["happened"] == []
 
     def counted() -> dict[str, Any] | None:
         row: dict[str, Any] = next(

@@ -1,9 +1,7 @@
 """Policies over REST: tried, refused, loaded, explained, taken back, kept over a restart."""
 
 import json
-import os
 import re
-import subprocess
 import threading
 import time
 import xmlrpc.client
@@ -14,21 +12,49 @@ from xmlrpc.server import SimpleXMLRPCServer
 
 import pytest
 
-from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.command import rosrv
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
 from tests.support.rest import Rest
 from tests.support.waiting import eventually
 
 WITHOUT_PUBLISHERS = OPEN_POLICY.replace("[Publishers]\ndefault = *\n", "[Publishers]\n/allowed = *\n")
+API = "http://127.0.0.1:1/"
 TRANSPORT = ("--api", "127.0.0.1:0", "--api-tls", "off")
 
 
-@pytest.fixture
-def appliance() -> Iterator[Appliance]:
-    """An appliance of its own for a test that changes its policy."""
+@pytest.fixture(scope="module")
+def common_appliance() -> Iterator[Appliance]:
+    """An appliance with REST in clear text."""
     with Appliance(options=TRANSPORT) as running:
         yield running
+
+
+@pytest.fixture
+def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
+    """The same with the open policy of its file in force, and a log of this test; it may change what it likes."""
+    common_appliance.leave_out_what_was()
+    yield common_appliance
+    cases_of(common_appliance).unlink(missing_ok=True)
+    common_appliance.reload(OPEN_POLICY)
+    with xmlrpc.client.ServerProxy(common_appliance.master_uri) as master:
+        master.unregisterPublisher("/tester", "/cmd_vel", API)
+
+
+def cases_of(appliance: Appliance) -> Path:
+    """The tests beside its policy."""
+    return Path(f"{appliance.policy_file}.tests.yaml")
+
+
+def in_force(rest: Rest) -> int:
+    """The revision of the policy."""
+    return int(rest.get("/v1/policy").json["revision"])
+
+
+def tag(revision: int) -> str:
+    """What it is called in If-Match."""
+    return f'"{revision}"'
 
 
 @pytest.fixture
@@ -53,7 +79,7 @@ def living_node() -> Iterator[int]:
 def register(uri: str, topic: str) -> Any:
     """What RVMaster says to a publisher."""
     with xmlrpc.client.ServerProxy(uri) as master:
-        return master.registerPublisher("/tester", topic, "std_msgs/String", "http://127.0.0.1:1/")
+        return master.registerPublisher("/tester", topic, "std_msgs/String", API)
 
 
 def call_with(appliance: Appliance, status: int) -> dict[str, Any] | None:
@@ -65,60 +91,68 @@ def call_with(appliance: Appliance, status: int) -> dict[str, Any] | None:
 def test_a_wrong_policy_is_refused_whole_with_every_place(appliance: Appliance) -> None:
     """Each finding has line and column, the problem those of the first; nothing changes; the refusal is recorded."""
     rest = appliance.rest()
-    answer = rest.post("/v1/policy", "[Nodes]\ndefault = *\nbogus\n[Publishrs]\n", match='"1"')
+    first = in_force(rest)
+    answer = rest.post("/v1/policy", "[Nodes]\ndefault = *\nbogus\n[Publishrs]\n", match=tag(first))
     assert answer.status == 422
     assert answer.headers["content-type"] == "application/problem+json"
     problem = answer.json
     assert (problem["line"], problem["column"]) == (3, 1)
     assert [(one["line"], one["severity"]) for one in problem["findings"]] == [(3, "error"), (4, "error")]
     assert "did you mean Publishers?" in problem["findings"][1]["text"]
-    assert rest.get("/v1/policy").json["revision"] == 1
+    assert in_force(rest) == first
     refused = eventually(lambda: call_with(appliance, 422), "the refused call is recorded")
     assert refused["detail"]["who"] == "first"
     assert "policy:3:1" in refused["reason"]
     assert refused["decision"] == "deny"
     [recorded] = appliance.recorded("--event", "policy refused")
     assert recorded["detail"]["who"] == "first"
-    assert "revision 2:3:1" in recorded["detail"]["findings"][0]
+    assert f"revision {first + 1}:3:1" in recorded["detail"]["findings"][0]
+
+
+def loaded_last_by(appliance: Appliance) -> list[str]:
+    """Who loaded the policy that the log has as the last one."""
+    newest = appliance.audit("--event", "policy loaded", "--limit", "1")
+    return [record["detail"]["who"] for record in newest]
 
 
 def test_a_right_policy_is_in_force_at_once_and_survives(appliance: Appliance) -> None:
     """What it no longer allows is denied from the answer on; the revision has its author; a restart keeps it."""
     rest = appliance.rest()
+    first = in_force(rest)
     assert register(appliance.master_uri, "/cmd_vel")[0] == 1
-    posted = rest.post("/v1/policy", {"text": WITHOUT_PUBLISHERS, "note": "no publishers"}, match='"1"')
+    posted = rest.post("/v1/policy", {"text": WITHOUT_PUBLISHERS, "note": "no publishers"}, match=tag(first))
     assert posted.status == 200
     assert posted.json | {"changes": [], "warnings": [], "ends": []} == {
-        "loaded": True, "revision": 2, "replaced": 1, "revoked": 1, "confirm_by": None, "warnings": [], "changes": [],
-        "ends": [],
+        "loaded": True, "revision": first + 1, "replaced": first, "revoked": 1, "confirm_by": None, "warnings": [],
+        "changes": [], "ends": [],
     }  # fmt: skip
     assert [(one["what"], one["resource"]) for one in posted.json["ends"]] == [("publication", "/cmd_vel")]
-    assert posted.etag == '"2"'
+    assert posted.etag == tag(first + 1)
     assert register(appliance.master_uri, "/cmd_vel")[0] == 0
-    loaded = appliance.recorded("--event", "policy loaded")[0]
-    assert loaded["detail"]["who"] == "first"
+    eventually(lambda: loaded_last_by(appliance) == ["first"], appliance.story)
     status = appliance.status()["policy"]
-    assert (status["revision"], status["differs_from_file"], status["who"]) == (2, True, "first")
+    assert (status["revision"], status["differs_from_file"], status["who"]) == (first + 1, True, "first")
     assert "loaded by first" in " ".join(appliance.rosrv("status", check=False).stdout.split())
     appliance.stop()
     appliance.start()
-    assert appliance.ready["revision"] == 2
+    assert appliance.ready["revision"] == first + 1
     assert register(appliance.master_uri, "/cmd_vel")[0] == 0
 
 
 def test_a_dry_run_says_what_would_change_and_changes_nothing(appliance: Appliance) -> None:
     """Registrations that would be taken back are listed with the new policy's reason; no If-Match is needed."""
     rest = appliance.rest()
+    first = in_force(rest)
     assert register(appliance.master_uri, "/cmd_vel")[0] == 1
     answer = rest.post("/v1/policy?dry_run=1", WITHOUT_PUBLISHERS)
     assert answer.status == 200
     report = answer.json
-    assert (report["loaded"], report["revision"], report["revoked"]) == (False, 1, None)
+    assert (report["loaded"], report["revision"], report["revoked"]) == (False, first, None)
     (change,) = report["changes"]
     assert (change["resource"], change["now"], change["then"]) == ("/cmd_vel", "allow", "deny")
     assert "/cmd_vel" in change["reason"]
     assert register(appliance.master_uri, "/cmd_vel")[0] == 1
-    assert rest.get("/v1/policy").json["revision"] == 1
+    assert in_force(rest) == first
 
 
 def test_a_dry_run_says_all_that_would_end_and_whose(
@@ -137,6 +171,7 @@ def test_a_dry_run_says_all_that_would_end_and_whose(
     assert [one[0] for one in answers] == [1] * 5  # type: ignore[index]  # what a master answers
     nothing = "[Nodes]\n/other = *\n[Commands]\nshutdown = robot\n[Services]\n[Clients]\n[Parameters]\n"
     rest = appliance.rest()
+    first = in_force(rest)
     ends = rest.post("/v1/policy?dry_run=1", nothing).json["ends"]
     expected = {
         ("publication", "/scan", "/driver"), ("subscription", "/cmd_vel", "/driver"),
@@ -151,16 +186,14 @@ def test_a_dry_run_says_all_that_would_end_and_whose(
     assert "subscription /cmd_vel of /driver on " in by_socket.stdout
     told = appliance.rosrv("policy", "check", str(file), "--json").stdout.splitlines()
     assert sum("ends" in json.loads(one) for one in told) == len(ends)
-    by_rest = subprocess.run(
-        [ROSRV, "policy", "check", str(file), "--api", str(appliance.ready["api"])],
-        env={"PATH": os.environ["PATH"], "ROSRV_TOKEN": str(appliance.ready["token"])},
-        capture_output=True, text=True, timeout=60, check=True,
-    )  # fmt: skip
+    place = ("--api", str(appliance.ready["api"]))
+    by_rest = rosrv("policy", "check", str(file), *place, ROSRV_TOKEN=appliance.token)
+    assert by_rest.returncode == 0, by_rest.stderr
     assert (
         sorted(by_rest.stdout.splitlines())[-len(ends) :]
         == sorted(by_socket.stdout.splitlines())[-len(ends) :]
     )
-    assert rest.get("/v1/policy").json["revision"] == 1
+    assert in_force(rest) == first
     assert rest.post("/v1/policy?dry_run=1", OPEN_POLICY).json["ends"] == []
 
 
@@ -174,6 +207,7 @@ def test_check_knows_who_is_enrolled_where_it_may_ask(appliance: Appliance, tmp_
     appliance.stop()
     stopped = appliance.rosrv("policy", "check", str(file), check=False)
     assert (stopped.returncode, "checked without it" in stopped.stderr) == (0, True)
+    appliance.start()
 
 
 def test_two_engineers_cannot_overwrite_each_other(appliance: Appliance) -> None:
@@ -183,74 +217,80 @@ def test_two_engineers_cannot_overwrite_each_other(appliance: Appliance) -> None
         ("/v1/policy", {"text": OPEN_POLICY}), ("/v1/policy/rollback", {}), ("/v1/policy/reload", None),
         ("/v1/policy/confirm", None),
     ]  # fmt: skip
-    assert rest.get("/v1/policy").etag == '"1"'
-    assert rest.post("/v1/policy", WITHOUT_PUBLISHERS, match='"1"').etag == '"2"'
+    first = in_force(rest)
+    assert rest.get("/v1/policy").etag == tag(first)
+    assert rest.post("/v1/policy", WITHOUT_PUBLISHERS, match=tag(first)).etag == tag(first + 1)
     for path, body in changes:
         assert rest.post(path, body).status == 428, path
-        for stale in ('"1"', 'W/"2"', "2", '"x"'):
+        for stale in (tag(first), f"W/{tag(first + 1)}", str(first + 1), '"x"'):
             assert rest.post(path, body, match=stale).status == 412, (path, stale)
-    assert rest.get("/v1/policy").json["revision"] == 2
-    assert rest.post("/v1/policy/rollback", {}, match='"2"').status == 200
+    assert in_force(rest) == first + 1
+    assert rest.post("/v1/policy/rollback", {}, match=tag(first + 1)).status == 200
 
 
 def test_the_tests_beside_the_file_guard_it(appliance: Appliance) -> None:
     """A text that fails FILE.tests.yaml is refused with the place of the case, also as a dry run."""
-    cases = Path(f"{appliance.policy_file}.tests.yaml")
+    cases = cases_of(appliance)
     cases.write_text("cases:\n  - host: 10.0.0.9\n    node: /joy\n    allow: [publish /cmd_vel]\n")
     rest = appliance.rest()
-    for path, match in (("/v1/policy?dry_run=1", None), ("/v1/policy", '"1"')):
+    present = tag(in_force(rest))
+    for path, match in (("/v1/policy?dry_run=1", None), ("/v1/policy", present)):
         answer = rest.post(path, WITHOUT_PUBLISHERS, match=match)
         assert answer.status == 422
         (finding,) = answer.json["findings"]
         assert (finding["file"], finding["line"]) == (str(cases), 4)
         assert "expected allow" in finding["text"]
-    assert rest.post("/v1/policy", OPEN_POLICY, match='"1"').status == 200
+    assert rest.post("/v1/policy", OPEN_POLICY, match=present).status == 200
 
 
 def test_back_by_itself_unless_confirmed(appliance: Appliance) -> None:
     """A change with confirm_within goes back when nobody confirms, and stays when somebody does."""
     rest = appliance.rest()
+    first = in_force(rest)
     events = rest.events("/v1/audit/stream?event=policy%20*")
     next(events)
-    assert (
-        rest.post("/v1/policy?confirm_within=1", WITHOUT_PUBLISHERS, match='"1"').json["confirm_by"]
-        > time.time()
-    )
+    brief = rest.post("/v1/policy?confirm_within=1", WITHOUT_PUBLISHERS, match=tag(first))
+    assert brief.json["confirm_by"] > time.time()
     back = next(one for one in events if "rolled back" in one.get("data", ""))
     assert json.loads(back["data"])["detail"]["who"] == "not confirmed in time"
     assert register(appliance.master_uri, "/cmd_vel")[0] == 1
-    kept = rest.post("/v1/policy?confirm_within=3600", WITHOUT_PUBLISHERS, match='"3"')
+    kept = rest.post("/v1/policy?confirm_within=3600", WITHOUT_PUBLISHERS, match=tag(first + 2))
     assert rest.get("/v1/policy").json["confirm_by"] == kept.json["confirm_by"]
-    assert rest.post("/v1/policy/confirm", match='"4"').json == {"confirmed": True, "revision": 4}
+    confirmed = rest.post("/v1/policy/confirm", match=tag(first + 3))
+    assert confirmed.json == {"confirmed": True, "revision": first + 3}
     assert rest.get("/v1/policy").json["confirm_by"] is None
 
 
 def test_revisions_are_kept_and_come_back(appliance: Appliance) -> None:
     """All that were in force are listed with their author and text; a rollback makes a new one of an old text."""
     rest = appliance.rest()
-    rest.post("/v1/policy", {"text": WITHOUT_PUBLISHERS, "note": "trial"}, match='"1"')
-    assert rest.post("/v1/policy/rollback", {"revision": 1}, match='"2"').json["revision"] == 3
+    rest.post("/v1/policy/reload", match="*")
+    first = in_force(rest)
+    rest.post("/v1/policy", {"text": WITHOUT_PUBLISHERS, "note": "trial"}, match=tag(first))
+    back = rest.post("/v1/policy/rollback", {"revision": first}, match=tag(first + 1))
+    assert back.json["revision"] == first + 2
     rows = rest.get("/v1/policy/revisions").json["revisions"]
-    assert [(one["revision"], one["who"], one["in_force"]) for one in rows] == [
-        (3, "first", True), (2, "first", False), (1, "disk", False),
+    assert [(one["revision"], one["who"], one["in_force"]) for one in rows[:3]] == [
+        (first + 2, "first", True), (first + 1, "first", False), (first, "disk", False),
     ]  # fmt: skip
     assert rows[1]["note"] == "trial"
-    assert rest.get("/v1/policy/revisions/2").json["text"] == WITHOUT_PUBLISHERS
-    assert rest.get("/v1/policy/revisions/77").status == 404
-    assert rest.post("/v1/policy/rollback", {"revision": 77}, match='"3"').status == 422
+    assert rest.get(f"/v1/policy/revisions/{first + 1}").json["text"] == WITHOUT_PUBLISHERS
+    assert rest.get("/v1/policy/revisions/7777").status == 404
+    assert rest.post("/v1/policy/rollback", {"revision": 7777}, match=tag(first + 2)).status == 422
 
 
 def test_reload_takes_the_file(appliance: Appliance) -> None:
     """What REST loaded is replaced by the file, which the answer says; the revision is the disk's again."""
     rest = appliance.rest()
-    rest.post("/v1/policy", WITHOUT_PUBLISHERS, match='"1"')
-    answer = rest.post("/v1/policy/reload", match='"2"')
-    assert (answer.json["revision"], answer.json["replaced"]) == (3, 2)
+    first = in_force(rest)
+    rest.post("/v1/policy", WITHOUT_PUBLISHERS, match=tag(first))
+    answer = rest.post("/v1/policy/reload", match=tag(first + 1))
+    assert (answer.json["revision"], answer.json["replaced"]) == (first + 2, first + 1)
     assert rest.get("/v1/policy").json["differs_from_file"] is False
     assert rest.get("/v1/policy").json["who"] == "disk"
-    assert appliance.recorded("--event", "policy loaded")[0]["detail"]["who"] == "first"
+    eventually(lambda: loaded_last_by(appliance) == ["first"], appliance.story)
     appliance.policy_file.write_text("[Nodes]\nnonsense\n")
-    refused = rest.post("/v1/policy/reload", match='"3"')
+    refused = rest.post("/v1/policy/reload", match=tag(first + 2))
     assert refused.status == 422
     assert f"{appliance.policy_file}:2:1" in refused.json["detail"]
 

@@ -1,15 +1,14 @@
 """Signed orders over REST: by `rosrv`, by a script, and what becomes of those that somebody in between touched."""
 
 import json
-import os
-import subprocess
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 from appliance.order_proof import HEADER, proof_of, reading_key, statement
-from tests.support.appliance import ROSRV, Appliance
+from tests.support.appliance import Appliance
+from tests.support.command import rosrv
 from tests.support.rest import Answer, Rest
 from tests.support.waiting import eventually
 
@@ -112,12 +111,8 @@ def test_a_proof_does_not_outlive_rvmaster(running: Appliance) -> None:
 def run(appliance: Appliance, *arguments: str) -> dict[str, Any]:
     """A verb over REST, whose command must succeed; its answer."""
     certificate = appliance.state / "api" / "certificate.pem"
-    kept = {key: value for key, value in os.environ.items() if not key.startswith("ROSRV_")}
-    done = subprocess.run(
-        [ROSRV, *arguments, "--json", "--api", str(appliance.ready["api"]), "--api-ca", str(certificate)],
-        env=kept | {"ROSRV_TOKEN": str(appliance.ready["token"])}, capture_output=True, text=True, timeout=60,
-        check=False, stdin=subprocess.DEVNULL,
-    )  # fmt: skip
+    place = ("--api", str(appliance.ready["api"]), "--api-ca", str(certificate))
+    done = rosrv(*arguments, "--json", *place, ROSRV_TOKEN=appliance.token)
     assert done.returncode == 0, done.stderr + done.stdout
     answer: dict[str, Any] = json.loads(done.stdout)
     return answer

@@ -13,7 +13,8 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.command import ROSRV, rosrv
 from tests.support.processes import LIMIT
 
 SPEED = "speed() { event said() /chatter std_msgs/String '{}' { } }\n"
@@ -44,16 +45,11 @@ def appliance() -> Iterator[Appliance]:
 
 def run(appliance: Appliance, way: str, *arguments: str, env: dict[str, str] | None = None) -> Done:
     """A verb, one way or the other."""
-    kept = {key: value for key, value in os.environ.items() if not key.startswith("ROSRV_")}
-    place = ["--state", str(appliance.state)]
-    if way == "api":
-        certificate = appliance.state / "api" / "certificate.pem"
-        place = ["--api", str(appliance.ready["api"]), "--api-ca", str(certificate)]
-        kept["ROSRV_TOKEN"] = str(appliance.ready["token"])
-    return subprocess.run(
-        [ROSRV, *arguments, *place],
-        env=kept | (env or {}), capture_output=True, text=True, timeout=LIMIT, check=False, stdin=subprocess.DEVNULL,
-    )  # fmt: skip
+    if way == "state":
+        return rosrv(*arguments, "--state", str(appliance.state))
+    certificate = appliance.state / "api" / "certificate.pem"
+    place = ("--api", str(appliance.ready["api"]), "--api-ca", str(certificate))
+    return rosrv(*arguments, *place, **({"ROSRV_TOKEN": appliance.token} | (env or {})))
 
 
 LOOKING = [

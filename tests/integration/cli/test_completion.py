@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.appliance import ROSRV, Appliance
+from tests.support.appliance import Appliance
+from tests.support.command import ROSRV
 
 WORDS = "words() {\n    event said() /chatter std_msgs/String '{}' { }\n}\n"
 

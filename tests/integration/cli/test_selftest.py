@@ -9,7 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.command import ROSRV
 from tests.support.processes import LIMIT
 
 STRICT = OPEN_POLICY.replace("*", "10.9.9.9")

@@ -5,7 +5,7 @@ import os
 import signal
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -36,8 +36,8 @@ def specification(name: str, topic: str) -> str:
     return SPECIFICATION.replace("NAME", name).replace("TOPIC", topic)
 
 
-@pytest.fixture
-def appliance() -> Iterator[Appliance]:
+@contextmanager
+def two_relays() -> Iterator[Appliance]:
     """Two relays, and a monitor for each: `left` on /left, `right` on /right."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with tempfile.TemporaryDirectory(prefix="rosrv-relays-") as name:
@@ -48,6 +48,20 @@ def appliance() -> Iterator[Appliance]:
         options = ("--monitors", str(folder), "--api", "off")
         with Appliance(options=options, relays=2) as appliance:
             yield appliance
+
+
+@pytest.fixture
+def appliance() -> Iterator[Appliance]:
+    """One of its own for a test that loads, or ends a process."""
+    with two_relays() as appliance:
+        yield appliance
+
+
+@pytest.fixture(scope="module")
+def common_appliance() -> Iterator[Appliance]:
+    """One for the tests in which only nodes come and go."""
+    with two_relays() as appliance:
+        yield appliance
 
 
 @pytest.fixture
@@ -173,24 +187,25 @@ def test_services_are_carried_by_the_relay_of_their_monitor(
 
 @pytest.mark.parametrize("client", CLIENTS)
 def test_one_message_after_waiting_for_a_subscriber_is_not_lost_to_the_monitor(
-    appliance: Appliance, ros: RosSession, client: Client
+    common_appliance: Appliance, tmp_path: Path, client: Client
 ) -> None:
     """Which is connected, and counts as the subscriber the publisher waits for, before the real one is.
 
     What comes within a second of the message has it; on a machine that is overloaded a node may need longer, so one of
     four may be late.
     """
-    listeners = [ros.listener(client, "/left", name=f"ear{number}") for number in range(2)]
-    for number in range(4):
-        talker = ros.node("rospy", "patient_talker", "/left", name=f"voice{number}")
-        talker.wait_for(event="sent")
+    with RosSession(common_appliance.master_uri, tmp_path) as ros:
+        listeners = [ros.listener(client, "/left", name=f"ear{number}") for number in range(2)]
+        for number in range(4):
+            talker = ros.node("rospy", "patient_talker", "/left", name=f"voice{number}")
+            talker.wait_for(event="sent")
+            for listener in listeners:
+                with suppress(AssertionError):
+                    listener.wait_for(event="received", publisher=f"/voice{number}", timeout=5)
+            talker.stop()
         for listener in listeners:
-            with suppress(AssertionError):
-                listener.wait_for(event="received", publisher=f"/voice{number}", timeout=5)
-        talker.stop()
-    for listener in listeners:
-        heard = [event["publisher"] for event in listener.seen(event="received")]
-        assert len(heard) == len(set(heard)) >= 3, ros.story()
+            heard = [event["publisher"] for event in listener.seen(event="received")]
+            assert len(heard) == len(set(heard)) >= 3, ros.story()
 
 
 @pytest.mark.parametrize("master", ["plain", "appliance"])
@@ -204,7 +219,7 @@ def test_the_next_subscriber_of_a_stream_gets_nothing_old(
         if master == "plain":
             uri = stack.enter_context(PlainMaster(tmp_path)).master_uri
         else:
-            uri = request.getfixturevalue("appliance").master_uri
+            uri = request.getfixturevalue("common_appliance").master_uri
         ros = stack.enter_context(RosSession(uri, tmp_path))
         talker = ros.talker(client, "/left", "--rate", "20")
         talker.wait_for_count(30, event="sent")

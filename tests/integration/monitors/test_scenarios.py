@@ -2,7 +2,6 @@
 
 import json
 import math
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,8 @@ import pytest
 from examples.landshark.drive import MISSION, SHIPPED, TRIGGERED, VELOCITY, Drive, Part, Simulation, record
 from examples.landshark.messages import MONITORS, Messages
 from examples.landshark.nodes import physics
-from tests.support.appliance import OPEN_POLICY, ROSRV, Appliance
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.command import rosrv
 from tests.support.nodes import PYTHON, ROOT, RosSession, has_ros
 from tests.support.requirements import needs
 
@@ -45,9 +45,9 @@ def bag(unguarded: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def replayed(bag: Path, *files: Path, output: Path | None = None) -> list[Record]:
     """`rosrv monitor run --json`: its records."""
-    command = [ROSRV, "monitor", "run", *map(str, files), "--bag", str(bag), "--json"]
-    command += ["--output", str(output)] if output else []
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    written = ("--output", str(output)) if output else ()
+    done = rosrv("monitor", "run", *map(str, files), "--bag", str(bag), "--json", *written)
+    assert done.returncode == 0, done.stderr
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 

@@ -214,22 +214,26 @@ def test_a_relay_runs_modules_within_its_walls(place: Place) -> None:
     assert found["threads"] == 1
 
 
-def test_status_shows_the_walls() -> None:
+@pytest.fixture(scope="module")
+def running() -> Iterator[Appliance]:
+    """An appliance with REST."""
+    need_root()
+    with Appliance(options=("--api", "127.0.0.1:0")) as running:
+        yield running
+
+
+def test_status_shows_the_walls(running: Appliance) -> None:
     """`rosrv status` and REST say of each process what it is in; nothing is lacking on this kernel.
 
     A relay that has taken a specification has the runtime of its module, and no memory to write code into.
     """
-    need_root()
     needs(landlock.version() >= landlock.SIGNALS, "a kernel with Landlock 6")
-    with Appliance(options=("--api", "127.0.0.1:0")) as running:
-        rows = running.processes()
-        rest = {row["role"]: row for row in running.rest().get("/v1/status").json["processes"]}
-        specification = running.directory / "count.rv"
-        specification.write_text(
-            "count() { int n = 0; event said() /chatter std_msgs/String '{}' { n++; } }\n"
-        )
-        running.rosrv("monitor", "load", str(specification))
-        memory = Path(f"/proc/{rows['relay']['pid']}/maps").read_text()
+    rows = running.processes()
+    rest = {row["role"]: row for row in running.rest().get("/v1/status").json["processes"]}
+    specification = running.directory / "count.rv"
+    specification.write_text("count() { int n = 0; event said() /chatter std_msgs/String '{}' { n++; } }\n")
+    running.rosrv("monitor", "load", str(specification))
+    memory = Path(f"/proc/{rows['relay']['pid']}/maps").read_text()
     abi = landlock.version()
     for name in ("signer", "relay", "control", "api"):
         assert (rows[name]["walls"], rows[name]["lacks"]) == (f"listed calls, Landlock {abi}", [])
@@ -241,14 +245,12 @@ def test_status_shows_the_walls() -> None:
     assert not [line for line in memory.splitlines() if "w" in line.split()[1] and "x" in line.split()[1]]
 
 
-def test_status_shows_how_the_relay_sends() -> None:
+def test_status_shows_how_the_relay_sends(running: Appliance) -> None:
     """As its own user it gets cubic where the kernel lets everybody have it, else reno."""
-    need_root()
-    with Appliance() as running:
 
-        def congestion() -> str:
-            said: str = running.processes()["relay"]["congestion"]
-            return said
+    def congestion() -> str:
+        said: str = running.processes()["relay"]["congestion"]
+        return said
 
-        allowed = Path("/proc/sys/net/ipv4/tcp_allowed_congestion_control").read_text().split()
-        assert eventually(congestion, running.story) == ("cubic" if "cubic" in allowed else "reno")
+    allowed = Path("/proc/sys/net/ipv4/tcp_allowed_congestion_control").read_text().split()
+    assert eventually(congestion, running.story) == ("cubic" if "cubic" in allowed else "reno")

@@ -8,7 +8,7 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from tests.support.appliance import Appliance
-from tests.support.robot import Robot
+from tests.support.robot import Robot, nodes
 from tests.system.console.reader import Reader
 
 WIDE, NARROW = (1280, 800), (390, 844)
@@ -38,13 +38,15 @@ def robot(appliance: Appliance) -> Iterator[Robot]:
 @pytest.mark.usefixtures("robot")
 @pytest.mark.parametrize("size", [WIDE, NARROW])
 def test_all_of_it_is_in_the_picture(opened: Callable[..., Reader], size: tuple[int, int]) -> None:
-    """Ten namespaces, none cut off, none over another, every name as large as one reads."""
+    """Ten namespaces, none cut off, none over another, every name whole, and as large as one reads."""
     page = _graph(opened(width=size[0], height=size[1]))
     expect(page.locator('[data-key="gnode:/arm/*"]')).to_contain_text("/arm")
     page.wait_for_function(_ALL_IN_FRAME)  # it is fitted once it is drawn
     boxes = [_place(one) for one in page.locator(".box .shape").all()]
     assert not [pair for pair in combinations(boxes, 2) if _overlap(*pair)]
     assert _smallest_name(page) >= SMALLEST_NAME
+    names = page.locator(".box.many .box-name").all_text_contents()
+    assert sorted(names) == sorted({f"/{node.split('/')[1]}" for node, _machine in nodes()})
     for _step in range(6):
         page.get_by_role("button", name="Farther").click()
     assert _smallest_name(page) >= SMALLEST_NAME

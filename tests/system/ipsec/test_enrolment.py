@@ -25,7 +25,7 @@ import pytest
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.network import links
 from examples.landshark.lab import Lab
-from tests.support.appliance import ROSRV
+from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT
 from tests.support.requirements import need_program, need_root

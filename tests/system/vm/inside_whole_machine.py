@@ -12,7 +12,8 @@ import pytest
 from appliance.network import links
 from appliance.network.namespaces import Namespace, namespaces
 from examples.landshark.lab import INTERFACE, Host, Lab
-from tests.support.appliance import ROSRV, Appliance
+from tests.support.appliance import Appliance
+from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT
 from tests.support.root_host import root_host
