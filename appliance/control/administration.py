@@ -8,7 +8,7 @@ takes it: of `Looks`, `PolicyOrders`, `MonitorOrders`, `HostOrders`, `TokenOrder
 import inspect
 import typing
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from appliance.channel import admin
 from appliance.channel.admin import A
@@ -51,21 +51,39 @@ _Orders = PolicyOrders | MonitorOrders | HostOrders | TokenOrders | RecordingOrd
 _Method = Callable[..., Awaitable[Any]]
 
 
-class Administration:
-    """Carries out requests."""
+class _Taken(NamedTuple):
+    """What takes a request; `wants_who`: it is told who asks; `orders`: it is more than a look."""
 
-    def __init__(self, looks: Looks, *orders: _Orders) -> None:
+    method: _Method
+    wants_who: bool
+    orders: bool
+
+
+class Administration:
+    """Carries out requests; `durable` waits until what was recorded is on disk, or cannot be."""
+
+    def __init__(self, looks: Looks, *orders: _Orders, durable: Callable[[], Awaitable[object]]) -> None:
         self._looks = looks
-        self._methods: dict[type, tuple[_Method, bool]] = {}
+        self._durable = durable
+        self._methods: dict[type, _Taken] = {}
         for part in (looks, *orders):
             for _name, method in inspect.getmembers(part, inspect.iscoroutinefunction):
                 kind, names = request_of(method)
                 if kind is not None:
-                    self._methods[kind] = method, "who" in names
+                    self._methods[kind] = _Taken(method, "who" in names, part is not looks)
 
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
-        """Do what is asked on behalf of `who` (the name of a token, or `operator` for the admin socket)."""
-        method, wants_who = self._methods[type(request)]
+        """Do what is asked on behalf of `who` (the name of a token, or `operator` for the admin socket).
+
+        What somebody did is in the audit log when it is answered: who then searches finds it.
+        """
+        answer = await self._answer(request, who)
+        if self._methods[type(request)].orders:
+            await self._durable()
+        return answer
+
+    async def _answer(self, request: admin.AdminRequest[A], who: str) -> admin.AdminAnswer[A]:
+        method, wants_who, _ = self._methods[type(request)]
         try:
             return admin.AdminAnswer(True, await (method(request, who) if wants_who else method(request)))
         except (PolicyRefusedError, SpecificationsRefusedError) as error:

@@ -248,6 +248,7 @@ class _Control:
             TokenOrders(self._tokens),
             parts.recordings,
             EvidenceOrders(self._audit, base.trail),
+            durable=base.trail.durable,
         )
         self._rest = RestLink(
             administration,
