@@ -45,6 +45,7 @@ _LED = ("at", "events", "timer", "conditions")
 ELSEWHERE: dict[str, tuple[str, ...]] = {
     **_LOGS_OWN,
     "decision": ("call", "key", "node", "subgraph", "needs", "parts", "stranger"),
+    "revoked": ("call", "needs"),
     "denials folded": _FOLDED,
     "repetitions folded": _FOLDED,
     "monitor log": _MONITOR,
@@ -76,6 +77,7 @@ class Use(NamedTuple):
     place: str
     severities: frozenset[str]
     fields: tuple[str, ...]
+    denies: bool
 
 
 def uses() -> Iterator[Use]:
@@ -98,10 +100,11 @@ def _use(node: ast.Call, place: str) -> Iterator[Use]:
         return
     fields = tuple(name for name in named if name not in _FIELDS) if called == "happened" else ()
     for name in _texts(event):
-        yield Use(name, place, _severities(node, called), fields)
+        denies = "decision" in named and any("deny" in _texts(one) for one in ast.walk(named["decision"]))
+        yield Use(name, place, _severities(node, called), fields, denies)
 
 
-def _texts(node: ast.expr) -> Iterator[str]:
+def _texts(node: ast.AST) -> Iterator[str]:
     """The texts an expression can be: a literal, or one of two."""
     match node:
         case ast.Constant(value=str(text)):

@@ -18,7 +18,8 @@ from sse_starlette import EventSourceResponse, ServerSentEvent
 from starlette.responses import JSONResponse, StreamingResponse
 
 from appliance.api.access import Bearer
-from appliance.api.judgement import explained, granted, is_refusal
+from appliance.api.denials import asks_policy
+from appliance.api.judgement import explained, granted
 from appliance.api.moments import given
 from appliance.api.problems import ProblemError
 from appliance.api.roles import OPERATOR, VIEWER, Viewer, ask, reads_contents
@@ -261,7 +262,7 @@ def routes(services: Services) -> Routes:
         shown = await desk.record(record_id, 0)
         record = _readable(shown.entry, bearer).record
         known = None
-        if is_refusal(record):
+        if asks_policy(record):
             known = await ask(services.control, PolicyWanted(), bearer)
         async with services.judging:
             return await asyncio.to_thread(explained, record, known)

@@ -10,6 +10,7 @@ from typing import Any
 
 import msgspec
 
+from appliance.api.denials import asked_of, is_denial
 from appliance.api.problems import Finding, ProblemError
 from appliance.audit.record import Record
 from appliance.audit.why import lines_of
@@ -33,8 +34,13 @@ from appliance.policy import (
     judge,
 )
 from appliance.policy.actions import BadWordError, check_resource, find_hosts
-from appliance.policy.grant import UngrantableError, asked, grant
+from appliance.policy.grant import UngrantableError, grant
 from appliance.policy.rights import needs_node
+
+_GRANTED = (
+    "the policy in force has every right that it needs: it was refused for what its reason says, or before this"
+    " revision"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +68,7 @@ def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterabl
 def granted(record: Record, current: PolicyKnown) -> Granted:
     """What would grant what a record says was refused. Raises `UngrantableError` where no line of a policy does."""
     known = Known.of(msgspec.structs.asdict(current))
-    wanted = asked(
-        record.host or "", record.caller_id or "", record.category or "", record.resource or "", record.detail
-    )
-    found = grant(current.text, current.file, known, wanted)
+    found = grant(current.text, current.file, known, asked_of(record))
     return Granted(
         revision=current.revision,
         reason=record.reason,
@@ -77,20 +80,18 @@ def granted(record: Record, current: PolicyKnown) -> Granted:
 
 
 def explained(record: Record, current: PolicyKnown | None) -> Why:
-    """Why what a record tells happened; for a refusal the policy in force is needed."""
+    """Why what a record tells happened; of a denial that a policy might allow, the one in force is needed."""
     found, refusal = None, ""
-    if current is not None:
-        try:
+    try:
+        if current is not None:
             found = granted(record, current)
-        except UngrantableError as error:
-            refusal = str(error)
+            refusal = "" if found.added else _GRANTED
+        elif is_denial(record):
+            asked_of(record)
+    except UngrantableError as error:
+        refusal = str(error)
     added = [f"would be allowed by: {line}" for line in found.added] if found is not None else []
     return Why(lines=[*lines_of(record), *added], grant=found, refusal=refusal)
-
-
-def is_refusal(record: Record) -> bool:
-    """Whether a change of the policy might have allowed what a record tells."""
-    return record.event == "decision" and record.decision in ("deny", "would deny")
 
 
 def judge_text(text: str | None, current: PolicyKnown, *, cases: bool) -> Judged:

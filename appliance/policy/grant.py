@@ -17,7 +17,8 @@ from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
 from appliance.policy.reader import Entry, SectionText, Word, read
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
-from appliance.policy.sections import BY_CATEGORY, DEFAULT, GROUPS, PARAMETERS
+from appliance.policy.sections import BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
+from appliance.policy.settings import TAKEOVERS
 
 _MOST_LINES = 8  # that one grant changes
 
@@ -28,10 +29,11 @@ class UngrantableError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A request that was decided, and all that it needs."""
+    """A request that was decided, and all that it needs; `takeover`: a name, too, that another host has."""
 
     request: Request
     rights: list[Right]
+    takeover: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,9 @@ def grant(text: str, file: str, known: Known, asked: Asked) -> Grant:
             policy = compile_policy(text, file=file, hosts=known.hosts, robot=known.robot)
         except PolicyError:  # the line would be none: there is no such call, or no key for it
             raise UngrantableError(f"no line of a policy grants it: {reason}") from None
+    if asked.takeover and policy.takeover != TAKEOVERS[-1]:
+        text, line = _with_takeover(text)
+        added.append(line)
     return Grant(text, tuple(added))
 
 
@@ -149,6 +154,17 @@ def _with_word(text: str, entry: Entry, word: str) -> tuple[str, str]:
     comma = "," if last is not None and "," in line[:end] else ""
     lines[entry.key.line - 1] = f"{line[:end]}{comma} {word}{line[end:]}"
     return "\n".join(lines), lines[entry.key.line - 1].strip()
+
+
+def _with_takeover(text: str) -> tuple[str, str]:
+    section = next((one for one in _sections(text) if one.name.text == OPTIONS), None)
+    entry = None if section is None else _entry(section, "takeover")
+    if entry is None:
+        return _with_line(text, section, OPTIONS, f"takeover = {TAKEOVERS[-1]}")
+    lines, number, first = text.split("\n"), entry.key.line - 1, entry.values[0]
+    rest = lines[number][first.column - 1 + len(first.text) :]
+    lines[number] = f"{lines[number][: first.column - 1]}{TAKEOVERS[-1]}{rest}"
+    return "\n".join(lines), lines[number].strip()
 
 
 def _with_line(text: str, section: SectionText | None, name: str, line: str) -> tuple[str, str]:

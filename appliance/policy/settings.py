@@ -12,6 +12,8 @@ from appliance.policy.sections import DECIDERS
 from appliance.ros.names import is_global_name
 
 TAKEOVERS = ("same-host", "granted")
+AT_ONCE = "[Options] takeover = granted"
+"""What lets another host have a name that is held: so does a denial say it that this would have prevented."""
 _MASTER_PORT = 11311
 _RANGE = re.compile(r"([0-9]{1,5})-([0-9]{1,5})", re.ASCII)
 

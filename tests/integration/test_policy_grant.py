@@ -129,3 +129,17 @@ def test_every_denial_explains_itself(appliance: Appliance) -> None:
         head = "would be allowed by: "
         allowed[what] = [line.removeprefix(head) for line in lines if line.startswith(head)]
     assert allowed == {what: added for what, (_call, added) in DENIALS.items()}
+
+
+def test_what_is_taken_back_says_what_would_keep_it(appliance: Appliance) -> None:
+    """A publication that another policy ends: the record of that has the change that lets it be had again."""
+    open_to_all = CLOSED.replace("[Publishers]\ndefault = ocu", "[Publishers]\ndefault = *")
+    appliance.reload(open_to_all)
+    with ServerProxy(appliance.master_uri) as master:
+        assert master.registerPublisher("/n", "/t", "std_msgs/String", HERE)[0] == 1  # type: ignore[index]  # a list
+    appliance.reload(CLOSED)
+    (record,) = appliance.recorded("--event", "revoked", resource="/t")
+    lines = appliance.rosrv("audit", "why", record["id"]).stdout.splitlines()
+    assert lines[-1] == "would be allowed by: /t = ocu robot"
+    assert appliance.rest().get(f"/v1/audit/{record['id']}/why").json["lines"] == lines
+    assert "+/t = ocu robot" in appliance.rosrv("policy", "grant", record["id"]).stdout.splitlines()

@@ -183,6 +183,10 @@ class LatchRefused(Message):
     size: int
 
 
+NO_GRANT = "no grant for"
+"""So begins the reason of a `ConnectionRefused` for want of a grant, and of no other."""
+
+
 class ConnectionOpened(Message):
     """A subscriber (`topic` set) or a client (`service` set) is connected through the relay."""
 

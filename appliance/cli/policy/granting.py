@@ -44,12 +44,13 @@ def why(
 def _explained(appliance: Appliance, record: str) -> Why:
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "why"), Why)
-    from appliance.api.judgement import explained, is_refusal  # noqa: PLC0415  not for every verb
+    from appliance.api.denials import asks_policy  # noqa: PLC0415  not for every verb
+    from appliance.api.judgement import explained  # noqa: PLC0415  as above
 
     with Errors():
         found = _record(appliance, record)
         try:
-            known = appliance.ask(PolicyWanted()).given() if is_refusal(found) else None
+            known = appliance.ask(PolicyWanted()).given() if asks_policy(found) else None
         except NotRunningError as error:
             typer.echo(f"rosrv audit: {error}; what would allow it is not known without it", err=True)
             known = None

@@ -18,6 +18,7 @@ from appliance.master.upkeep.liveness import Presence, Probe
 from appliance.policy import Policy
 from appliance.policy.model import Address, Category, Decision
 from appliance.policy.rights import decide, rights_of_call
+from appliance.policy.settings import AT_ONCE
 from appliance.ros.parameter_tree import Tree
 from appliance.shares.table import NAMES
 
@@ -200,13 +201,12 @@ def contested(contest: Contest, probe: Probe | None) -> Decision:
                 "a node",
                 " that takes connections and does not answer (it "
                 f"hangs, or was stopped); unless it answers it is unregistered in {math.ceil(probe.patience)} s: "
-                "start this node again then (or at once with [Options] takeover = granted)",
+                f"start this node again then (or at once with {AT_ONCE})",
             )
     return _held_by(
         holder,
         "a running node",
-        "; another host may take the name over once that node is gone "
-        "(or at once with [Options] takeover = granted)",
+        f"; another host may take the name over once that node is gone (or at once with {AT_ONCE})",
     )
 
 

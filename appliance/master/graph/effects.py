@@ -4,7 +4,8 @@ They do nothing themselves; `enactor` carries effects out, in their order and in
 nobody sees a change without what follows from it.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from appliance.audit.record import Severity
 from appliance.master.graph.registry import Durable, Incarnation, Kind, Registration
@@ -155,6 +156,7 @@ class Record:
     severity: Severity = Severity.INFO
     decision: str | None = None
     rule: Rule | None = None
+    more: Mapping[str, str] = field(default_factory=dict)
 
 
 Effect = (

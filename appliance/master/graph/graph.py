@@ -92,11 +92,13 @@ class Graph:
         reason = f"{incarnation.name} unregistered {resource}"
         return [*effects, _record("unregistered", reason, incarnation, kind.value, resource)]
 
-    def revoked(self, incarnation: Incarnation, registration: Registration, decision: Decision) -> Effects:
-        """The policy no longer allows a registration; it is gone at ROSMaster."""
+    def revoked(
+        self, incarnation: Incarnation, registration: Registration, decision: Decision, call: str
+    ) -> Effects:
+        """A registration is no longer allowed (`call`: see `revocation`); it is gone at ROSMaster."""
         kind, resource = registration.kind, registration.resource
         effects: Effects = [
-            revocation(decision, str(incarnation.host), incarnation.name, kind.value, resource),
+            revocation(decision, str(incarnation.host), incarnation.name, kind.value, resource, call=call),
             *self.unregistered(incarnation, kind, resource),
             *self._registry.shelve(incarnation, registration),
         ]
@@ -364,8 +366,14 @@ class Graph:
         return [effect for topic in topics for effect in self.tell(topic)]
 
 
-def revocation(decision: Decision, host: str, caller_id: str, category: str, resource: str) -> Record:
-    """The record of something that the policy in force does not allow any more, and that is taken back."""
+def revocation(
+    decision: Decision, host: str, caller_id: str, category: str, resource: str, *, call: str
+) -> Record:
+    """The record of something that is taken back.
+
+    `call` gave it and is not allowed by the policy any more; empty where it was not the policy that decided.
+    """
+    about = {"call": call, "needs": decision.needs}
     return Record(
         "revoked",
         decision.reason,
@@ -376,6 +384,7 @@ def revocation(decision: Decision, host: str, caller_id: str, category: str, res
         severity=Severity.WARNING,
         decision="deny",
         rule=decision.rule,
+        more={name: text for name, text in about.items() if text and call},
     )
 
 

@@ -81,11 +81,12 @@ class Revocation:
         for incarnation, registration in registrations:
             decision = self._decide(incarnation, registration.kind, registration.resource)
             if not decision.allowed:
-                effects += self._take_back(incarnation, registration, decision)
+                call = "" if incarnation.own else CALLS[registration.kind][0]
+                effects += self._take_back(incarnation, registration, decision, call)
         for row in grants:
             decision = self._decide_grant(row)
             if not decision.allowed:
-                effects += self._revoke(row, decision)
+                effects += self._revoke(row, decision, self._granted(row).call)
         return effects
 
     def expel(self, host: Address, reason: str) -> Effects:
@@ -94,10 +95,10 @@ class Revocation:
         decision = Decision(False, None, reason)
         for incarnation, registration in self._registrations():
             if incarnation.host == host and not incarnation.own:
-                effects += self._take_back(incarnation, registration, decision)
+                effects += self._take_back(incarnation, registration, decision, "")
         for row in self._grants.all():
             if row.host == str(host):
-                effects += self._revoke(row, decision)
+                effects += self._revoke(row, decision, "")
         return effects
 
     def returned(self, incarnation: Incarnation) -> Effects:
@@ -127,14 +128,16 @@ class Revocation:
         ]
         return sorted(pairs, key=lambda pair: pair[1].order)
 
-    def _take_back(self, incarnation: Incarnation, registration: Registration, decision: Decision) -> Effects:
-        effects = self._graph.revoked(incarnation, registration, decision)
+    def _take_back(
+        self, incarnation: Incarnation, registration: Registration, decision: Decision, call: str
+    ) -> Effects:
+        effects = self._graph.revoked(incarnation, registration, decision, call)
         if incarnation.life is Life.LIVE:  # else ROSMaster has been told
             effects.append(TakeBack(incarnation, registration))
         return effects
 
-    def _revoke(self, row: PermissionRow, decision: Decision) -> Effects:
-        record = revocation(decision, row.host, row.caller_id, row.kind, row.resource)
+    def _revoke(self, row: PermissionRow, decision: Decision, call: str) -> Effects:
+        record = revocation(decision, row.host, row.caller_id, row.kind, row.resource, call=call)
         return [*self._grants.take(row), record]
 
     def may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:

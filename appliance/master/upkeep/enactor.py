@@ -111,6 +111,7 @@ class Enactor:
                         resource=effect.resource,
                         rule=effect.rule,
                         decision=effect.decision,
+                        more=effect.more,
                     )
                 case _:
                     self._tell_relays(effect)

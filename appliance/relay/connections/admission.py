@@ -8,6 +8,7 @@ roscpp never tries again after an error header, so such a peer is kept waiting f
 
 from collections.abc import Mapping
 
+from appliance.channel.messages.relay import NO_GRANT
 from appliance.relay.connections.headers import switched_on, too_long
 from appliance.relay.grants import StatedTable
 from appliance.ros.errors import InvalidNameError
@@ -53,13 +54,13 @@ def missing(table: StatedTable, key: str, host: str, fields: Mapping[str, str]) 
         if table.publication(key, topic) is None:
             return f"[{name}] is not a publisher of [{topic}]"
         if not table.may_subscribe(key, topic, host, caller_id):
-            return f"no grant for [{caller_id}] at {host} to subscribe to [{topic}]; requestTopic comes first"
+            return f"{NO_GRANT} [{caller_id}] at {host} to subscribe to [{topic}]; requestTopic comes first"
         return ""
     service = fields["service"]
     if table.service(key, service) is None:
         return f"[{name}] is not a provider of [{service}]"
     if bound_name(table, key, host, fields) is None:
-        return f"no grant for [{caller_id}] at {host} to call [{service}]; lookupService comes first"
+        return f"{NO_GRANT} [{caller_id}] at {host} to call [{service}]; lookupService comes first"
     return ""
 
 

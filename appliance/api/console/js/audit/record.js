@@ -19,6 +19,7 @@ import { Grant } from "./grant.js";
 import { Why } from "./why.js";
 
 const EXPLAINED = new Set(["publish", "subscribe", "offer", "call", "command", "node", "read", "write"]);
+const GIVEN = new Set(["revoked", "connection refused"]);
 const SHOWN_APART = new Set(["before", "after", "before_fields", "after_fields", "at", "timer", "conditions", "values", "handler", "why"]);
 const MONITORS = new Set(["monitor verdict", "message dropped", "message changed", "monitor fault", "monitor published", "trial observed"]);
 
@@ -50,10 +51,10 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
       ${record.revision !== null && html`<dt>Policy</dt><dd>revision ${record.revision}</dd>`}
       ${record.decision && html`<dt>Rule</dt><dd><${Rule} rule=${record.rule} revision=${record.revision} /></dd>`}
     </dl>
-    ${MONITORS.has(record.event) && !record.detail.count && html`<${Why} key=${record.id} id=${record.id} />`}
+    ${((MONITORS.has(record.event) && !record.detail.count) || isDenial(record)) && html`<${Why} key=${record.id} id=${record.id} />`}
     ${record.rule && record.revision !== null && html`<${Excerpt} rule=${record.rule} revision=${record.revision} />`}
     ${record.decision && EXPLAINED.has(record.category) && html`<div class="row"><${Link} class="button" to=${explain(record)}>Explain in the policy</${Link}></div>`}
-    ${(record.decision === "deny" || record.decision === "would deny") && EXPLAINED.has(record.category) && html`<${Grant} key=${record.id} id=${record.id} />`}
+    ${isDenial(record) && (EXPLAINED.has(record.category) || GIVEN.has(record.event)) && html`<${Grant} key=${record.id} id=${record.id} />`}
     <${OnTimeline} key=${`t${record.id}`} record=${record} />
     ${(record.detail.before || record.detail.after) && html`<div><h3>Message</h3><${Change} detail=${record.detail} /></div>`}
     ${detail.length > 0 && html`<div><h3>Details</h3><dl class="facts">${detail.map(([name, value]) => html`<dt key=${name}><${Given} value=${name} most=${40} /></dt><dd><${Given} value=${typeof value === "string" ? value : JSON.stringify(value)} most=${800} mono /></dd>`)}</dl></div>`}
@@ -61,6 +62,10 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
     <div class="stack-tight"><div class="row"><button class="button small" aria-expanded=${String(raw)} onClick=${() => setRaw(!raw)}>${raw ? "Hide JSON" : "Show JSON"}</button><span class="muted small mono">${record.id}</span></div>
       ${raw && html`<pre class="bytes">${plain(JSON.stringify(record, null, 2), 20_000).replaceAll("⟨LF⟩", "\n")}</pre>`}</div>
   </div>`;
+}
+
+function isDenial(/** @type {any} */ record) {
+  return record.decision === "deny" || record.decision === "would deny" || record.event === "rate limited" || record.event === "denials folded";
 }
 
 function Around(/** @type {{title: string, records: any[], filter: Record<string, string>}} */ { title, records, filter }) {

@@ -1,4 +1,4 @@
-/** Why a monitor's verdict, drop, change, fault or publication happened: the events that alone make it so, the values compared, the lines. */
+/** Why a monitor's verdict, drop, change, fault or publication happened: the events that alone make it so, the values compared, the lines. Of a denial the line that would allow it, or why none would. */
 
 import { html } from "../html.js";
 import { Given } from "../parts/given.js";
@@ -11,5 +11,5 @@ export function Why({ id }) {
   const { value, error, again } = useResource((signal) => get(`/v1/audit/${encodeURIComponent(id)}/why`, {}, signal), [id]);
   if (error) return html`<${Failure} error=${error} retry=${again} />`;
   if (!value) return html`<${Loading} rows=${2} />`;
-  return html`<div><h3>Why</h3><ul class="plain-list">${value.lines.slice(1).map((/** @type {string} */ line) => html`<li key=${line}><${Given} value=${line} most=${600} mono /></li>`)}</ul></div>`;
+  return html`<div><h3>Why</h3><ul class="plain-list">${value.lines.slice(1).map((/** @type {string} */ line) => html`<li key=${line}><${Given} value=${line} most=${600} mono /></li>`)}${value.refusal && html`<li><${Given} value=${value.refusal} most=${600} /></li>`}</ul></div>`;
 }

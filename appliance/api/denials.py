@@ -1,0 +1,118 @@
+"""Which records tell of a denial, and what would have allowed it: which question to the policy, or why no policy does.
+
+Who is denied something asks "what must change?". Every event that can be a denial has its row in `DENIALS`.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import msgspec
+
+from appliance.audit.kinds import KIND
+from appliance.audit.output import rule_text
+from appliance.audit.record import Record
+from appliance.channel.messages.relay import NO_GRANT
+from appliance.policy.grant import Asked, UngrantableError, asked
+from appliance.policy.model import Category
+from appliance.policy.rights import category_of
+from appliance.policy.settings import AT_ONCE
+
+_ASKS = {"topic": "requestTopic", "service": "lookupService"}
+"""The call that gives the right to connect, by what a connection is for."""
+
+
+def is_denial(record: Record) -> bool:
+    """Whether something was refused."""
+    return record.event in DENIALS and record.decision != "allow"
+
+
+def asks_policy(record: Record) -> bool:
+    """Whether a change of the policy might allow it: the policy in force is needed to say which."""
+    try:
+        return is_denial(record) and asked_of(record) is not None
+    except UngrantableError:
+        return False
+
+
+def asked_of(record: Record) -> Asked:
+    """What the policy is to be asked about a denial. Raises `UngrantableError`: why no change of it would allow it."""
+    what = DENIALS.get(record.event)
+    if what is None:
+        raise UngrantableError("it is no record of a decision about a host's call")
+    if isinstance(what, str):
+        raise UngrantableError(f"no change of the policy would allow it: {what}")
+    return what(record)
+
+
+def _of_decision(record: Record) -> Asked:
+    found = asked(
+        record.host or "", record.caller_id or "", record.category or "", record.resource or "", record.detail
+    )
+    return replace(found, takeover=AT_ONCE in record.reason)
+
+
+def _of_revoked(record: Record) -> Asked:
+    call = str(record.detail.get("call", ""))
+    if not call:
+        raise UngrantableError(
+            "no change of the policy would have kept it: it was taken back for what its reason says"
+            " (or by an earlier version, whose records do not have the call that gave it)"
+        )
+    return _of_call(record, call)
+
+
+def _of_connection(record: Record) -> Asked:
+    call = _ASKS.get(record.category or "")
+    if call is None or not record.reason.startswith(NO_GRANT) or record.decision is None:
+        raise UngrantableError(
+            "no change of the policy would allow it: it was refused for what its reason says"
+        )
+    return _of_call(record, call)
+
+
+def _of_call(record: Record, call: str) -> Asked:
+    """As if the call had been decided that gives, or would have given, what the record is about."""
+    category, detail = category_of(call), {**record.detail, "call": call}
+    resource = record.resource
+    if category is Category.COMMAND:
+        resource, detail["key"] = call, record.resource
+    return _of_decision(
+        msgspec.structs.replace(record, category=category.value, resource=resource, detail=detail)
+    )
+
+
+def _of_folded(record: Record) -> Asked:
+    detail = record.detail
+    if detail.get("scope") != KIND:
+        raise UngrantableError(
+            f"it stands for denials of many kinds; the first of them is record {detail.get('recorded_id')}"
+        )
+    return asked_of(msgspec.structs.replace(record, event=str(detail.get("of")), decision="deny"))
+
+
+def _of_limited(record: Record) -> Asked:
+    line = "a line of [Limits] that is gone" if record.rule is None else rule_text(record.rule)
+    raise UngrantableError(f"no right is missing; more would pass with a higher limit at {line}")
+
+
+DENIALS: dict[str, str | Callable[[Record], Asked]] = {
+    "decision": _of_decision,
+    "revoked": _of_revoked,
+    "connection refused": _of_connection,
+    "denials folded": _of_folded,
+    "rate limited": _of_limited,
+    "limit exceeded": "the bounds on what one peer may send, hold and open are settings (docs/shares.md)",
+    "malformed": "what was sent is not what the protocol says, as its reason has it",
+    "message dropped": "the monitor dropped it; change its specification, or switch it off (rosrv monitor disable)",
+    "publication refused": "the specifications in force are for another definition of it; load specifications for this"
+    " one, or give the node theirs",
+    "policy refused": "the policy itself was refused, for what its findings say",
+    "specifications refused": "the specifications were refused, for what their findings say",
+    "order refused": "REST goes by tokens and their roles (rosrv token list), and by signatures, not by the policy",
+    "rest call": "REST goes by tokens and their roles (rosrv token list), not by the policy",
+    "enrolment refused": "who enrols brings a one-time token that is in force (rosrv host add)",
+    "renewal refused": "a host renews its certificate in its own tunnel",
+    "tunnel refused": "a tunnel takes a certificate of this appliance that is in force (rosrv host list)",
+    "packets refused": "packets that were sent again, or under another's address, are never taken",
+}
+"""By event: how to make of its record the question to the policy, or why there is none."""

@@ -1,0 +1,162 @@
+"""Every denial says what would have allowed it: the smallest change of the policy, or why no change of it would."""
+
+import ipaddress
+from typing import get_args, get_type_hints
+
+import pytest
+
+from appliance.api.denials import DENIALS, asks_policy, is_denial
+from appliance.api.judgement import explained
+from appliance.audit.events import EVENTS
+from appliance.audit.ocsf import as_ocsf
+from appliance.audit.output import Entry
+from appliance.audit.record import Record, RuleReference
+from appliance.audit_trail import rule_reference
+from appliance.channel.answers.policy import PolicyKnown, Why
+from appliance.channel.messages.relay import Violation
+from appliance.master.graph.graph import revocation
+from appliance.policy import compile_policy
+from appliance.policy.live import Live, may_keep
+from appliance.policy.settings import AT_ONCE
+from distribution.audit_events_page import uses
+
+HOST = "10.0.0.9"
+CLOSED = "[Nodes]\ndefault = 10.0.0.1\n[Publishers]\n/x = 10.0.0.1\n[Parameters]\nread default = 10.0.0.1\n"
+_BLOCKED = {2, 6, 24, 25}
+"""Blocked, dropped, revoked, rejected: the dispositions of OCSF that say no."""
+
+
+def known(text: str = CLOSED) -> PolicyKnown:
+    """The policy in force."""
+    unknown = dict.fromkeys(get_type_hints(PolicyKnown))
+    given = {"text": text, "file": "p.ini", "revision": 3, "hosts": {}, "robot": [], "site_keys": []}
+    return PolicyKnown(**(unknown | given | {"cases_file": ""}))  # type: ignore[arg-type]  # what it is judged by
+
+
+def denied(event: str, reason: str = "because", **fields: object) -> Record:
+    """A denial to a host that asked for the topic /x."""
+    about = {"host": HOST, "caller_id": "/it", "category": "publish", "resource": "/x", "decision": "deny"}
+    return Record(id="1", time=1, event=event, reason=reason, **(about | fields))  # type: ignore[arg-type]  # fields of it
+
+
+def why(record: Record, text: str = CLOSED) -> Why:
+    """As the command line and REST have it."""
+    return explained(record, known(text) if asks_policy(record) else None)
+
+
+def allowing(found: Why) -> list[str]:
+    """The lines of the policy that would allow it."""
+    start = "would be allowed by: "
+    return [line.removeprefix(start) for line in found.lines if line.startswith(start)]
+
+
+def test_every_event_that_can_be_a_denial_has_its_row() -> None:
+    """By what the event is to a SIEM, and by what the program records with it."""
+    blocking = {
+        name
+        for name in EVENTS
+        if as_ocsf(Entry(1, Record(id="1", time=1, event=name))).get("disposition_id") in _BLOCKED
+    }
+    refusing = {use.event for use in uses() if use.denies} | {*get_args(Violation)} - {""}
+    assert {"revoked", "connection refused", "rate limited", "malformed"} <= blocking | refusing
+    assert blocking | refusing | {"decision", "denials folded"} == set(DENIALS)
+    assert set(DENIALS) <= set(EVENTS)
+
+
+@pytest.mark.parametrize("event", EVENTS)
+def test_every_denial_says_what_would_allow_it(event: str) -> None:
+    """Or that no change of the policy would; and nothing else says either."""
+    found = why(denied(event))
+    assert (bool(allowing(found)) != bool(found.refusal)) is (event in DENIALS)
+    assert not is_denial(denied(event, decision="allow"))
+
+
+@pytest.mark.parametrize(
+    ("call", "category"),
+    [
+        ("registerPublisher", "publication"),
+        ("registerSubscriber", "subscription"),
+        ("registerService", "service"),
+        ("subscribeParam", "parameter"),
+        ("requestTopic", "topic"),
+        ("lookupService", "service"),
+    ],
+)
+@pytest.mark.parametrize("namespace", [False, True])
+def test_what_was_taken_back_may_be_kept_after_the_change(
+    call: str, category: str, *, namespace: bool
+) -> None:
+    """Everything that a call gives: registrations, connections, a parameter that holds others."""
+    live = Live(ipaddress.ip_address(HOST), "/it", call, "/x", namespace)
+    decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
+    made = revocation(decision, HOST, "/it", category, "/x", call=call)
+    record = denied(
+        made.event, made.reason, category=category, rule=rule_reference(made.rule), detail=dict(made.more)
+    )
+    text = CLOSED
+    for _ in range(3):  # of a namespace, what is below it may be refused next
+        found = why(record, text)
+        assert allowing(found)
+        assert found.grant is not None
+        text = found.grant.text
+        if (decision := may_keep(compile_policy(text, file="p.ini"), live)).allowed:
+            break
+        record = denied("revoked", category=category, detail={"call": call, "needs": decision.needs})
+    assert decision.allowed
+    assert "has every right" in why(record, text).refusal
+
+
+def test_what_no_policy_decided_is_not_put_down_to_it() -> None:
+    """A host that is expelled, and the appliance's own: `call` is not told."""
+    live = Live(ipaddress.ip_address(HOST), "/it", "registerPublisher", "/x")
+    decision = may_keep(compile_policy(CLOSED, file="p.ini"), live)
+    assert not revocation(decision, HOST, "/it", "publication", "/x", call="").more
+    found = why(denied("revoked", category="publication"))
+    assert (allowing(found), "what its reason says" in found.refusal) == ([], True)
+
+
+def test_a_connection_without_a_grant() -> None:
+    """The right to ask for one; where the policy gives that, or something else is wrong with it, that is said."""
+    reason = f"no grant for [/it] at {HOST} to subscribe to [/x]; requestTopic comes first"
+    found = why(denied("connection refused", reason, category="topic"))
+    assert allowing(found) == ["[Subscribers] /x = 10.0.0.9", "/it = 10.0.0.1 10.0.0.9"]
+    assert found.grant is not None
+    assert (
+        "has every right"
+        in why(denied("connection refused", reason, category="topic"), found.grant.text).refusal
+    )
+    service = f"no grant for [/it] at {HOST} to call [/s]; lookupService comes first"
+    found = why(denied("connection refused", service, category="service", resource="/s"))
+    assert allowing(found) == ["[Commands] lookupService = 10.0.0.9"]
+    gone = why(denied("connection refused", "[/that] is not a publisher of [/x]", category="topic"))
+    own = why(denied("connection refused", reason, category="topic", decision=None))
+    for other in (gone, own):
+        assert (allowing(other), "no change of the policy" in other.refusal) == ([], True)
+
+
+def test_a_name_that_another_host_has() -> None:
+    """The option that gives it at once, in a section that is there or not, for another value that is there."""
+    held = f"/it is held by a running node on 10.0.0.1 (or at once with {AT_ONCE})"
+    all_may = "[Nodes]\ndefault = *\n[Publishers]\n/x = *\n"
+    for options, line in {
+        "": AT_ONCE,
+        "[Options]\ntell = rule\n": "takeover = granted",
+        "[Options]\ntakeover = same-host  # theirs\n": "takeover = granted  # theirs",
+    }.items():
+        found = why(denied("decision", held), all_may + options)
+        assert allowing(found) == [line]
+        assert found.grant is not None
+        assert compile_policy(found.grant.text, file="p.ini").takeover == "granted"
+        assert not allowing(why(denied("decision", "the limit for one host"), all_may + options))
+
+
+def test_repetitions_and_limits() -> None:
+    """What stands for repetitions of one denial has its answer; of many kinds, the first; a limit, its line."""
+    one = {"scope": "kind", "of": "decision", "recorded_id": "7"}
+    assert allowing(why(denied("denials folded", detail=one))) == [
+        "/x = 10.0.0.1 10.0.0.9",
+        "/it = 10.0.0.1 10.0.0.9",
+    ]
+    assert "record 7" in why(denied("denials folded", detail=one | {"scope": "all"})).refusal
+    rule = RuleReference("Limits", "/x", "p.ini", 9)
+    assert "[Limits] /x p.ini:9" in why(denied("rate limited", rule=rule, decision=None)).refusal
