@@ -5,7 +5,7 @@ One method for each rule of the grammar. Walked without recursion, so that no ne
 
 # ruff: noqa: D102  a method is the rule of the grammar that has its name
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -26,8 +26,8 @@ class _Unsaid:
 
 
 def _binary(operator: str) -> Callable[..., tree.Binary]:
-    def build(self: "Builder", meta: Meta, children: list[Any]) -> tree.Binary:
-        return tree.Binary(self.at(meta), operator, children[0], children[-1])
+    def build(self: "Builder", meta: Meta, left: Any, right: Any) -> tree.Binary:
+        return tree.Binary(self.at(meta), operator, left, right)
 
     return build
 
@@ -35,24 +35,22 @@ def _binary(operator: str) -> Callable[..., tree.Binary]:
 def _made(kind: Callable[..., _T], first: int = 0, **more: bool) -> Callable[..., _T]:
     """Of a rule whose children, from the `first` on, are the fields of its node."""
 
-    def build(self: "Builder", meta: Meta, children: list[Any]) -> _T:
+    def build(self: "Builder", meta: Meta, *children: Any) -> _T:
         given = (str(child) if isinstance(child, Token) else child for child in children[first:])
         return kind(self.at(meta), *given, **more)
 
     return build
 
 
-def _all(self: "Builder", meta: Meta, children: list[Any]) -> tuple[Any, ...]:
-    del self, meta
-    return tuple(children)
+def _all(_builder: "Builder", _: Meta, *children: Any) -> tuple[Any, ...]:
+    return children
 
 
-def _unsaid(self: "Builder", meta: Meta, children: list[Any]) -> _Unsaid:
-    del self, meta, children
+def _unsaid(_builder: "Builder", _: Meta, *_children: Any) -> _Unsaid:
     return _Unsaid()
 
 
-@v_args(meta=True)
+@v_args(inline=True, meta=True)
 class Builder(Transformer_NonRecursive[Token, Any]):
     """Builds the tree of one file; `findings` are the literals that mean nothing."""
 
@@ -76,18 +74,16 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
     # Files and specifications
 
-    def file(self, meta: Meta, children: list[Any]) -> tree.File:
-        del meta
+    def file(self, _: Meta, *children: Any) -> tree.File:
         found = tuple(child for child in children if isinstance(child, tree.Specification))
         return tree.File(self._file, self._text, found)
 
     using = _unsaid
 
-    def nothing(self, meta: Meta, children: list[Any]) -> tree.Statement:
-        del children
+    def nothing(self, meta: Meta) -> tree.Statement:
         return tree.Block(self.at(meta), ())
 
-    def specification(self, meta: Meta, children: list[Any]) -> tree.Specification:
+    def specification(self, meta: Meta, *children: Any) -> tree.Specification:
         names = [
             child for child in children if isinstance(child, Token) and child.type in ("NAME", "MODIFIER")
         ]
@@ -109,38 +105,36 @@ class Builder(Transformer_NonRecursive[Token, Any]):
             items(tree.Property),
         )
 
-    def function(self, meta: Meta, children: list[Any]) -> tree.Function | tree.Init:
-        kind, name, parameters, body = children
+    def function(
+        self, meta: Meta, kind: Any, name: Any, parameters: Any, body: Any
+    ) -> tree.Function | tree.Init:
         if name == "init" and kind.name == ("void",):
-            return self.init(meta, [parameters, body])
+            return self.init(meta, parameters, body)
         return tree.Function(self.at(meta), kind, str(name), parameters or (), body)
 
     prototype = _unsaid
 
-    def procedure(self, meta: Meta, children: list[Any]) -> tree.Function:
-        name, parameters, body = children
+    def procedure(self, meta: Meta, name: Any, parameters: Any, body: Any) -> tree.Function:
         return tree.Function(self.at(meta), None, str(name), parameters or (), body)
 
-    def init(self, meta: Meta, children: list[Any]) -> tree.Init:
-        parameters, body = children
+    def init(self, meta: Meta, parameters: Any, body: Any) -> tree.Init:
         if parameters:
             self.refuse(meta, "`init` takes no parameters: it runs before the first message")
         return tree.Init(self.at(meta), body)
 
     parameters = _all
 
-    def unnamed_parameters(self, meta: Meta, children: list[Any]) -> tuple[tree.Parameter, ...]:
-        if children != ["void"]:
-            self.refuse(meta, f"give the parameter a name: `{' '.join(children)} x`")
+    def unnamed_parameters(self, meta: Meta, *words: Any) -> tuple[tree.Parameter, ...]:
+        if words != ("void",):
+            self.refuse(meta, f"give the parameter a name: `{' '.join(words)} x`")
         return ()
 
     parameter = _made(tree.Parameter)
 
-    def reference_parameter(self, meta: Meta, children: list[Any]) -> tree.Parameter:
-        return tree.Parameter(self.at(meta), _referenced(children[0]), str(children[-1]))
+    def reference_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.Parameter:
+        return tree.Parameter(self.at(meta), _referenced(kind), str(name))
 
-    def array_parameter(self, meta: Meta, children: list[Any]) -> tree.Parameter:
-        kind, name = children
+    def array_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.Parameter:
         array = tree.TypeName(kind.position, ("[]",), element=kind)
         return tree.Parameter(self.at(meta), array, str(name))
 
@@ -148,59 +142,52 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
     # Events and properties
 
-    def event(self, meta: Meta, children: list[Any]) -> tree.Event:
+    def event(self, meta: Meta, *children: Any) -> tree.Event:
         *modifiers, name, parameters, trigger, action = children
         words = tuple(tree.Name(self.at(word), (str(word),)) for word in modifiers)
         return tree.Event(self.at(meta), words, str(name), parameters or (), trigger, action)
 
-    def trigger(self, meta: Meta, children: list[Any]) -> tree.MessageTrigger:
-        topic, kind, pattern, when = children
+    def trigger(
+        self, meta: Meta, topic: Any, kind: Any, *rest: Any, part: str | None = None
+    ) -> tree.MessageTrigger:
         name = str(kind).replace("::", "/")
-        return tree.MessageTrigger(self.at(meta), str(topic), name, self.at(kind), None, pattern, when)
+        return tree.MessageTrigger(self.at(meta), str(topic), name, self.at(kind), part, *rest)
 
-    def service_trigger(self, meta: Meta, children: list[Any]) -> tree.MessageTrigger:
-        _, topic, kind, part, pattern, when = children
-        name = str(kind).replace("::", "/")
-        return tree.MessageTrigger(self.at(meta), str(topic), name, self.at(kind), str(part), pattern, when)
+    def service_trigger(
+        self, meta: Meta, _: Any, topic: Any, kind: Any, part: Any, *rest: Any
+    ) -> tree.MessageTrigger:
+        return self.trigger(meta, topic, kind, *rest, part=str(part))
 
-    def timer(self, meta: Meta, children: list[Any]) -> tree.TimerTrigger:
-        duration = children[1]
+    def timer(self, meta: Meta, _every: Any, duration: Any) -> tree.TimerTrigger:
         try:
             return tree.TimerTrigger(self.at(meta), literals.duration_ns(duration.strip()))
         except literals.BadLiteralError as error:
             self.refuse(duration, str(error))
             return tree.TimerTrigger(self.at(meta), 10**9)
 
-    def pattern(self, meta: Meta, children: list[Any]) -> tuple[tree.Binding, ...]:
-        del meta
-        return tuple(children[1] or ())
+    def pattern(self, _: Meta, _open: Any, fields: Any, _close: Any) -> tuple[tree.Binding, ...]:
+        return tuple(fields or ())
 
-    def fields(self, meta: Meta, children: list[Any]) -> list[tree.Binding]:
-        del meta
-        return [binding for group in children if group is not None for binding in group]
+    def fields(self, _: Meta, *groups: Any) -> list[tree.Binding]:
+        return [binding for group in groups if group is not None for binding in group]
 
-    def bind(self, meta: Meta, children: list[Any]) -> list[tree.Binding]:
-        path, name = children
+    def bind(self, meta: Meta, path: Any, name: Any) -> list[tree.Binding]:
         if name in ("true", "false"):
             constant = tree.Name(self.at(name), (str(name),))
             return [tree.Binding(self.at(meta), path, None, constant, self.at(name))]
         return [tree.Binding(self.at(meta), path, str(name), None, self.at(name))]
 
-    def constrain(self, meta: Meta, children: list[Any]) -> list[tree.Binding]:
-        path, constant = children
+    def constrain(self, meta: Meta, path: Any, constant: Any) -> list[tree.Binding]:
         if isinstance(constant, list | tuple):
             constant = tree.Name(self.at(meta), tuple(constant))
         return [tree.Binding(self.at(meta), path, None, constant, constant.position)]
 
-    def nest(self, meta: Meta, children: list[Any]) -> list[tree.Binding]:
-        del meta
-        path, inner = children
+    def nest(self, _: Meta, path: Any, inner: Any) -> list[tree.Binding]:
         return [replace(binding, path=(*path, *binding.path)) for binding in inner or ()]
 
     path = _all
 
-    def path_step(self, meta: Meta, children: list[Any]) -> tree.PathStep:
-        name, index = children
+    def path_step(self, meta: Meta, name: Any, index: Any) -> tree.PathStep:
         if index is None:
             return tree.PathStep(self.at(meta), str(name), None)
         if not index.isdigit() or len(index) > 10:
@@ -208,8 +195,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
             return tree.PathStep(self.at(meta), str(name), 0)
         return tree.PathStep(self.at(meta), str(name), int(index))
 
-    def property(self, meta: Meta, children: list[Any]) -> tree.Property:
-        logic, formula, *handlers = children
+    def property(self, meta: Meta, logic: Any, formula: Any, *handlers: Any) -> tree.Property:
         stripped = formula.lstrip()
         origin = self.at(formula).within(formula, len(formula) - len(stripped))
         return tree.Property(self.at(meta), str(logic), stripped.rstrip(), origin, tuple(handlers))
@@ -218,79 +204,69 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
     # Types
 
-    def type(self, meta: Meta, children: list[Any]) -> tree.TypeName:
+    def type(self, meta: Meta, *children: Any) -> tree.TypeName:
         core = next(child for child in children if isinstance(child, tree.TypeName))
         constant = core.constant or "const" in children or "constexpr" in children
         static = "static" in children
         return replace(core, position=self.at(meta), constant=constant, static=static)
 
-    def qualifier(self, meta: Meta, children: list[Any]) -> str:
-        del meta
-        return str(children[0])
+    def qualifier(self, _: Meta, word: Any) -> str:
+        return str(word)
 
-    def core(self, meta: Meta, children: list[Any]) -> tree.TypeName:
-        if isinstance(children[0], tree.TypeName):
-            return children[0]
-        return tree.TypeName(self.at(meta), tuple(map(str, children)))
+    def core(self, meta: Meta, *words: Any) -> tree.TypeName:
+        if isinstance(words[0], tree.TypeName):
+            return words[0]
+        return tree.TypeName(self.at(meta), tuple(map(str, words)))
 
-    def pointer(self, meta: Meta, children: list[Any]) -> tree.TypeName:
-        return tree.TypeName(self.at(meta), tuple(map(str, children)), pointer=True)
+    def pointer(self, meta: Meta, *words: Any) -> tree.TypeName:
+        return tree.TypeName(self.at(meta), tuple(map(str, words)), pointer=True)
 
-    def named(self, meta: Meta, children: list[Any]) -> tree.TypeName:
-        return tree.TypeName(self.at(meta), children[0])
+    named = _made(tree.TypeName)
 
-    def message(self, meta: Meta, children: list[Any]) -> tree.TypeName:
-        return tree.TypeName(self.at(meta), tuple(str(children[0]).replace("::", "/").split("/")))
+    def message(self, meta: Meta, name: Any) -> tree.TypeName:
+        return tree.TypeName(self.at(meta), tuple(str(name).replace("::", "/").split("/")))
 
-    def vector(self, meta: Meta, children: list[Any]) -> tree.TypeName:
+    def vector(self, meta: Meta, *children: Any) -> tree.TypeName:
         return tree.TypeName(self.at(meta), ("std", "vector"), element=children[-1])
 
-    def vector_of_vectors(self, meta: Meta, children: list[Any]) -> tree.TypeName:
-        inner = self.vector(meta, children)
-        return tree.TypeName(self.at(meta), ("std", "vector"), element=inner)
+    def vector_of_vectors(self, meta: Meta, *children: Any) -> tree.TypeName:
+        return self.vector(meta, self.vector(meta, *children))
 
-    def automatic(self, meta: Meta, children: list[Any]) -> tree.TypeName:
-        del children
+    def automatic(self, meta: Meta) -> tree.TypeName:
         return tree.TypeName(self.at(meta), ("auto",))
 
-    def scoped(self, meta: Meta, children: list[Any]) -> tuple[str, ...]:
-        del meta
+    def scoped(self, _: Meta, *children: Any) -> tuple[str, ...]:
         return tuple(str(child) for child in children if child is not None)
 
     # Statements
 
-    def block(self, meta: Meta, children: list[Any]) -> tree.Block:
-        return tree.Block(self.at(meta), tuple(children))
+    def block(self, meta: Meta, *children: Any) -> tree.Block:
+        return tree.Block(self.at(meta), children)
 
     evaluate = _made(tree.Evaluate)
     if_ = _made(tree.If, 1)
     while_ = _made(tree.While, 1)
 
-    def do_(self, meta: Meta, children: list[Any]) -> tree.While:
-        _, body, condition = (child for child in children if not _is_word(child, "WHILE"))
+    def do_(self, meta: Meta, _: Any, body: Any, condition: Any) -> tree.While:
         return tree.While(self.at(meta), condition, body, at_end=True)
 
-    def for_(self, meta: Meta, children: list[Any]) -> tree.For:
-        _, start, condition, step, body = children
+    def for_(self, meta: Meta, _: Any, start: Any, condition: Any, step: Any, body: Any) -> tree.For:
         empty = isinstance(start, tree.Block)
         return tree.For(self.at(meta), None if empty else start, condition, step, body)
 
     range_for = _made(tree.RangeFor, 1)
 
-    def range_for_reference(self, meta: Meta, children: list[Any]) -> tree.RangeFor:
-        word, kind, *more = children
-        return self.range_for(meta, [word, _referenced(kind), *more])
+    def range_for_reference(self, meta: Meta, word: Any, kind: Any, *more: Any) -> tree.RangeFor:
+        return self.range_for(meta, word, _referenced(kind), *more)
 
-    def switch(self, meta: Meta, children: list[Any]) -> tree.Switch:
-        _, value, *cases = children
-        return tree.Switch(self.at(meta), value, tuple(cases))
+    def switch(self, meta: Meta, _: Any, value: Any, *cases: Any) -> tree.Switch:
+        return tree.Switch(self.at(meta), value, cases)
 
-    def case(self, meta: Meta, children: list[Any]) -> tree.Case:
-        _, value, *statements = children
-        return tree.Case(self.at(meta), value, tuple(statements))
+    def case(self, meta: Meta, _: Any, value: Any, *statements: Any) -> tree.Case:
+        return tree.Case(self.at(meta), value, statements)
 
-    def default(self, meta: Meta, children: list[Any]) -> tree.Case:
-        return tree.Case(self.at(meta), None, tuple(children[1:]))
+    def default(self, meta: Meta, _: Any, *statements: Any) -> tree.Case:
+        return tree.Case(self.at(meta), None, statements)
 
     break_ = _made(tree.Break, 1)
     continue_ = _made(tree.Continue, 1)
@@ -298,67 +274,53 @@ class Builder(Transformer_NonRecursive[Token, Any]):
     reset = _made(tree.Reset, 1)
     return_ = _made(tree.Return, 1)
 
-    def delete(self, meta: Meta, children: list[Any]) -> tree.Delete:
+    def delete(self, meta: Meta, *children: Any) -> tree.Delete:
         return tree.Delete(self.at(meta), children[-1])
 
-    def publish(self, meta: Meta, children: list[Any]) -> tree.Publish:
-        _, topic, kind, value = children
+    def publish(self, meta: Meta, _: Any, topic: Any, kind: Any, value: Any) -> tree.Publish:
         names = [_unquoted(child) if child.type == "STRING" else str(child) for child in (topic, kind)]
         return tree.Publish(self.at(meta), names[0], names[1].replace("::", "/"), self.at(kind), value)
 
-    def declaration(self, meta: Meta, children: list[Any]) -> tree.Declaration:
-        kind, *declarators = children
-        return tree.Declaration(self.at(meta), kind, tuple(declarators))
+    def declaration(self, meta: Meta, kind: Any, *declarators: Any) -> tree.Declaration:
+        return tree.Declaration(self.at(meta), kind, declarators)
 
     plain_declarator = _made(tree.Declarator)
     initialized = _made(tree.Declarator)
 
-    def constructed(self, meta: Meta, children: list[Any]) -> tree.Declarator:
-        name, arguments = children
+    def constructed(self, meta: Meta, name: Any, arguments: Any) -> tree.Declarator:
         return tree.Declarator(self.at(meta), str(name), arguments=arguments)
 
-    def braced(self, meta: Meta, children: list[Any]) -> tree.Declarator:
-        name, items = children
-        value = tree.Elements(self.at(meta), items or ())
-        return tree.Declarator(self.at(meta), str(name), value=value)
+    def braced(self, meta: Meta, name: Any, items: Any) -> tree.Declarator:
+        return tree.Declarator(self.at(meta), str(name), value=self.elements_in_braces(meta, items))
 
-    def sized(self, meta: Meta, children: list[Any]) -> tree.Declarator:
-        name, size = children
-        return tree.Declarator(self.at(meta), str(name), size=size, is_array=True)
-
-    def sized_initialized(self, meta: Meta, children: list[Any]) -> tree.Declarator:
-        name, size, items = children
-        value = tree.Elements(self.at(meta), items or ())
+    def sized(self, meta: Meta, name: Any, size: Any, value: Any = None) -> tree.Declarator:
         return tree.Declarator(self.at(meta), str(name), value=value, size=size, is_array=True)
 
-    def sized_assigned(self, meta: Meta, children: list[Any]) -> tree.Declarator:
-        name, size, value = children
-        return tree.Declarator(self.at(meta), str(name), value=value, size=size, is_array=True)
+    sized_assigned = sized
 
-    def elements(self, meta: Meta, children: list[Any]) -> tuple[tree.Expression, ...]:
-        del meta
-        return tuple(child for child in children if child is not None)
+    def sized_initialized(self, meta: Meta, name: Any, size: Any, items: Any) -> tree.Declarator:
+        return self.sized(meta, name, size, self.elements_in_braces(meta, items))
 
-    def elements_in_braces(self, meta: Meta, children: list[Any]) -> tree.Elements:
+    def elements(self, _: Meta, *items: Any) -> tuple[tree.Expression, ...]:
+        return tuple(item for item in items if item is not None)
+
+    def elements_in_braces(self, meta: Meta, *children: Any) -> tree.Elements:
         return tree.Elements(self.at(meta), children[-1] or ())
 
     # Expressions
 
-    def sequence(self, meta: Meta, children: list[Any]) -> tree.Sequence:
-        return tree.Sequence(self.at(meta), tuple(children))
+    def sequence(self, meta: Meta, *children: Any) -> tree.Sequence:
+        return tree.Sequence(self.at(meta), children)
 
-    def assign(self, meta: Meta, children: list[Any]) -> tree.Assign:
-        target, operator, value = children
+    def assign(self, meta: Meta, target: Any, operator: Any, value: Any) -> tree.Assign:
         return tree.Assign(self.at(meta), str(operator), target, value)
 
-    def set(self, meta: Meta, children: list[Any]) -> tree.Assign:
-        target, value = children
+    def set(self, meta: Meta, target: Any, value: Any) -> tree.Assign:
         return tree.Assign(self.at(meta), "=", target, value)
 
     conditional = _made(tree.Conditional)
 
-    def binary(self, meta: Meta, children: list[Any]) -> tree.Binary:
-        left, operator, right = children
+    def binary(self, meta: Meta, left: Any, operator: Any, right: Any) -> tree.Binary:
         return tree.Binary(self.at(meta), str(operator), left, right)
 
     bit_or_ = _binary("|")
@@ -377,37 +339,32 @@ class Builder(Transformer_NonRecursive[Token, Any]):
     prefix = _made(tree.Unary)
     step_before = _made(tree.Step, prefix=True)
 
-    def step_after(self, meta: Meta, children: list[Any]) -> tree.Step:
-        target, operator = children
+    def step_after(self, meta: Meta, target: Any, operator: Any) -> tree.Step:
         return tree.Step(self.at(meta), str(operator), target, prefix=False)
 
-    def parenthesis(self, meta: Meta, children: list[Any]) -> tree.Expression:
-        del meta
-        inner: tree.Expression = children[-1]
+    def parenthesis(self, _: Meta, _open: Any, inner: tree.Expression) -> tree.Expression:
         return inner
 
-    def cast(self, meta: Meta, children: list[Any]) -> tree.Cast:
-        words = tuple(str(child) for child in children if _is_word(child, "BUILTIN"))
-        if _is_word(children[1], "FIXED"):
-            words = tuple(part.strip() for part in children[1].split("::"))
-        return tree.Cast(self.at(meta), tree.TypeName(self.at(meta), words), children[-1])
+    def cast(self, meta: Meta, _open: Any, *children: Any) -> tree.Cast:
+        *words, value = children
+        if words[0].type == "FIXED":
+            words = [part.strip() for part in words[0].split("::")]
+        return tree.Cast(self.at(meta), tree.TypeName(self.at(meta), tuple(map(str, words))), value)
 
-    def static_cast(self, meta: Meta, children: list[Any]) -> tree.Cast:
+    def static_cast(self, meta: Meta, *children: Any) -> tree.Cast:
         return tree.Cast(self.at(meta), *(child for child in children if not isinstance(child, Token)))
 
-    def convert(self, meta: Meta, children: list[Any]) -> tree.Construct:
+    def convert(self, meta: Meta, *children: Any) -> tree.Construct:
         words = tuple(str(child) for child in children if _is_word(child, "BUILTIN"))
         return tree.Construct(self.at(meta), tree.TypeName(self.at(meta), words), children[-1] or ())
 
-    def construct_vector(self, meta: Meta, children: list[Any]) -> tree.Construct:
-        kind, *arguments = (child for child in children if not _is_word(child, "LPAR"))
-        return tree.Construct(self.at(meta), kind, arguments[0] or ())
+    def construct_vector(self, meta: Meta, kind: Any, arguments: Any) -> tree.Construct:
+        return tree.Construct(self.at(meta), kind, arguments or ())
 
-    def construct_elements(self, meta: Meta, children: list[Any]) -> tree.Construct:
-        kind, *items = (child for child in children if not _is_word(child, "LBRACE"))
-        return tree.Construct(self.at(meta), kind, (tree.Elements(self.at(meta), items[0] or ()),))
+    def construct_elements(self, meta: Meta, kind: Any, items: Any) -> tree.Construct:
+        return tree.Construct(self.at(meta), kind, (self.elements_in_braces(meta, items),))
 
-    def new(self, meta: Meta, children: list[Any]) -> tree.NewCharacters:
+    def new(self, meta: Meta, *children: Any) -> tree.NewCharacters:
         words = [str(child) for child in children if _is_word(child, "BUILTIN")]
         if words != ["char"]:
             self.refuse(
@@ -419,37 +376,35 @@ class Builder(Transformer_NonRecursive[Token, Any]):
     index = _made(tree.Index)
     member = _made(tree.Member)
 
-    def call(self, meta: Meta, children: list[Any]) -> tree.Call:
-        callee, *arguments = (child for child in children if not isinstance(child, Token))
-        return tree.Call(self.at(meta), callee, arguments[0] or ())
+    def call(self, meta: Meta, callee: Any, arguments: Any) -> tree.Call:
+        return tree.Call(self.at(meta), callee, arguments or ())
 
     arguments = _all
 
-    def number(self, meta: Meta, children: list[Any]) -> tree.Number:
+    def number(self, meta: Meta | Token, *children: Any) -> tree.Number:
         return tree.Number(self.at(meta), str(children[-1]))
 
-    def negative(self, meta: Meta, children: list[Any]) -> tree.Unary:
-        number = tree.Number(self.at(children[-1]), str(children[-1]))
-        return tree.Unary(self.at(meta), "-", number)
+    def negative(self, meta: Meta, *children: Any) -> tree.Unary:
+        return tree.Unary(self.at(meta), "-", self.number(children[-1], children[-1]))
 
-    def name(self, meta: Meta, children: list[Any]) -> tree.Name:
+    def name(self, meta: Meta, *children: Any) -> tree.Name:
         parts = children[0] if isinstance(children[0], tuple) else tuple(map(str, children))
         if len(parts) == 1 and parts[0] in FORBIDDEN:
             self.refuse(meta, f"`{parts[0]}` is not part of the language; {FORBIDDEN[parts[0]]}")
         return tree.Name(self.at(meta), parts)
 
-    def string(self, meta: Meta, children: Sequence[Token]) -> tree.Text:
+    def string(self, meta: Meta, *parts: Token) -> tree.Text:
         value = b""
-        for part in children:
+        for part in parts:
             try:
                 value += literals.string_bytes(part[1:-1])
             except literals.BadLiteralError as error:
                 self.refuse(part, str(error))
         return tree.Text(self.at(meta), value)
 
-    def character(self, meta: Meta, children: list[Token]) -> tree.Character:
+    def character(self, meta: Meta, quoted: Token) -> tree.Character:
         try:
-            return tree.Character(self.at(meta), literals.character_value(children[0][1:-1]))
+            return tree.Character(self.at(meta), literals.character_value(quoted[1:-1]))
         except literals.BadLiteralError as error:
             self.refuse(meta, str(error))
             return tree.Character(self.at(meta), 0)
