@@ -51,7 +51,7 @@ from appliance.master.rosmaster import RosMaster, limits_of_answers, own_paramet
 from appliance.master.upkeep.arrivals import Arrivals
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import Entries
-from appliance.master.upkeep.liveness import Liveness, LivenessSettings, Watchlist
+from appliance.master.upkeep.liveness import Liveness, Watchlist
 from appliance.master.upkeep.moves import Moving
 from appliance.master.upkeep.publisher import OwnPublisher
 from appliance.master.upkeep.reconcile import Reconciler
@@ -208,9 +208,7 @@ class Parts:
             self.enactor,
             self._watchlist,
             nodes=self._nodes,
-            settings=LivenessSettings(
-                settings.liveness.interval, settings.liveness.silent, settings.liveness.shadow
-            ),
+            settings=settings.liveness,
             standing=self._base.standing,
         )
         self.reconciler = Reconciler(

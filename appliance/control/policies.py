@@ -7,13 +7,14 @@ and says everything that is wrong with it. Every policy that came into force is 
 import asyncio
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import structlog
 
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
+from appliance.channel.answers.policy import Loaded
 from appliance.fingerprints import fingerprint
 from appliance.policy import Known, Policy, PolicyError, judge
 from appliance.policy.hosts import Network
@@ -51,17 +52,6 @@ class RevisionChangedError(Exception):
 
     def __init__(self, expected: int, found: int) -> None:
         super().__init__(f"revision {found} is in force, not {expected}: look at it before you change it")
-
-
-@dataclass(frozen=True, slots=True)
-class Loaded:
-    """What a load did: the revision in force now, the one before, the lint, and what was revoked."""
-
-    revision: int
-    replaced: int
-    warnings: list[str]
-    revoked: int
-    confirm_by: float | None
 
 
 class Policies:

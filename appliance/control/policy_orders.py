@@ -8,7 +8,6 @@ taken back can rely on it that nothing of it goes through any more.
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import asdict
 from typing import Any
 
 from appliance.channel import admin
@@ -37,26 +36,23 @@ class PolicyOrders:
         """Read the policy file again."""
         by = "disk" if who == "operator" else who
         async with self._changing(request.expected):
-            loaded = await self._policies.reload(who=by, confirm_within=request.confirm_within)
-        return answers.Loaded(**asdict(loaded))
+            return await self._policies.reload(who=by, confirm_within=request.confirm_within)
 
     async def load(self, request: admin.PolicyLoad, who: str) -> answers.Loaded:
         """Bring another text into force."""
         async with self._changing(request.expected):
-            loaded = await self._policies.load_text(
+            return await self._policies.load_text(
                 request.text,
                 request.signature,
                 who=who,
                 note=request.note,
                 confirm_within=request.confirm_within,
             )
-        return answers.Loaded(**asdict(loaded))
 
     async def roll_back(self, request: admin.PolicyRollback, who: str) -> answers.Loaded:
         """Bring a kept revision into force."""
         async with self._changing(request.expected):
-            loaded = self._policies.rollback(request.revision, who=who)
-        return answers.Loaded(**asdict(loaded))
+            return self._policies.rollback(request.revision, who=who)
 
     async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
         """Keep a change that would go back by itself."""

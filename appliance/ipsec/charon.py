@@ -8,8 +8,7 @@ import base64
 import contextlib
 import socket
 import struct
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,8 @@ from vici.exception import (
     SessionException,
 )
 
-from appliance.ipsec.strongswan import Tunnel, connection, connection_name, host_of, pool, proposals_of
+from appliance.channel.messages import TunnelHost, TunnelSeen, TunnelsStated
+from appliance.ipsec.strongswan import connection, connection_name, host_of, pool, proposals_of
 
 PROGRAM = Path("/usr/sbin/charon-systemd")
 _SECONDS = 10.0
@@ -35,35 +35,14 @@ class CharonError(Exception):
     """charon cannot be used; the message says why and what to do."""
 
 
-@dataclass(frozen=True)
-class Material:
-    """Certificates in PEM, and the list of revoked ones; `address` is the appliance's own in the tunnels."""
-
-    address: str
-    authority: bytes
-    certificate: bytes
-    revocations: bytes
-
-
-@dataclass(frozen=True)
-class Seen:
-    """A tunnel that stands, as charon has it; `seconds` since it was established."""
-
-    name: str
-    remote: str
-    seconds: int
-    bytes_in: int
-    bytes_out: int
-
-
 class Vici:
     """The conversation with a running charon. Raises `CharonError`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._session = self._connect()
-        self._loaded: dict[str, Tunnel] = {}
-        self._material: Material | None = None
+        self._loaded: dict[str, TunnelHost] = {}
+        self._stated: TunnelsStated | None = None
         self.proposals = proposals_of(self._key_exchanges())
 
     def close(self) -> None:
@@ -75,34 +54,31 @@ class Vici:
         with self._said("the appliance's key"):
             self._session.load_key({"type": "any", "data": key})
 
-    def provision(self, tunnels: Sequence[Tunnel], material: Material) -> None:
+    def provision(self, stated: TunnelsStated) -> None:
         """Make charon's tunnels exactly these. What is revoked is cut before anything new is loaded."""
-        wanted = {tunnel.name: tunnel for tunnel in tunnels}
-        before = self._material
-        if before is None or before.authority != material.authority:
+        before = self._stated
+        if before is None or before.authority != stated.authority:
             with self._said("the authority's certificate"):
-                self._session.load_cert({"type": "x509", "flag": "ca", "data": material.authority})
-        if before is None or before.revocations != material.revocations:
+                self._session.load_cert({"type": "x509", "flag": "ca", "data": stated.authority})
+        if before is None or before.revocations != stated.revocations:
             with self._said("the list of revoked certificates"):
-                self._session.load_cert({"type": "x509crl", "data": _der_of(material.revocations)})
+                self._session.load_cert({"type": "x509crl", "data": _der_of(stated.revocations)})
                 # charon takes the first valid list that it finds, and its cache may hold the one before.
                 self._session.flush_certs()
         earlier = dict(self._loaded)
-        for name in earlier.keys() - wanted.keys():
+        for name in earlier.keys() - {host.name for host in stated.hosts}:
             self._unload(name)
-        fresh = before is None or (before.address, before.certificate) != (
-            material.address,
-            material.certificate,
-        )
-        for tunnel in tunnels:
-            was = earlier.get(tunnel.name)
-            if fresh or was != tunnel:
-                self._load(tunnel, material)
-            if was is not None and was.serial != tunnel.serial:
-                self._close(tunnel.name)
-        self._material = material
+        own = (stated.address, stated.certificate)
+        fresh = before is None or (before.address, before.certificate) != own
+        for host in stated.hosts:
+            was = earlier.get(host.name)
+            if fresh or was != host:
+                self._load(host, stated)
+            if was is not None and was.serial != host.serial:
+                self._close(host.name)
+        self._stated = stated
 
-    def seen(self) -> list[Seen]:
+    def seen(self) -> list[TunnelSeen]:
         """The tunnels that stand now."""
         with self._said("the list of tunnels"):
             found = [(name, row) for reply in self._session.list_sas() for name, row in reply.items()]
@@ -134,27 +110,17 @@ class Vici:
         except OSError:
             return
 
-    def _load(self, tunnel: Tunnel, material: Material) -> None:
-        with self._said(f"the tunnel of {tunnel.name}"):
-            self._session.load_pool(pool(tunnel))
-            self._session.load_conn(
-                connection(
-                    tunnel,
-                    address=material.address,
-                    certificate=material.certificate,
-                    authority=material.authority,
-                    proposals=self.proposals,
-                )
-            )
-        self._loaded[tunnel.name] = tunnel
+    def _load(self, host: TunnelHost, stated: TunnelsStated) -> None:
+        with self._said(f"the tunnel of {host.name}"):
+            self._session.load_pool(pool(host))
+            self._session.load_conn(connection(host, stated, self.proposals))
+        self._loaded[host.name] = host
 
     def _unload(self, name: str) -> None:
         with self._said(f"the end of the tunnel of {name}"):
             self._session.unload_conn({"name": connection_name(name)})
             self._close(name)
-            with contextlib.suppress(
-                CommandException
-            ):  # its address is still in use until the tunnel is gone
+            with contextlib.suppress(CommandException):  # its address is in use until the tunnel is gone
                 self._session.unload_pool({"name": connection_name(name)})
         del self._loaded[name]
 
@@ -186,14 +152,14 @@ def _der_of(pem: bytes) -> bytes:
     return base64.b64decode(b"".join(pem.split(b"-----")[2:3]))
 
 
-def _seen(name: str, row: Any) -> Seen | None:
+def _seen(name: str, row: Any) -> TunnelSeen | None:
     host = host_of(name)
     if host is None or _text(row, "state") != "ESTABLISHED":
         return None
     children = [child for child in row.get("child-sas", {}).values() if _text(child, "state") == "INSTALLED"]
     if not children:
         return None
-    return Seen(
+    return TunnelSeen(
         host,
         _text(row, "remote-host"),
         int(_text(row, "established") or 0),

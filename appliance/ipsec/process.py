@@ -30,12 +30,12 @@ import structlog
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child import Child
-from appliance.ipsec.charon import PROGRAM, CharonError, Material, Vici
+from appliance.ipsec.charon import PROGRAM, CharonError, Vici
 from appliance.ipsec.files import SignerKeyError, require_private, write_whole
 from appliance.ipsec.leftovers import clear_leftovers
 from appliance.ipsec.refusals import Refusal, Refusals
 from appliance.ipsec.requests import make_key, signing_request
-from appliance.ipsec.strongswan import Tunnel, configuration
+from appliance.ipsec.strongswan import configuration
 
 KEY_FILE = "appliance.key"
 REFUSALS_PER_SECOND = 20
@@ -113,9 +113,7 @@ class TunnelProcess:
             if self._vici is None:
                 self._vici = await self._start(wanted)
             vici = self._vici
-            tunnels = [Tunnel(host.name, host.address, host.serial) for host in wanted.hosts]
-            material = Material(wanted.address, wanted.authority, wanted.certificate, wanted.revocations)
-            await self._in_turn(partial(vici.provision, tunnels, material))
+            await self._in_turn(partial(vici.provision, wanted))
             self._taken = wanted.number
             await self._say_how_it_stands(vici)
 
@@ -192,16 +190,7 @@ class TunnelProcess:
                 await self._say_how_it_stands(self._vici)
 
     async def _say_how_it_stands(self, vici: Vici) -> None:
-        rows = await self._in_turn(vici.seen)
-        self._tell(
-            messages.TunnelsReported(
-                self._taken,
-                [
-                    messages.TunnelSeen(row.name, row.remote, row.seconds, row.bytes_in, row.bytes_out)
-                    for row in rows
-                ],
-            )
-        )
+        self._tell(messages.TunnelsReported(self._taken, await self._in_turn(vici.seen)))
 
     async def _renew(self) -> None:
         while True:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from appliance.channel.messages import APPLIANCE_NAME, Esp
+from appliance.channel.messages import APPLIANCE_NAME, Esp, TunnelHost, TunnelsStated
 from appliance.shares.table import IKE_HANDSHAKES
 
 USER_SPACE_INTERFACE = "ipsec0"
@@ -26,15 +26,6 @@ _ML_KEM_ALGORITHM = "ML_KEM_768"
 CHILD = "ros"
 _PLUGINS = ("random", "nonce", "openssl", "pem", "x509", "revocation", "constraints", "pubkey", "kdf")
 _PREFIX = "host-"
-
-
-@dataclass(frozen=True)
-class Tunnel:
-    """An enrolled host: its name, the virtual address kept for it, and the serial number of its certificate."""
-
-    name: str
-    address: str
-    serial: str
 
 
 def plugins(esp: Esp) -> str:
@@ -105,29 +96,22 @@ def host_of(connection: str) -> str | None:
     return connection.removeprefix(_PREFIX) if connection.startswith(_PREFIX) else None
 
 
-def pool(tunnel: Tunnel) -> dict[str, Any]:
+def pool(host: TunnelHost) -> dict[str, Any]:
     """The one address of a host, for vici's `load-pool`."""
-    return {connection_name(tunnel.name): {"addrs": f"{tunnel.address}-{tunnel.address}"}}
+    return {connection_name(host.name): {"addrs": f"{host.address}-{host.address}"}}
 
 
-def connection(
-    tunnel: Tunnel,
-    *,
-    address: str,
-    certificate: bytes,
-    authority: bytes,
-    proposals: Proposals = Proposals(),
-) -> Mapping[str, Any]:
-    """The tunnel of a host, for vici's `load-conn`; `address` is the appliance's own in the tunnel."""
+def connection(host: TunnelHost, stated: TunnelsStated, proposals: Proposals) -> Mapping[str, Any]:
+    """The tunnel of a host, for vici's `load-conn`."""
     child = {
-        "local_ts": [f"{address}/32"],
+        "local_ts": [f"{stated.address}/32"],
         "remote_ts": ["dynamic"],
         "esp_proposals": list(proposals.esp),
         "dpd_action": "clear",
         "close_action": "none",
     }
     return {
-        connection_name(tunnel.name): {
+        connection_name(host.name): {
             "version": "2",
             "proposals": list(proposals.ike),
             "unique": "replace",
@@ -135,12 +119,12 @@ def connection(
             "mobike": "yes",
             "dpd_delay": "5s",
             "send_cert": "always",
-            "pools": [connection_name(tunnel.name)],
-            "local": {"auth": "pubkey", "certs": [certificate], "id": f"fqdn:{APPLIANCE_NAME}"},
+            "pools": [connection_name(host.name)],
+            "local": {"auth": "pubkey", "certs": [stated.certificate], "id": f"fqdn:{APPLIANCE_NAME}"},
             "remote": {
                 "auth": "pubkey",
-                "cacerts": [authority],
-                "id": f"fqdn:{tunnel.name}",
+                "cacerts": [stated.authority],
+                "id": f"fqdn:{host.name}",
                 "revocation": "strict",
             },
             "children": {CHILD: child},

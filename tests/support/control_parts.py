@@ -11,6 +11,7 @@ import itertools
 from collections.abc import Iterable
 from typing import Any, Self, cast
 
+from appliance import config
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.graph.effects import Effect, NodeCall
@@ -25,7 +26,7 @@ from appliance.master.reach.relays import RelayControl
 from appliance.master.rosmaster import RosMaster
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import Entries
-from appliance.master.upkeep.liveness import Liveness, LivenessSettings, Watchlist
+from appliance.master.upkeep.liveness import Liveness, Watchlist
 from appliance.master.upkeep.reconcile import Reconciler
 from appliance.metrics import Meter
 from appliance.policy import compile_policy
@@ -347,7 +348,7 @@ class ControlParts:
             self.enactor,
             self.watchlist,
             nodes=self.nodes,
-            settings=LivenessSettings(silent=silent),
+            settings=config.Liveness.model_construct(silent=silent),
             standing=lambda _host: Standing.REGISTERED,
         )
         self._serving = functools.partial(

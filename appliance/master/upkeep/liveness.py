@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import structlog
 
+from appliance import config
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
@@ -54,15 +55,6 @@ _log = structlog.get_logger()
 _REPLACED_SECONDS = 60.0
 _IDLE_SECONDS = 30.0  # longer than a registering call can be on its way
 _LOOK_AGAIN_SECONDS = 0.3
-
-
-@dataclass(frozen=True, slots=True)
-class LivenessSettings:
-    """Seconds: between looks, without an answer until lost, as a shadow until forgotten."""
-
-    interval: float = 5.0
-    silent: float = 20.0
-    shadow: float = 600.0
 
 
 @dataclass(slots=True)
@@ -131,7 +123,7 @@ class Liveness:
         watchlist: Watchlist,
         *,
         nodes: NodeApi,
-        settings: LivenessSettings,
+        settings: config.Liveness,
         standing: Callable[[Address], Standing],
     ) -> None:
         self._registry = registry

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from vici.protocol import Message, Packet
 
-from appliance.ipsec.charon import CharonError, Material, Vici
+from appliance.channel.messages import TunnelsStated
+from appliance.ipsec.charon import CharonError, Vici
 
 
 class StandIn:
@@ -45,6 +46,11 @@ def pem_of(count: int) -> bytes:
     return b"-----BEGIN X509 CRL-----\n" + text + b"-----END X509 CRL-----\n"
 
 
+def stated(count: int) -> TunnelsStated:
+    """No hosts, and a list of so many bytes."""
+    return TunnelsStated(1, "kernel", "10.113.11.1", b"authority", b"certificate", pem_of(count), [])
+
+
 @pytest.fixture
 def charon(tmp_path: Path) -> Iterator[tuple[StandIn, Vici]]:
     """A charon and the conversation with it."""
@@ -66,6 +72,6 @@ def test_an_answer_of_another_kind_is_said(charon: tuple[StandIn, Vici]) -> None
 def test_a_list_that_is_too_long_is_said(charon: tuple[StandIn, Vici]) -> None:
     """A value has 65,535 bytes at most: more is an error that names the list, and what was loaded before stays."""
     _stand_in, vici = charon
-    vici.provision([], Material("10.113.11.1", b"authority", b"certificate", pem_of(65_535)))
+    vici.provision(stated(65_535))
     with pytest.raises(CharonError, match="the list of revoked certificates"):
-        vici.provision([], Material("10.113.11.1", b"authority", b"certificate", pem_of(65_536)))
+        vici.provision(stated(65_536))

@@ -3,7 +3,6 @@
 import asyncio
 import socket
 import threading
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,13 +14,13 @@ from appliance.channel.messages import (
     LinkOpened,
     Stop,
     TunnelLink,
+    TunnelSeen,
     TunnelsReported,
     TunnelsStated,
 )
 from appliance.ipsec import process
-from appliance.ipsec.charon import Material, Seen, Vici
+from appliance.ipsec.charon import Vici
 from appliance.ipsec.requests import make_key
-from appliance.ipsec.strongswan import Tunnel
 
 _LIMIT_SECONDS = 30
 
@@ -33,13 +32,13 @@ class Conversation:
         self._busy = threading.Event()
         self.interrupted = threading.Event()
 
-    def provision(self, _tunnels: Sequence[Tunnel], _material: Material) -> None:
+    def provision(self, _stated: TunnelsStated) -> None:
         """Is asked for the tunnels in the middle, or is not."""
         self._busy.set()
         self.interrupted.wait(0.3)
         self._busy.clear()
 
-    def seen(self) -> list[Seen]:
+    def seen(self) -> list[TunnelSeen]:
         """None; notes whether something else is being asked."""
         if self._busy.is_set():
             self.interrupted.set()

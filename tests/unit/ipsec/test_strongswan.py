@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+from appliance.channel.messages import TunnelHost, TunnelsStated
 from appliance.ipsec.strongswan import (
     ESP_PROPOSALS,
     IKE_PROPOSALS,
-    Tunnel,
+    Proposals,
     configuration,
     connection,
     host_of,
@@ -14,13 +15,14 @@ from appliance.ipsec.strongswan import (
     proposals_of,
 )
 
-TUNNEL = Tunnel("ocu-1", "10.113.11.2", "a1")
+HOST = TunnelHost("ocu-1", "10.113.11.2", "a1")
+STATED = TunnelsStated(1, "kernel", "10.113.11.1", b"A", b"C", b"R", [HOST])
 
 
 def test_a_host_gets_one_address_and_reaches_the_appliance_only() -> None:
     """The pool has one address; the selectors are it and the appliance's own."""
-    assert pool(TUNNEL) == {"host-ocu-1": {"addrs": "10.113.11.2-10.113.11.2"}}
-    made = connection(TUNNEL, address="10.113.11.1", certificate=b"C", authority=b"A")["host-ocu-1"]
+    assert pool(HOST) == {"host-ocu-1": {"addrs": "10.113.11.2-10.113.11.2"}}
+    made = connection(HOST, STATED, Proposals())["host-ocu-1"]
     assert made["pools"] == ["host-ocu-1"]
     assert made["children"]["ros"]["local_ts"] == ["10.113.11.1/32"]
     assert made["children"]["ros"]["remote_ts"] == ["dynamic"]
@@ -28,9 +30,7 @@ def test_a_host_gets_one_address_and_reaches_the_appliance_only() -> None:
 
 def test_a_host_is_its_certificate() -> None:
     """Its name in the certificate, of this authority, not revoked: without a valid list nobody comes in."""
-    remote = connection(TUNNEL, address="10.113.11.1", certificate=b"C", authority=b"A")["host-ocu-1"][
-        "remote"
-    ]
+    remote = connection(HOST, STATED, Proposals())["host-ocu-1"]["remote"]
     assert remote == {"auth": "pubkey", "cacerts": [b"A"], "id": "fqdn:ocu-1", "revocation": "strict"}
 
 
@@ -66,9 +66,7 @@ def test_ml_kem_is_offered_where_charon_has_it() -> None:
     assert found.key_exchange == ["x25519+mlkem768", "x25519", "ecp384"]
     assert found.ike[0] == "aes256gcm16-prfsha384-x25519-ke1_mlkem768"
     assert found.esp[0] == "aes256gcm16-x25519-ke1_mlkem768"
-    (row,) = connection(
-        Tunnel("a", "10.0.0.2", "1f"), address="10.0.0.1", certificate=b"", authority=b"", proposals=found
-    ).values()
+    (row,) = connection(HOST, STATED, found).values()
     assert row["proposals"] == list(found.ike)
 
 
