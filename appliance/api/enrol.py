@@ -108,7 +108,13 @@ def _add_renewal(router: Routes, services: Services) -> None:
             raise ProblemError(422, "bad-input", f"body.proof: not base64: {error}") from None
         return await _ask(services, admin.HostRenewItself(name, renewal.request, proof, _peer(request)))
 
-    @router.post("/v1/hosts/{name}/renewed", operation_id="host_renewed", responses=_TUNNEL, status_code=204)
+    @router.post(
+        "/v1/hosts/{name}/renewed",
+        operation_id="host_renewed",
+        responses=_TUNNEL,
+        response_class=Response,
+        status_code=204,
+    )
     async def renewed(name: OneName, request: Request) -> None:
         """For a host in its tunnel: the new certificate is in place; the one before ends, the tunnel comes anew."""
         await _ask(services, admin.HostRenewed(name, _peer(request)))

@@ -20,7 +20,7 @@ from appliance.api.history import BUSY_SECONDS, Sample, Seen
 from appliance.api.moments import in_full
 from appliance.api.problems import ProblemError
 from appliance.api.roles import VIEWER, Viewer, ask
-from appliance.api.routing import Responses, Routes
+from appliance.api.routing import Routes, file
 from appliance.api.services import Services
 from appliance.api.streams import Held, Streams, peer_of
 from appliance.channel.admin import GraphWanted
@@ -29,21 +29,7 @@ from appliance.shares.table import REST_STREAM_PEERS, REST_STREAMS
 
 _PING_SECONDS = 15
 _SHARE = 20  # of the time it takes to make the graph, that is how long one waits before the next
-_EVENT = {
-    "type": "object",
-    "properties": {
-        "event": {"type": "string"},
-        "data": {"type": "string", "description": "JSON"},
-        "id": {"type": "string"},
-    },
-    "required": ["event", "data"],
-}
-_TEXT: Responses = {
-    200: {
-        "description": "Events `now`, `graph`, `away`, `end`.",
-        "content": {"text/event-stream": {"schema": _EVENT}},
-    }
-}
+_TEXT = file("text/event-stream", "Events `now`, `graph`, `away`, `end`.")
 
 
 class Hour(msgspec.Struct, frozen=True):

@@ -6,9 +6,11 @@
 import contextlib
 import json
 import re
+import ssl
 import subprocess
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,11 +20,13 @@ from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Event, Process, ThisMachine
+from tests.support.rest import Rest
 from tests.support.tunnels import JoinedHost
 
 MIDDLE, ROBOT, OCU, ATTACKER = "10.88.0.2", "10.88.0.10", "10.88.0.20", "10.88.0.66"
 MASTER = f"http://{MIDDLE}:11311"
 OWN = "10.113.11.1"  # the appliance's address in the tunnels
+API = 8443  # REST's port, where a site has REST
 LONG = 2 * LIMIT  # seconds
 POLICY = f"""\
 [Groups]
@@ -131,6 +135,13 @@ class TunnelSite:
     def story(self) -> str:
         """What the appliance said, for the message of a failure."""
         return self.appliance.story()
+
+    def rest(self) -> Rest:
+        """REST as the first admin, for the management network (the attacker's machine, which has a token here)."""
+        # The kernel takes connections before the process is there: one answer says that it is.
+        served = self.attacker.run(partial(ssl.get_server_certificate, (MIDDLE, API), timeout=LONG))
+        (self.home / "api.pem").write_text(served)
+        return Rest(f"https://{MIDDLE}:{API}", self.appliance.token, self.home / "api.pem")
 
     @property
     def mark(self) -> int:

@@ -11,12 +11,10 @@ import os
 import re
 import signal
 import socket
-import ssl
 import subprocess
 import tarfile
 import time
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +27,10 @@ from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT
 from tests.support.requirements import need_program, need_root
-from tests.support.rest import Rest
 from tests.support.script_host import ScriptHost
-from tests.support.tunnel_site import LONG, MASTER, MIDDLE, OCU, OWN, POLICY, TunnelSite
+from tests.support.tunnel_site import API, LONG, MASTER, MIDDLE, OCU, OWN, POLICY, TunnelSite
 from tests.support.tunnels import need_strongswan
 
-API = 8443
 CONFIG = f"""\
 api: 0.0.0.0:{API}
 api_networks: [10.88.0.0/24]
@@ -232,17 +228,9 @@ def test_somebody_in_between_gets_nothing(site: TunnelSite, laptop: ScriptHost, 
     site.appliance.rosrv("host", "revoke", "other")
 
 
-def rest_of(site: TunnelSite) -> Rest:
-    """REST as the first admin, from the management network (the attacker's machine, which has a token here)."""
-    # The kernel takes connections before the process is there: one answer says that it is.
-    served = site.attacker.run(partial(ssl.get_server_certificate, (MIDDLE, API), timeout=30))
-    (site.home / "api.pem").write_text(served)
-    return Rest(f"https://{MIDDLE}:{API}", str(site.appliance.ready["token"]), site.home / "api.pem")
-
-
 def test_everything_over_rest(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
     """A kit joins, under an odd name; a later one has no key; a new one closes the tunnel; revoked, it is out."""
-    rest, ask = rest_of(site), site.attacker.run
+    rest, ask = site.rest(), site.attacker.run
     seen = ask(lambda: rest.get("/v1/hosts"))
     new = {"name": "re.st_e-D", "endpoint": MIDDLE, "how": "kit"}
     made = ask(lambda: rest.post("/v1/hosts", new, match=seen.etag))
@@ -320,7 +308,7 @@ def test_a_short_life_is_renewed_in_time(site: TunnelSite, laptop: ScriptHost, t
 
 def test_two_hundred_hosts_beside_a_tunnel(site: TunnelSite, laptop: ScriptHost, tmp_path: Path) -> None:
     """charon takes two hundred enrolled hosts, and the one that comes gets its own address among them."""
-    rest, ask = rest_of(site), site.attacker.run
+    rest, ask = site.rest(), site.attacker.run
     request = signing_request(make_key(), "many").decode()
 
     def enrol_many() -> list[int]:
