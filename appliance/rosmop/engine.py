@@ -543,7 +543,7 @@ class MonitorSet:
         self._turn.now = time_ns
         self._sender = sender
         message = Message(buffer, time_ns)
-        writers: tuple[Step, ...] = ()
+        writers: tuple[tuple[Step, Sequence[int]], ...] = ()
         for step in steps:
             if step.first:
                 monitor = step.monitor
@@ -555,8 +555,9 @@ class MonitorSet:
                 outcome.dropped_by = step.monitor.name
                 break
             if message.touched:
-                message.touched = False
-                writers = (*writers, step)
+                sites = [site for bit, site in enumerate(message.marks) if message.touched >> bit & 1]
+                message.touched = 0
+                writers = (*writers, (step, sites))
         self._finish(message, writers, outcome)
         return outcome
 
@@ -699,7 +700,9 @@ class MonitorSet:
         outcome.faults = (*outcome.faults, Fault(monitor.name, step.event.position, text, binding))
         self._block(message, outcome)
 
-    def _finish(self, message: Message, writers: tuple[Step, ...], outcome: Outcome) -> None:
+    def _finish(
+        self, message: Message, writers: tuple[tuple[Step, Sequence[int]], ...], outcome: Outcome
+    ) -> None:
         turn = self._turn
         if turn.log or turn.published or turn.looked:
             self._collect(outcome)
@@ -713,8 +716,9 @@ class MonitorSet:
         elif message.changed:
             outcome.result = "changed"
             outcome.buffer = message.buffer
-            outcome.changed_by = tuple([step.name for step in writers])
-            outcome.changed_at = tuple([step.event.position for step in writers])
+            sites = self.compiled.module.sites
+            outcome.changed_by = tuple([step.name for step, _ in writers])
+            outcome.changed_at = tuple([sites[one].position for _, at in writers for one in at])
         if self._timed:
             self._schedule()
 

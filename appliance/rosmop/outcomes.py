@@ -68,8 +68,8 @@ class Outcome:
     its sets on trial.
 
     `changed_by` are the events whose actions made its bytes others than they found them, in order; empty unless the
-    result is `changed`, and stand at `changed_at`. An event that happened without a change, or assigned what was there,
-    is not among them.
+    result is `changed`; at `changed_at` stand the statements that assigned to the fields whose bytes are others. An
+    event that happened without a change, or assigned what was there, is not among them.
     `dropped_by` is the specification that dropped it: by its last event, by `fatal` (a fault that dropped it), or for
     `reason` (it is held, or could not begin); `dropped_at` is where the statement, the action or the specification
     stands. `handling` has the verdicts in whose handlers the message was dropped (under `DROPPED`) and messages were

@@ -87,11 +87,14 @@ class Printer:
         self._context = context
         self._acts = 0
         self._flags: frozenset[str] = frozenset()
+        self._marks: list[int] = []  # sites that assign to fields of the message
+        self._site = -1
 
     def function(self, function: form.Function) -> int:
         """Add a function to the module; returns the line at which its event happens, 0 if it is none's."""
         lines = Lines()
         happens = 0
+        self._marks = []
         self._flags = frozenset(
             write.flag
             for one in function.body
@@ -126,14 +129,13 @@ class Printer:
         lines.depth -= 1
 
     def _statement(self, lines: Lines, node: form.Statement) -> None:
-        lines.site = node.site
+        lines.site = self._site = node.site
         _STATEMENTS[type(node)](self, lines, node)
 
     def _evaluate(self, lines: Lines, node: form.Evaluate) -> None:
         value = node.value.value if isinstance(node.value, form.Discard) else node.value
         if isinstance(value, form.Assign):
-            self._acts += value.name in self._flags  # a field of the message gets another value
-            lines.add(f"{value.name} = {self.text(value.value)}")
+            lines.add(f"{value.name} = {self._assigned(value)}")
         elif isinstance(value, form.Call) and value.function == "a_slot":
             base, slot, new = map(self.text, value.arguments)
             lines.add(f"{base}[{slot}] = {new}")
@@ -279,6 +281,8 @@ class Printer:
     def _write_back(self, lines: Lines, node: form.WriteBack) -> None:
         """What can fault, the encoding of fields of variable size, comes before the first byte is written."""
         lines.add("if m.dropped: return True")
+        if node.writes:
+            lines.add(f"m.marks = ({''.join(f'{site}, ' for site in self._marks)})")
         spliced = [write for write in node.writes if write.end is not None]
         if spliced:
             lines.add(f"{node.name} = []")
@@ -287,13 +291,13 @@ class Printer:
             lines.add("    o = e_bytearray()")
             encoder = self._module.use(self._values.encoder(write.value.type))
             lines.add(f"    {encoder}({self.text(write.value)}, o)")
-            lines.add(f"    {node.name}.append(({spot(write.at)}, {write.end}, e_bytes(o)))")
+            lines.add(f"    {node.name}.append(({spot(write.at)}, {write.end}, e_bytes(o), {write.flag}))")
         for write in node.writes:
             if write.end is None:
                 codes, value = struct_code(write.value.type) or "", self.text(write.value)
                 parts = f"{value} // {BILLION}, {value} % {BILLION}" if len(codes) == 2 else value
                 packed = f"{self._module.struct('<' + codes, 'pack')}({parts})"
-                lines.add(f"if {write.flag}: m.patch({spot(write.at)}, {packed})")
+                lines.add(f"if {write.flag}: m.patch({spot(write.at)}, {packed}, {write.flag})")
         if spliced:
             lines.add(f"if {node.name}: m.splice({node.name})")
 
@@ -319,8 +323,16 @@ class Printer:
         return node.name
 
     def _assign(self, node: form.Assign) -> str:
-        self._acts += node.name in self._flags
-        return f"({node.name} := {self.text(node.value)})"
+        return f"({node.name} := {self._assigned(node)})"
+
+    def _assigned(self, node: form.Assign) -> str:
+        """The value; of the flag of a field, which gets another value: the sites that have assigned to it, as bits."""
+        if node.name not in self._flags or _constant(node.value) is not True:
+            return self.text(node.value)
+        self._acts += 1
+        if self._site not in self._marks:
+            self._marks.append(self._site)
+        return f"{node.name} | {1 << self._marks.index(self._site)}"
 
     def _convert(self, node: form.Convert) -> str:
         return converted(self.text(node.value), node.value.type, node.type)

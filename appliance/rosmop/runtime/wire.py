@@ -115,8 +115,9 @@ class Message:
     """The message that events look at: its bytes as changed so far, and what has become of it.
 
     Numbers are written where they stand, and only the bytes that were there are kept: a picture of a camera is not
-    copied for a changed stamp. `touched` is set by every write of other bytes than were there; cleared after each
-    event, it says which event wrote. `cause` is the site of the statement that dropped it.
+    copied for a changed stamp. `touched` has bits of every write of other bytes than were there; cleared after each
+    event, it says whether the event wrote, and by which of its statements at the sites `marks`. `cause` is the site of
+    the statement that dropped it.
     """
 
     __slots__ = (
@@ -124,6 +125,7 @@ class Message:
         "buffer",
         "cause",
         "dropped",
+        "marks",
         "past",
         "time",
         "touched",
@@ -137,7 +139,8 @@ class Message:
         self._replaced: bytes | None = None  # the bytes as received, once the buffer is another
         self.dropped = False
         self.cause: int | None = None
-        self.touched = False
+        self.touched = 0
+        self.marks: Sequence[int] = ()
         self.past: tuple[int, int, int] | None = None  # an index was past the end: site, index, elements
 
     @property
@@ -159,13 +162,13 @@ class Message:
         """Where the buffer that came in had other bytes, and which, in order."""
         return self.written or ()
 
-    def patch(self, start: int, new: bytes) -> None:
-        """Put bytes in the place of as many."""
+    def patch(self, start: int, new: bytes, by: int = 1) -> None:
+        """Put bytes in the place of as many; `by` are the bits that `touched` gets if they are others."""
         end = start + len(new)
         old = self.buffer[start:end]
         if old == new:
             return
-        self.touched = True
+        self.touched |= by
         if self._replaced is None:
             if self.written is None:
                 self.written = []
@@ -176,18 +179,18 @@ class Message:
             self.written.append((start, bytes(old)))
         self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
 
-    def splice(self, edits: list[tuple[int, int, bytes]]) -> None:
-        """Put bytes in the place of those from the first to before the second number, for every edit."""
-        if all(len(new) == end - start for start, end, new in edits):
-            for start, _, new in edits:
-                self.patch(start, new)
+    def splice(self, edits: list[tuple[int, int, bytes, int]]) -> None:
+        """Put bytes in the place of those from the first to before the second number, for every edit; see `patch`."""
+        if all(len(new) == end - start for start, end, new, _ in edits):
+            for start, _, new, by in edits:
+                self.patch(start, new, by)
             return
         if self._replaced is None:
             self._replaced = self._original()
-        self.touched = True  # an encoding says how long it is, so one of another length has other bytes
         pieces = []
         last = 0
-        for start, end, new in sorted(edits):
+        for start, end, new, by in sorted(edits):
+            self.touched |= by if self.buffer[start:end] != new else 0
             pieces += [bytes(self.buffer[last:start]), new]
             last = end
         pieces.append(bytes(self.buffer[last:]))

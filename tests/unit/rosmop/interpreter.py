@@ -308,7 +308,7 @@ class Interpreter:
             if write.end is None:
                 patched.append((start, bytes(out)))
             else:
-                spliced.append((start, frame.variables[write.end], bytes(out)))
+                spliced.append((start, frame.variables[write.end], bytes(out), 1))
         for start, new in patched:
             message.patch(start, new)
         if spliced:

@@ -155,6 +155,46 @@ def test_a_change_is_by_the_events_that_made_the_bytes_others(
     assert (outcome.result, list(outcome.changed_by)) == (result, changed_by)
 
 
+ASSIGNS = """a() {
+    void twice(double& v) {
+        v = v * 2; }
+    event e(double x, double y, std::vector<double> c, std::string f) /p geometry_msgs/PoseWithCovarianceStamped
+        '{header:{frame_id:f}, pose:{pose:{position:{x:x, y:y}}, covariance:c}}' {
+        if (x < 0) {
+            x = 0; }
+        if (x > 1) {
+            x = 1;
+            y = y + (x = 0.5); }
+        c[0] = 7;
+        c[1] = x;
+        f = f + f;
+        twice(y); }
+}
+b() { event e(double x) /p geometry_msgs/PoseWithCovarianceStamped '{pose:{pose:{position:{x:x}}}}' {
+    x = x + 0; } }"""
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "frame", "lines"),
+    [
+        (-1.0, 0.0, "", [7, 11, 12]),
+        (5.0, 1.0, "map", [9, 10, 11, 12, 13, 14]),
+        (0.5, 3.0, "", [11, 12, 14]),
+        (0.0, 0.0, "", [11, 12]),
+    ],
+)
+def test_a_change_stands_where_the_changed_fields_were_assigned(
+    x: float, y: float, frame: str, lines: list[int]
+) -> None:
+    """Every statement that assigned to a field whose bytes are others, also as part of another, or by a function."""
+    monitors = MonitorSet.load({"x.rv": ASSIGNS}, definitions())
+    monitors.start(0)
+    kind = "geometry_msgs/PoseWithCovarianceStamped"
+    body = message(kind, header__frame_id=frame, pose__pose__position__x=x, pose__pose__position__y=y)
+    outcome = monitors.process("/p", bytearray(body), 0)
+    assert [one.line for one in outcome.changed_at] == lines
+
+
 DROPS = {
     "the event itself": ("a() {" + on("/t", "e", "x = 9;") + "} b() {" + on("/t", "e", "return;") + "}", "b", None),
     "a handler": ("a() {" + on("/t") + "} b() {" + on("/t") + "ere: e @match { DROP; } } c() {" + on("/t") + "}", "b", None),

@@ -273,7 +273,7 @@ OUTCOMES = {
         f"m() {{ int zero = 0; init() {{ zero = 1 / zero; }} {B} {{ }} }}", given("b1"), "drop", STICK, "m()", [], {}
     ),
     "a change": Row(
-        f"m() {{ {B} {WHEN} {{ if (b == 7) {{ b = 1; }} }} }}", given("b7"), "change", STICK, "event b", [],
+        f"m() {{ {B} {WHEN} {{ if (b == 7) {{ b = 1; }} }} }}", given("b7"), "change", STICK, "b = 1", [],
         {"b > 2": {"b": 7}, "b == 7": {"b": 7}},
     ),
     "a publication": Row(
@@ -335,11 +335,11 @@ OUTCOMES = {
         {"ok) { D": {"ok": True}},
     ),
     "a request that is changed": Row(
-        f"m() {{ {ASK} {{ if (on) {{ on = false; }} }} }}", given("q1"), "change", "/client", "event q", [],
+        f"m() {{ {ASK} {{ if (on) {{ on = false; }} }} }}", given("q1"), "change", "/client", "on = false", [],
         {"on) { o": {"on": True}},
     ),
     "a reply that is changed": Row(
-        f"m() {{ {REPLY} {{ if (ok) {{ ok = false; }} }} }}", given("r1"), "change", "/server", "event r", [],
+        f"m() {{ {REPLY} {{ if (ok) {{ ok = false; }} }} }}", given("r1"), "change", "/server", "ok = false", [],
         {"ok) { o": {"ok": True}},
     ),
     "a fault of a request": Row(

@@ -66,7 +66,7 @@ def test_a_change_is_recorded_under_the_monitor_that_made_it(told: Told) -> None
         "events": ["stop.drive", "turn.drive", "look.drive", "look.on"],
         "changed_by": ["stop.drive"],
         "number": 1,
-        "at": ["0.rv:1:30"],
+        "at": ["0.rv:2:18"],
         "conditions": {"0.rv:2:9": {"v": 5.0}},
     }
     assert told.counts() == {"stop": (0, 1), "turn": (0, 0), "look": (0, 0)}

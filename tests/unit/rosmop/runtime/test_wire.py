@@ -25,8 +25,8 @@ def test_what_is_written_as_it_was_touches_nothing() -> None:
     message = Message(bytearray(b"abcdef"), 0)
     found = []
     for start, end, new in ((1, 3, b"bc"), (1, 3, b"bx"), (0, 2, b"abc"), (0, 3, b"abc"), (0, 1, b"z")):
-        message.touched = False
-        message.splice([(start, end, new)])
+        message.touched = 0
+        message.splice([(start, end, new, 1)])
         found.append(message.touched)
     assert found == [False, True, True, False, True]
 
@@ -64,7 +64,7 @@ def test_patches_and_splices_agree_with_a_copy(seed: int) -> None:
             message.patch(start, new)
         else:
             new = bytes(random.choices(b"ab", k=random.randint(0, 4)))
-            message.splice([(start, end, new)])
+            message.splice([(start, end, new, 1)])
         copy[start:end] = new
         if not copy:
             break
