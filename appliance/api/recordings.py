@@ -153,7 +153,7 @@ def _add_bag(router: Routes, services: Services) -> None:
         """The messages of a recording, for investigators; it is recorded who fetched them."""
         give_back = services.exports.take(bearer, peer_of(request), "exports")
         try:
-            return Held(await _bag(services, recording_id, bearer, mcap=format == "mcap"), give_back)
+            return Held(await bag_response(services, recording_id, bearer, mcap=format == "mcap"), give_back)
         except BaseException:
             give_back()
             raise
@@ -221,13 +221,15 @@ def _add_reading(router: Routes, services: Services) -> None:
         )
 
 
-async def _bag(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:
+async def bag_response(services: Services, recording_id: str, bearer: Bearer, *, mcap: bool) -> Response:
     """The file, once it is on record who fetches it."""
     found = answered(await services.control.ask(admin.RecordingFetch(recording_id), bearer, _SLOW_SECONDS))
-    path = _bag_of(services, found.id)
-    if not await asyncio.to_thread(path.is_file):
-        raise _gone(found.id)
-    pieces = as_mcap(path) if mcap else _pieces_of(path)
+    try:  # open before it is answered: what is removed from now on is sent to its end
+        pieces = await asyncio.to_thread(as_mcap if mcap else _pieces_of, _bag_of(services, found.id))
+    except FileNotFoundError:
+        raise _gone(found.id) from None
+    except (OSError, ValueError) as error:
+        raise ProblemError(503, "not-available", f"the bag of {found.id} cannot be read: {error}") from error
     name = f"rosrv-{found.id}.{'mcap' if mcap else 'bag'}"
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
     if not mcap:
@@ -248,6 +250,10 @@ def _moment(moment: str | int | None) -> int | None:
 
 
 def _pieces_of(path: FilePath) -> Iterator[bytes]:
-    with path.open("rb") as bag:
-        while piece := bag.read(_PIECE):
-            yield piece
+    bag = path.open("rb")
+
+    def pieces() -> Iterator[bytes]:
+        with bag:
+            yield from iter(lambda: bag.read(_PIECE), b"")
+
+    return pieces()

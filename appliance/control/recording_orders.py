@@ -4,6 +4,7 @@ import asyncio
 import itertools
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from appliance.audit.record import Severity
@@ -11,9 +12,10 @@ from appliance.audit_trail import AuditTrail
 from appliance.channel import admin, messages
 from appliance.channel.answers.recordings import Recording, RecordingBegun, Recordings, Trigger
 from appliance.channel.answers.status import RecorderState
-from appliance.channel.channel import Channel
+from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.config import RecorderRules
 from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.recorder.shelf import MOST_LENT
 
 _PATIENCE_SECONDS = 10.0
 _LONGEST_NOTE = 300
@@ -42,10 +44,11 @@ class RecordingOrders:
         self._in_force = in_force
         self._channel: Channel | None = None
         self._kept: dict[str, Recording] = {}
-        self._lent: dict[str, Recording] = {}  # the last one of the memory
+        self._lent: dict[str, Recording] = {}  # the last ones of the memory
         self._begun: str | None = None  # the id of the one that is being made, if somebody was told it
         self._numbers = itertools.count(1)
         self._asked: dict[int, asyncio.Future[_Answer]] = {}
+        self._notes: set[asyncio.Future[None]] = set()
 
     def attach(self, channel: Channel) -> None:
         """A recorder is there."""
@@ -186,7 +189,7 @@ class RecordingOrders:
         trigger = Trigger(now, "order", record, f"{who}: of what is in memory")
         answer = await self._ask(lambda number: messages.MemoryWanted(number, trigger, since, until))
         assert isinstance(answer, messages.MemoryLent)  # noqa: S101  what this order is answered with
-        self._lent = {answer.recording.id: answer.recording}
+        self._lent = dict([*self._lent.items(), (answer.recording.id, answer.recording)][-MOST_LENT:])
         return answer.recording
 
     async def remove(self, request: admin.RecordingRemove, who: str) -> Recording:
@@ -242,7 +245,7 @@ class RecordingOrders:
             case messages.RecordingClosed(recording):
                 self._begun = None
                 self._closed(recording)
-                channel.send(messages.RecordingNoted(recording.id))
+                self._note(channel, recording.id)
             case messages.RecordingMissed(trigger, reason):
                 self._begun = None
                 self._trail.happened(
@@ -262,12 +265,25 @@ class RecordingOrders:
                     sha256=recording.sha256,
                     who=who or "recorder",
                 )
+                self._note(channel, recording.id)
                 self._answered(message)
             case messages.RecordingBegun(_number, recording_id):
                 self._begun = recording_id
                 self._answered(message)
             case messages.MemoryLent() | messages.RecordingRefused():
                 self._answered(message)
+
+    def _note(self, channel: Channel, recording_id: str) -> None:
+        """Have the recorder know, once it is on disk, that the audit log has what it told of a recording."""
+
+        async def note() -> None:
+            if await self._trail.durable() is None:
+                with suppress(ChannelClosedError, ChannelFullError):
+                    channel.send(messages.RecordingNoted(recording_id))
+
+        task = asyncio.ensure_future(note())
+        self._notes.add(task)
+        task.add_done_callback(self._notes.discard)
 
     def _answered(self, message: _Answer) -> None:
         future = self._asked.get(message.number)

@@ -6,13 +6,15 @@ know of them it reads back from the file, so all there is to keep between two li
 connections. Format: http://wiki.ros.org/Bags/Format/2.0.
 """
 
+import os
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 MAGIC = b"#ROSBAG V2.0\n"
 _HEAD_SIZE = 4096
+_FIRST = len(MAGIC) + _HEAD_SIZE
 _U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = (bytes([op]) for op in (2, 3, 4, 5, 6, 7))
 INDEX_ENTRY = struct.Struct("<III")
@@ -34,11 +36,13 @@ class BagWriter:
     def __init__(self, path: Path, connections: Mapping[int, Mapping[str, str]], size: int = 0) -> None:
         """`connections` are the headers of those that the first `size` bytes have."""
         self._connections = dict(connections)
-        self._file: BinaryIO = path.open("r+b" if size else "w+b")
-        if size:
-            self._file.truncate(size)
-            self._file.seek(size)
-        else:
+        self._file: BinaryIO = path.open("r+b" if size and path.exists() else "w+b")
+        whole = self._whole(size)
+        self.lost = whole < size
+        """Whether some of these bytes are not there: after a power cut."""
+        self._file.truncate(whole)
+        self._file.seek(whole)
+        if not whole:
             self._file.write(MAGIC + _bag_header(0, 0, 0))
 
     def connect(self, header: Mapping[str, str]) -> int:
@@ -94,22 +98,39 @@ class BagWriter:
             _fields({name: value.encode("utf-8", "surrogateescape") for name, value in header.items()}),
         )
 
-    def _chunk_infos(self, end: int) -> list[bytes]:
-        """A record for each chunk: where it is, its time, and how many messages of which connection it has."""
-        chunks: list[tuple[int, list[tuple[int, int]], list[tuple[int, int]]]] = []
-        at = len(MAGIC) + _HEAD_SIZE
+    def _whole(self, size: int) -> int:
+        """How many of the first bytes are chunks with all their indexes."""
+        whole, at, there = 0, _FIRST, self._file.seek(0, os.SEEK_END)
+        try:
+            for place, fields, length in self._records(min(size, there)):
+                if fields["op"] == CHUNK:
+                    whole = place
+                at = self._file.tell() + length
+        except (struct.error, ValueError, LookupError):
+            return whole
+        return size if at == size <= there else whole
+
+    def _records(self, end: int) -> Iterator[tuple[int, dict[str, bytes], int]]:
+        """The place of each record, its fields, and the length of its data, which begins where the file stands."""
+        at = _FIRST
         while at < end:
             self._file.seek(at)
             fields = read_fields(self._file)
             size = _U32.unpack(self._file.read(4))[0]
+            following = self._file.tell() + size
+            yield at, fields, size
+            at = following
+
+    def _chunk_infos(self, end: int) -> list[bytes]:
+        """A record for each chunk: where it is, its time, and how many messages of which connection it has."""
+        chunks: list[tuple[int, list[tuple[int, int]], list[tuple[int, int]]]] = []
+        for at, fields, size in self._records(end):
             if fields["op"] == CHUNK:
                 chunks.append((at, [], []))
             else:
                 times = [(entry[0], entry[1]) for entry in INDEX_ENTRY.iter_unpack(self._file.read(size))]
-                self._file.seek(-size, 1)
                 chunks[-1][1].append((_U32.unpack(fields["conn"])[0], len(times)))
                 chunks[-1][2].extend((min(times), max(times)))
-            at = self._file.tell() + size
         # `rosbag info` takes the beginning from the first and the end from the last.
         last = max((max(times) for _place, _counts, times in chunks), default=None)
         chunks.sort(key=lambda chunk: (max(chunk[2]) == last, min(chunk[2])))

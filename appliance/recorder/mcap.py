@@ -7,6 +7,7 @@ times, in chunks that are not compressed; each has its index, and the summary at
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 
 from appliance.recorder.bag_reader import BagReader
@@ -20,8 +21,16 @@ _OF_SENDER = ("md5sum", "callerid", "host", "latching")
 
 
 def as_mcap(bag: Path) -> Iterator[bytes]:
-    """The pieces of the MCAP file. Raises `OSError`, and `ValueError` for no good bag."""
-    with BagReader.of(bag) as reader:
+    """The pieces of the MCAP file, of a bag that is open from now on, so that it may be removed meanwhile.
+
+    Raises `OSError`, and `ValueError` for no good bag, both also while it is read.
+    """
+    opened = ExitStack()
+    return _pieces(opened, opened.enter_context(BagReader.of(bag)))
+
+
+def _pieces(opened: ExitStack, reader: BagReader) -> Iterator[bytes]:
+    with opened:
         writer = _Writer(reader.connections)
         head = _MAGIC + _record(_HEADER, _text("ros1"), _text("rosrv"))
         yield head

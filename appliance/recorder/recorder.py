@@ -34,7 +34,7 @@ from appliance.recorder.recording import (
     RecordingInProgress,
     load_progress,
 )
-from appliance.recorder.shelf import Shelf
+from appliance.recorder.shelf import MOST_LENT, Shelf
 from appliance.recorder.triggers import HourlyLimit, trigger_of
 
 SETTLE_SECONDS = 0.5
@@ -85,7 +85,12 @@ class Recorder:
     def step(self, said: Iterable[Any] = ()) -> list[messages.Message]:
         """Obey what control has said, follow the log, go on with the recording; what control is to be told."""
         for message in said:
-            self._obey(message)
+            try:
+                self._obey(message)
+            except OSError as error:
+                _log.error(
+                    "what control said cannot be done", order=type(message).__name__, reason=str(error)
+                )
         try:
             for trigger in self._new_triggers():
                 self._triggered(trigger)
@@ -115,6 +120,7 @@ class Recorder:
             case messages.RecordingsAsked():
                 self._answers.append(messages.RecordingsStated(list(self._shelf.recordings)))
                 self._answers += [messages.RecordingClosed(found) for found in self._shelf.unnoted()]
+                self._answers += [messages.RecordingRemoved(0, *removed) for removed in self._shelf.removed()]
                 self._answers.append(messages.RevisionsWanted())
             case messages.RevisionsStated():
                 self._revisions = message
@@ -155,13 +161,17 @@ class Recorder:
             return
         progress = Progress(self._ids.next(), self._memory, since, until, [wanted.trigger])
         try:
+            if not self._shelf.can_lend(now):
+                reason = f"others asked for it {MOST_LENT} times within seconds: try again in half a minute"
+                self._answers.append(messages.RecordingRefused(wanted.number, reason))
+                return
             lent = self._in_progress(progress)
             self._shelf.mark_lent(progress.id)
             lent.step()
             recording = lent.finish((), self._revisions)
             self._shelf.lend(recording)
         except OSError as error:
-            shutil.rmtree(self._shelf.part(progress.id), ignore_errors=True)
+            self._shelf.discard_part(progress.id)
             self._answers.append(messages.RecordingRefused(wanted.number, str(error)))
         else:
             self._answers.append(messages.MemoryLent(wanted.number, recording))
@@ -173,7 +183,7 @@ class Recorder:
             self._answers.append(refused)
             return
         try:
-            self._shelf.remove(recording)
+            self._shelf.remove(recording, who, "")
         except OSError as error:
             self._answers.append(messages.RecordingRefused(number, str(error)))
         else:
@@ -292,7 +302,7 @@ class Recorder:
         if self._making is not None:
             self._making.leave()
             progress = self._making.progress
-            shutil.rmtree(self._shelf.part(progress.id), ignore_errors=True)
+            self._shelf.discard_part(progress.id)
             self._making, self._revisions_asked = None, False
             self._answers.append(messages.RecordingMissed(progress.triggers[0], str(error)))
 
@@ -305,13 +315,13 @@ class Recorder:
                 _log.warning("a recording that had only been begun is removed", folder=folder.name)
                 shutil.rmtree(folder)
                 continue
-            if progress.memory == self._memory and self._making is None:
-                self._making = self._in_progress(progress)
-                _log.warning("a recording that was begun goes on", recording=progress.id)
-                continue
-            progress.why_not = "the appliance ended while it was made"
-            _log.warning("a recording that was begun is finished without its end", recording=progress.id)
             try:
+                if progress.memory == self._memory and self._making is None:
+                    self._making = self._in_progress(progress)
+                    _log.warning("a recording that was begun goes on", recording=progress.id)
+                    continue
+                progress.why_not = "the appliance ended while it was made"
+                _log.warning("a recording that was begun is finished without its end", recording=progress.id)
                 self._finish(RecordingInProgress(folder, progress, (), largest=self._shelf.largest))
             except OSError as error:
                 _log.error("it cannot be finished; the next start tries again", reason=str(error))
@@ -319,7 +329,7 @@ class Recorder:
     def _remove_surplus(self, *, room: bool) -> None:
         try:
             for recording, reason in self._shelf.surplus(self._clock(), room=room):
-                self._shelf.remove(recording)
+                self._shelf.remove(recording, "", reason)
                 self._answers.append(messages.RecordingRemoved(0, recording, "", reason))
         except OSError as error:
             _log.error("a recording cannot be removed", reason=str(error))

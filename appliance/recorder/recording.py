@@ -92,6 +92,8 @@ class RecordingInProgress:
         self._folder = folder
         self._largest = largest
         self._bag = BagWriter(folder / BAG, dict(enumerate(progress.connections)), progress.size)
+        if self._bag.lost:
+            progress.why_not = progress.why_not or "the disk lost what was written last"
         self._numbers = {_key(header): number for number, header in enumerate(progress.connections)}
         self._headers = sum(map(_length, progress.connections))
         self._topics = {(row.topic, row.type, row.md5sum): row for row in progress.topics}

@@ -1,5 +1,7 @@
 """The recordings that are kept: `ID/recording.bag` and `ID/recording.json`, and what was begun as `.ID.part/`.
 
+What is removed is `.ID.gone/` until the audit log has that, without its bag; `.ID.rest/` is nothing any more.
+
 Invariants:
 
 1. A folder with the name of a recording is whole: it gets that name when all that is in it is on disk.
@@ -7,15 +9,19 @@ Invariants:
    of trigger whose recordings have most of it, the oldest goes: who causes many loses none of others. So it does where
    their descriptions have more than `_MOST_DESCRIBED` bytes, for control is told of all of them in one message.
 3. `noted` in a folder says that the audit log has the recording; what was not noted is told again.
-4. `lent` in a folder says that it is no recording that is kept: there is one at most, which goes with the next, and
-   a recorder that begins removes it, also where the one before fell while it was made. It is not counted: beside what
-   `disk` says there may be one recording's share for `LENT_SECONDS`.
+4. `lent` in a folder says that it is no recording that is kept: there are `MOST_LENT` at most, of which the oldest goes
+   with the next, but not while who asked for it may be about to open it (`_OPENING_SECONDS`), and a recorder that
+   begins removes them, also where the one before fell while one was made. They are not counted: beside what `disk`
+   says there may be as many recordings' shares for `LENT_SECONDS`.
+5. Whenever the recorder falls, a recording is there, or it is gone and that is told: of a folder that has the name of a
+   recording nothing is removed; it loses its name first, at once.
 """
 
 import re
 import shutil
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -26,11 +32,14 @@ from appliance.channel.answers.recordings import Recording
 BAG, ABOUT, PROGRESS = "recording.bag", "recording.json", "progress"
 MOST_KEPT = 500
 LENT_SECONDS = 600
+MOST_LENT = 4
+_OPENING_SECONDS = 30
 _MOST_DESCRIBED = 32 << 20
-_NOTED, _LENT = "noted", "lent"
+_NOTED, _LENT, _REMOVED = "noted", "lent", "removed"
 _ID = re.compile(r"[0-9a-f]{20}")
-_PART = re.compile(r"\.([0-9a-f]{20})\.part")
+_PART, _GONE, _REST = (re.compile(rf"\.([0-9a-f]{{20}})\.{kind}") for kind in ("part", "gone", "rest"))
 _LARGEST = 8  # the part of `disk` that one recording may have
+_SECOND = 1_000_000_000
 _log = structlog.get_logger()
 
 
@@ -42,8 +51,12 @@ class Shelf:
         self._disk = disk
         self._seconds = seconds
         for mark in folder.glob(f"*/{_LENT}"):
-            shutil.rmtree(mark.parent)
-        self._lent: Recording | None = None
+            self._discard(mark.parent)
+        for rest in self._named(_REST):
+            shutil.rmtree(rest)
+        for gone in self._named(_GONE):
+            (gone / BAG).unlink(missing_ok=True)
+        self._lent: list[Recording] = []
         self.recordings = sorted(self._read(), key=lambda recording: recording.id)
         self._described = {found.id: self._length(found) for found in self.recordings}
 
@@ -74,7 +87,21 @@ class Shelf:
 
     def parts(self) -> list[Path]:
         """Those that were begun and not finished, the oldest first."""
-        return sorted(path for path in self._folder.iterdir() if _PART.fullmatch(path.name))
+        return self._named(_PART)
+
+    def _named(self, kind: re.Pattern[str]) -> list[Path]:
+        return sorted(path for path in self._folder.iterdir() if kind.fullmatch(path.name))
+
+    def _discard(self, folder: Path) -> None:
+        """Nothing of it is there any more, or nothing of it counts. Raises `OSError`."""
+        rest = self._folder / f".{folder.name.strip('.')[:20]}.rest"
+        folder.rename(rest)
+        shutil.rmtree(rest)
+
+    def discard_part(self, recording_id: str) -> None:
+        """Take away what was begun of a recording, if anything was."""
+        with suppress(OSError):
+            self._discard(self.part(recording_id))
 
     def keep(self, recording: Recording) -> None:
         """A recording is whole, and all of it on disk; only what has no name yet needs `progress`."""
@@ -88,31 +115,60 @@ class Shelf:
         """What is made in its folder is not to be kept. Raises `OSError`."""
         (self.part(recording_id) / _LENT).touch()
 
-    def lend(self, recording: Recording) -> None:
-        """One that is not kept can be read until there is another, or for `LENT_SECONDS`. Raises `OSError`."""
-        self._take_back()
-        self.part(recording.id).rename(self._folder / recording.id)
-        self._lent = recording
+    def can_lend(self, now: int) -> bool:
+        """Make room for one that is not kept; False while all that there may be are about to be opened.
 
-    def _take_back(self) -> None:
-        if self._lent is not None:
-            shutil.rmtree(self._folder / self._lent.id)
-            self._lent = None
+        Raises `OSError`.
+        """
+        self._take_back(now, MOST_LENT - 1, _OPENING_SECONDS)
+        return len(self._lent) < MOST_LENT
+
+    def lend(self, recording: Recording) -> None:
+        """One that is not kept can be read for `LENT_SECONDS`, or until others need its place. Raises `OSError`."""
+        self.part(recording.id).rename(self._folder / recording.id)
+        self._lent.append(recording)
+
+    def _take_back(self, now: int, most: int, seconds: float) -> None:
+        """Of those that were lent longer ago the oldest go, until there are so many."""
+        while len(self._lent) > most and abs(now - self._lent[0].triggers[0].time) > seconds * _SECOND:
+            self._discard(self._folder / self._lent[0].id)
+            del self._lent[0]
 
     def find(self, recording_id: str) -> Recording | None:
         """The recording of this id; None when there is none."""
         return next((found for found in self.recordings if found.id == recording_id), None)
 
-    def remove(self, recording: Recording) -> None:
-        """Take a recording away. Raises `OSError`."""
-        shutil.rmtree(self._folder / recording.id)
+    def remove(self, recording: Recording, who: str, reason: str) -> None:
+        """Take a recording away, for somebody or for a reason. Raises `OSError`."""
+        kept, gone = self._folder / recording.id, self._gone(recording.id)
+        with suppress(OSError):  # a full disk, which is when recordings have to go
+            (kept / _REMOVED).write_bytes(msgspec.json.encode((who, reason)))
+        kept.rename(gone)
         self.recordings.remove(recording)
         del self._described[recording.id]
+        (gone / BAG).unlink(missing_ok=True)
+
+    def _gone(self, recording_id: str) -> Path:
+        return self._folder / f".{recording_id}.gone"
+
+    def removed(self) -> Iterator[tuple[Recording, str, str]]:
+        """Those that were removed, for whom and why, and of which it is not known whether the audit log has that."""
+        for folder in self._named(_GONE):
+            try:
+                recording = msgspec.json.decode((folder / ABOUT).read_bytes(), type=Recording)
+            except (OSError, msgspec.MsgspecError):
+                continue
+            who, reason = "", "the recorder fell meanwhile"
+            with suppress(OSError, msgspec.MsgspecError):
+                who, reason = msgspec.json.decode((folder / _REMOVED).read_bytes(), type=tuple[str, str])
+            yield recording, who, reason
 
     def note(self, recording_id: str) -> None:
-        """The audit log has it."""
+        """The audit log has it: that there is this recording, or that it was removed. Raises `OSError`."""
         if self.find(recording_id) is not None:
             (self._folder / recording_id / _NOTED).touch()
+        elif self._gone(recording_id).exists():
+            self._discard(self._gone(recording_id))
 
     def unnoted(self) -> list[Recording]:
         """Those of which it is not known whether the audit log has them."""
@@ -123,8 +179,7 @@ class Shelf:
 
         Each is to be removed before the next is asked for. What was lent for long enough goes, too. Raises `OSError`.
         """
-        if self._lent is not None and self._lent.triggers[0].time + LENT_SECONDS * 1_000_000_000 < now:
-            self._take_back()
+        self._take_back(now, 0, LENT_SECONDS)
         while self._seconds is not None and self.recordings:
             oldest = self.recordings[0]
             if oldest.ended + int(self._seconds * 1e9) > now:

@@ -49,7 +49,7 @@ class RecordingClosed(Message):
 
 
 class RecordingNoted(Message):
-    """Control has made an audit record of a recording."""
+    """Control has made an audit record of a recording, or of its removal."""
 
     id: str
 
@@ -80,7 +80,10 @@ class RecordingRemovalWanted(Message):
 
 
 class RecordingRemoved(Message):
-    """A recording is gone: for `who` (then `number` is that of the order), or because of `reason`."""
+    """A recording is gone: for `who` (then `number` is that of the order), or because of `reason`.
+
+    Told again until control has noted it.
+    """
 
     number: int
     recording: Recording
@@ -98,7 +101,7 @@ class MemoryWanted(Message):
 
 
 class MemoryLent(Message):
-    """What was asked for as `number` can be read as `recording`, which goes by itself or with the next one."""
+    """What was asked for as `number` can be read as `recording`, which goes by itself or for later ones."""
 
     number: int
     recording: Recording

@@ -3,7 +3,7 @@
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
@@ -75,6 +75,7 @@ def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
 def pieces_of(appliance: Appliance, known: Recordings, span: Span, *, as_json: bool) -> Iterator[list[Piece]]:
     """The recordings of this time and what is in memory, the oldest first; each is fetched, which is on record.
 
+    They are open until the end: what is removed meanwhile can be read all the same.
     Ends the program with 1 when there is nothing, or when the appliance refuses.
     """
     found: list[tuple[Span, Recording]] = []
@@ -92,11 +93,18 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span, *, as_json: b
         parts = (Span(max(gap.since, lent.began), min(gap.until, lent.ended)) for gap in missing)
         found += [(part, lent) for part in parts if part.since <= part.until]
     pieces: list[Piece] = []
-    with tempfile.TemporaryDirectory(prefix="rosrv-replay-") as folder:
+    with tempfile.TemporaryDirectory(prefix="rosrv-replay-") as folder, ExitStack() as opened:
         bags: dict[str, Path] = {}
         for part, row in sorted(found, key=lambda one: one[0]):
             if row.id not in bags:
-                bags[row.id] = bag_of(appliance, row.id, Path(folder) / row.id, as_json=as_json)
+                bag = bag_of(appliance, row.id, Path(folder) / row.id, as_json=as_json)
+                try:
+                    file = opened.enter_context(bag.open("rb"))
+                except OSError as error:
+                    raise usage_error(
+                        f"the bag of {row.id} is not there any more: {error.strerror}"
+                    ) from None
+                bags[row.id] = Path(f"/proc/self/fd/{file.fileno()}")
             pieces.append(Piece("memory" if row is lent else row.id, bags[row.id], part, row.why_not))
         if not pieces:
             text = f"nothing is recorded of {span}: {_there(known.recordings)}"

@@ -15,6 +15,7 @@ from appliance.channel.channel import Channel
 from appliance.config import RecorderRules
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.recording_orders import RecorderAwayError, RecordingOrders
+from appliance.recorder.shelf import MOST_LENT
 
 KEPT = Recording(
     "a" * 20, 1, 2, [Trigger(1, "drop", "r", "t")], [], 1, 1, 300, "5a", complete=True, why_not=""
@@ -148,6 +149,13 @@ def test_what_is_closed_is_recorded_noted_and_listed() -> None:
         recorder.send(messages.RecordingRemoved(0, KEPT, "", "recorder.disk is used up"))
         await told(scene, lambda: len(scene.trail.events) == 2)
         assert scene.trail.events[1][1]["who"] == "recorder"
+        await told(scene, lambda: len(heard) == 3)
+        assert heard[2] == messages.RecordingNoted(KEPT.id)
+        scene.trail.failure = "no space left on device"
+        recorder.send(messages.RecordingClosed(KEPT))
+        recorder.send(messages.RevisionsWanted())
+        await told(scene, lambda: len(heard) == 4)
+        assert heard[3] == messages.RevisionsStated(4, 2)  # what is on no disk is told again
         with pytest.raises(UnknownThingError, match="no recording"):
             await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve")
         recorder.close()
@@ -225,8 +233,8 @@ def test_who_waits_for_a_recorder_that_dies_is_told() -> None:
 
 
 def test_what_is_in_memory_can_be_fetched_and_is_not_listed() -> None:
-    """Who asked and who fetched is on record; the next one takes its place."""
-    lent = iter([msgspec.structs.replace(KEPT, id=letter * 20) for letter in "cd"])
+    """Who asked and who fetched is on record; the next ones leave it there for a while."""
+    lent = iter([msgspec.structs.replace(KEPT, id=letter * 20) for letter in "bcdef"])
 
     def answer(message: Any) -> list[messages.Message]:
         if not isinstance(message, messages.MemoryWanted):
@@ -245,7 +253,9 @@ def test_what_is_in_memory_can_be_fetched_and_is_not_listed() -> None:
         ]
         known = await scene.orders.recordings(admin.RecordingsWanted())
         assert (known.recordings, known.topics, known.before) == ([], ["/*"], 60)
-        await scene.orders.of_memory(admin.RecordingOfMemory(since=7), "eve")
+        for _other in range(MOST_LENT):
+            assert await scene.orders.fetch(admin.RecordingFetch(first.id), "eve") == first
+            await scene.orders.of_memory(admin.RecordingOfMemory(since=7), "eve")
         with pytest.raises(UnknownThingError):
             await scene.orders.fetch(admin.RecordingFetch(first.id), "eve")
         recorder.close()

@@ -60,6 +60,37 @@ def test_another_writer_goes_on(tmp_path: Path, torn: int) -> None:
     assert [data for _topic, _time, data in read(path)] == [body(b"one"), body(b"two"), body(b"three")]
 
 
+def test_what_a_power_cut_took_is_left_out_and_said(tmp_path: Path) -> None:
+    """However many bytes are there of what had been written: whole chunks stay, all but the last; more can follow."""
+    path, whole, headers = (
+        tmp_path / "cut.bag",
+        tmp_path / "whole.bag",
+        [HEADER, HEADER | {"topic": "/other"}],
+    )
+    bag = BagWriter(whole, {})
+    numbers = [bag.connect(header) for header in headers]
+    sizes = [
+        bag.write([Message(number, (2 * chunk + number) * SECOND, body(b"x")) for number in numbers])
+        for chunk in range(3)
+    ]
+    bag.leave()
+    data = whole.read_bytes()
+    for length in [0, 20, *range(sizes[0] - 300, len(data), 5), *sizes]:
+        path.write_bytes(data[:length])
+        bag = BagWriter(path, dict(enumerate(headers)), sizes[-1])
+        assert bag.lost is (length < len(data))
+        bag.write([Message(0, 9 * SECOND, body(b"y"))])
+        bag.close()
+        times = [time // SECOND for _topic, time, _data in read(path)]
+        assert times == [*range(len(times) - 1), 9]
+        assert len(times) % 2
+        assert len(times) // 2 >= sum(size <= length for size in sizes) - bag.lost
+    path.unlink()
+    bag = BagWriter(path, {}, sizes[-1])
+    assert bag.lost
+    bag.close()
+
+
 def test_stock_tools_find_beginning_and_end(tmp_path: Path) -> None:
     """They take them from the first chunk and the last, in whatever order of times chunks were written."""
     bag = BagWriter(tmp_path / "a.bag", {})

@@ -19,7 +19,7 @@ from appliance.config import RecorderRules
 from appliance.recorder.recorder import SETTLE_SECONDS, Recorder
 from appliance.recorder.recording import RecordingInProgress
 from appliance.recorder.ring import SMALLEST, RingWriter
-from appliance.recorder.shelf import Shelf
+from appliance.recorder.shelf import MOST_LENT, Shelf
 from tests.support.audit import decision, settle
 from tests.unit.recorder.test_ring import HEADER, Clock, frame, opened
 
@@ -136,12 +136,16 @@ def test_before_and_after(scene: Scene) -> None:
 
 
 def test_what_is_in_memory_is_lent_and_not_kept(scene: Scene) -> None:
-    """Of the time that was asked for, as far as it goes back; until the next, for ten minutes, or another recorder."""
+    """Of the time that was asked for, as far as it goes back; for ten minutes, or until another recorder."""
     trigger = Trigger(BEGAN, "order", "r", "eve: of what is in memory")
 
+    def asked(since: int, until: int) -> messages.Message:
+        order = msgspec.structs.replace(trigger, time=scene.clock.now)
+        [answer] = scene.later(0, messages.MemoryWanted(1, order, since, until))
+        return answer
+
     def lent(since: int, until: int) -> Recording:
-        asked = messages.MemoryWanted(1, msgspec.structs.replace(trigger, time=scene.clock.now), since, until)
-        [answer] = scene.later(0, asked)
+        answer = asked(since, until)
         assert isinstance(answer, messages.MemoryLent), answer
         return answer.recording
 
@@ -157,7 +161,7 @@ def test_what_is_in_memory_is_lent_and_not_kept(scene: Scene) -> None:
     assert [data for _topic, _time, data in scene.bag(first)] == [TEXT.replace(b"hello", b"alarm"), TEXT]
     second = lent(BEGAN + 21 * SECOND, scene.clock.now + SECOND)
     assert (second.ended, len(scene.bag(second))) == (scene.clock.now, 1)
-    assert there() == {second.id}
+    assert there() == {first.id, second.id}
     [refused] = scene.later(0, messages.MemoryWanted(2, trigger, 0, BEGAN + 5 * SECOND))
     assert isinstance(refused, messages.RecordingRefused)
     assert (refused.unknown, "the last 10 seconds" in refused.reason) == (True, True)
@@ -166,7 +170,14 @@ def test_what_is_in_memory_is_lent_and_not_kept(scene: Scene) -> None:
     scene.later(601)
     assert there() == set()
     scene.say()
-    lent(0, scene.clock.now)
+    several = {lent(0, scene.clock.now).id for _order in range(MOST_LENT)}
+    busy = asked(0, scene.clock.now)  # nobody loses what he is about to open
+    assert isinstance(busy, messages.RecordingRefused)
+    assert (busy.unknown, "half a minute" in busy.reason) == (False, True)
+    assert there() == several
+    scene.later(31)
+    last = lent(scene.clock.now, scene.clock.now)
+    assert (last.id in there(), len(there() & several)) == (True, MOST_LENT - 1)
     scene.begin_anew()
     assert there() == set()
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit):

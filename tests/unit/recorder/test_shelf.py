@@ -34,7 +34,7 @@ def cleared(shelf: Shelf, now: int = 0, *, room: bool = False) -> list[tuple[Rec
     """What goes, as the recorder lets it go."""
     gone = []
     for kept, why in shelf.surplus(now, room=room):
-        shelf.remove(kept)
+        shelf.remove(kept, "", why)
         gone.append((kept, why))
     return gone
 
@@ -50,9 +50,14 @@ def test_what_is_kept_is_found_again(tmp_path: Path) -> None:
     again = Shelf(tmp_path, disk=64 * MIB, seconds=None)
     assert again.recordings == [first, second]
     assert again.parts() == [again.part("f" * 20)]
-    again.remove(first)
+    again.remove(first, "eve", "")
     assert not (tmp_path / first.id).exists()
     assert again.find(first.id) is None
+    again = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    assert list(again.removed()) == [(first, "eve", "")]
+    again.note(first.id)
+    assert not list(again.removed())
+    assert {path.name for path in tmp_path.iterdir()} == {second.id, f".{'f' * 20}.part", "e" * 20}
 
 
 def test_what_the_log_has_is_told_once(tmp_path: Path) -> None:

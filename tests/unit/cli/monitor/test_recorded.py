@@ -1,6 +1,7 @@
 """`rosrv monitor replay --since`: what the flight recorder has of a time, what it has not, and what is refused."""
 
 import json
+import shutil
 import socket
 import threading
 import time
@@ -30,6 +31,8 @@ class Kept:
         self.trouble: Trouble = "failed"
         self.before = 60.0
         self.asked: list[dict[str, Any]] = []
+        self.removes = False
+        """Whether what was fetched is removed when the next is fetched."""
 
     def keep(self, name: str, began: int, ended: int, *, memory: bool = False, **more: Any) -> Recording:
         """One of them."""
@@ -61,6 +64,8 @@ class Kept:
             if self.memory is None:
                 return AdminAnswer(False, error="it does not run at the moment", trouble=self.trouble)
             return AdminAnswer(True, self.memory)
+        if self.removes and len(self.fetched) > 1:
+            shutil.rmtree(self.folder / "recordings" / self.fetched[-2])
         known = [*self.rows, *([self.memory] if self.memory is not None else [])]
         return AdminAnswer(True, next(row for row in known if row.id == request["id"]))
 
@@ -152,6 +157,22 @@ def test_the_memory_has_what_was_before_a_recording(kept: Kept) -> None:
     assert kept.fetched == ["e" * 20, "a" * 20]
     gaps = [(one["since"] - BASE, one["until"] - BASE) for one in found if one["kind"] == "gap"]
     assert [(round(since), round(until)) for since, until in gaps] == [(5, 10), (49, 60)]
+
+
+def test_what_is_removed_while_it_is_replayed_is_read_to_its_end(kept: Kept) -> None:
+    """Somebody removes a recording, or asks for the memory as well: who has fetched it has it."""
+    kept.before = 3600.0
+    kept.keep("a" * 20, 20, 29)
+    kept.keep("e" * 20, 10, 19, memory=True)
+    kept.removes = True
+    found = records(replay(kept, "--since", at(10), "--until", at(29), "--json"))
+    drops = [(one["bag"][0], one["time"] - BASE) for one in found if one["kind"] == "drop"]
+    assert drops == [("m", 18), ("m", 19), ("a", 28), ("a", 29)]
+    shutil.rmtree(kept.folder / "recordings" / ("a" * 20))
+    kept.memory = None
+    kept.trouble = "unknown"
+    gone = replay(kept, "--since", at(20), "--until", at(29))
+    assert (gone.exit_code, "is not there any more" in gone.output) == (2, True), gone.output
 
 
 def test_a_time_that_is_not_in_memory_any_more_is_a_gap(kept: Kept) -> None:

@@ -1,0 +1,65 @@
+"""A recording that is removed while it is fetched."""
+
+import asyncio
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from starlette.responses import StreamingResponse
+
+from appliance.api import recordings
+from appliance.api.access import Bearer, Role
+from appliance.api.problems import ProblemError
+from appliance.api.services import Services
+from appliance.channel.admin import AdminAnswer
+from appliance.channel.answers.recordings import Recording
+from appliance.recorder.bag import BagWriter, Message
+from appliance.recorder.mcap import as_mcap
+from tests.support.answers import example
+from tests.unit.recorder.test_bag import HEADER, SECOND, body
+
+_EVE = Bearer("eve", "eve", Role.INVESTIGATOR, 1e12, "shown")
+
+
+@pytest.mark.parametrize("mcap", [False, True])
+def test_what_is_answered_is_sent_to_its_end(tmp_path: Path, *, mcap: bool) -> None:
+    """It is open when the answer begins, and may go then; what went before is an error, and no answer of 200."""
+    kept = tmp_path / "recordings" / ("a" * 20)
+    kept.mkdir(parents=True)
+    bag = BagWriter(kept / "recording.bag", {})
+    bag.connect(HEADER)
+    for second in range(3):
+        bag.write([Message(0, second * SECOND, body(b"x" * 2_000_000))])
+    bag.close()
+    size = (kept / "recording.bag").stat().st_size
+    whole = b"".join(as_mcap(kept / "recording.bag")) if mcap else (kept / "recording.bag").read_bytes()
+
+    class Control:
+        async def ask(self, *_asked: Any) -> AdminAnswer[Any]:
+            return AdminAnswer(True, example(Recording, id="a" * 20, size=size))
+
+    services: Any = SimpleNamespace(control=Control(), settings=SimpleNamespace(state=tmp_path))
+
+    async def fetched() -> bytes:
+        response = await _asked(services, mcap=mcap)
+        assert response.headers.get("Content-Length") == (None if mcap else str(size))
+        shutil.rmtree(kept)
+        return b"".join([piece async for piece in response.body_iterator if isinstance(piece, bytes)])
+
+    assert asyncio.run(fetched()) == whole
+    with pytest.raises(ProblemError, match="not there any more") as gone:
+        asyncio.run(_asked(services, mcap=mcap))
+    assert gone.value.status == 503
+    kept.mkdir()
+    (kept / "recording.bag").write_bytes(b"")
+    if mcap:
+        with pytest.raises(ProblemError, match="cannot be read"):
+            asyncio.run(_asked(services, mcap=mcap))
+
+
+async def _asked(services: Services, *, mcap: bool) -> StreamingResponse:
+    response = await recordings.bag_response(services, "a" * 20, _EVE, mcap=mcap)
+    assert isinstance(response, StreamingResponse)
+    return response

@@ -1,0 +1,110 @@
+"""A recorder that is killed at whatever it does with files: the next has whole recordings, and loses none silently."""
+
+import hashlib
+import os
+import sys
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from rosbags.rosbag1 import Reader
+
+from appliance.channel import messages
+from appliance.channel.answers.recordings import Recording, Trigger
+from tests.unit.recorder.test_recorder import BEGAN, SECOND, Scene
+
+_CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.chmod")
+_TOLD = (messages.RecordingClosed, messages.RecordingRemoved)
+_KILLED = 9
+
+
+def _life(scene: Scene) -> None:
+    """All that is done with recordings: made, noted, made of the memory, removed by order, and made once more."""
+
+    def order() -> Trigger:
+        return Trigger(scene.clock.now + SECOND, "order", "r", "eve")
+
+    orders: dict[int, Callable[[], messages.Message]] = {
+        0: lambda: messages.RecordingWanted(1, order(), 5, 1),
+        3: lambda: messages.MemoryWanted(2, order(), 0, 1 << 62),
+        4: lambda: messages.RecordingRemovalWanted(3, kept[0], "eve"),
+        5: lambda: messages.RecordingWanted(4, order(), 5, 1),
+    }
+    kept: list[str] = []
+    noted: list[messages.Message] = []
+    for number in range(7):
+        scene.say()
+        answers = scene.later(2, *noted, *([orders[number]()] if number in orders else []))
+        noted = [messages.RecordingNoted(one.recording.id) for one in answers if isinstance(one, _TOLD)]
+        kept += [recording.id for recording in scene.closed(answers)]
+
+
+def _killed_at(scene: Scene, operation: int) -> bool:
+    """Whether a recorder that lives so was killed before its so many-th change of a file or folder."""
+    child = os.fork()
+    if not child:
+        done = count(1)
+
+        def hook(event: str, arguments: tuple[Any, ...]) -> None:
+            changes = event in _CHANGES or (event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR))
+            if changes and next(done) == operation:
+                os._exit(_KILLED)
+
+        status = 1
+        try:
+            sys.addaudithook(hook)
+            _life(scene)
+            status = 0
+        finally:
+            os._exit(status)
+    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert status in (0, _KILLED)
+    return status == _KILLED
+
+
+@pytest.mark.parametrize("memory", ["same", "another"])
+def test_killed_at_each_operation_with_files(tmp_path: Path, memory: str) -> None:
+    """Each recording that has a name is whole; what was removed is told until it is noted; nothing else is left."""
+    removed, kept = set[int](), set[int]()
+    for operation in count(1, 1 if memory == "same" else 3):
+        folder = tmp_path / str(operation)
+        folder.mkdir()
+        scene = Scene(folder, before=30)
+        scene.happen()
+        killed = _killed_at(scene, operation)
+        scene.said += 7
+        scene.clock.now = BEGAN + 15 * SECOND
+        if memory == "another":
+            scene.born = scene.clock.now
+        scene.recorder = scene.make_recorder()
+        told: list[messages.Message] = []
+        for seconds in (0, 20, 20):
+            told += scene.later(seconds, messages.RecordingsAsked())
+        stated = [one for one in told if isinstance(one, messages.RecordingsStated)][-1].recordings
+        gone = {one.recording.id for one in told if isinstance(one, messages.RecordingRemoved)}
+        if memory == "same" and 1 not in removed:  # what happened is in a recording until that is removed
+            assert gone or "drop" in {trigger.what for found in stated for trigger in found.triggers}, (
+                operation
+            )
+        names = {path.name for path in scene.folder.iterdir() if not path.name.startswith(".")}
+        assert names == {found.id for found in stated}, operation
+        for found in stated:
+            place = scene.folder / found.id
+            assert msgspec.json.decode((place / "recording.json").read_bytes(), type=Recording) == found
+            assert hashlib.sha256((place / "recording.bag").read_bytes()).hexdigest() == found.sha256
+            with Reader(place / "recording.bag") as reader:
+                assert sum(topic.messages for topic in found.topics) == sum(
+                    connection.topic == "/chatter" for connection, _time, _data in reader.messages()
+                )
+        kept.add(len(stated))
+        removed.add(len(gone))
+        scene.later(0, *(messages.RecordingNoted(name) for name in names | gone))
+        assert {path.name for path in scene.folder.iterdir()} == names, operation
+        scene.log.close()
+        if not killed:
+            break
+    assert operation > 20
+    assert (removed, kept) == ({0, 1}, {1, 2} if memory == "same" else {0, 1})
