@@ -39,7 +39,7 @@ from appliance.control.monitor_orders import MonitorOrders
 from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.control.policy_orders import PolicyOrders
 from appliance.control.rest import RestLink
-from appliance.control.robot import own_address, robot_addresses
+from appliance.control.robot import master_address, robot_addresses
 from appliance.control.signing import Signing
 from appliance.control.spare_memory import SpareMemory
 from appliance.control.standing import HostStanding
@@ -297,7 +297,7 @@ class _Control:
 
     def _say_ready(self, restarted: bool, token: str | None) -> None:
         host, base = self._settings.listen_address[0], self._base
-        told = own_address(self._settings) if host in {"0.0.0.0", "::"} else host  # noqa: S104 - compared only
+        told = master_address(self._settings) if host in {"0.0.0.0", "::"} else host  # noqa: S104 - compared only
         uri = node_uri(told, base.port(RVMASTER))
         self._lifeline.surroundings.master = uri.rstrip("/")
         if not restarted:

@@ -15,27 +15,41 @@ def robot_addresses(settings: Settings) -> list[Address]:
     """Loopback with `isolation: none`; else the gateway of the default route."""
     if settings.isolation == "none":
         return [ipaddress.ip_address("127.0.0.1"), ipaddress.ip_address("::1")]
-    gateway = _default_gateway(_ROUTES.read_text(encoding="ascii"))
+    gateway = _default_gateway()
     return [gateway] if gateway is not None else []
 
 
 def own_address(settings: Settings) -> str:
     """The address at which the robot reaches the appliance when it listens on all of them."""
     robots = robot_addresses(settings)
-    if settings.isolation == "none" or not robots:
-        return "127.0.0.1"
-    family = socket.AF_INET if robots[0].version == 4 else socket.AF_INET6
-    with socket.socket(family, socket.SOCK_DGRAM) as sock:
-        sock.connect(
-            (str(robots[0]), 9)
-        )  # a datagram socket that connects sends nothing: it only picks a route
+    return "127.0.0.1" if settings.isolation == "none" or not robots else _towards(robots[0])
+
+
+def master_address(settings: Settings) -> str:
+    """The same for nodes: without a default route, the address in the first network that is attached."""
+    if settings.isolation != "none" and not robot_addresses(settings):
+        for network, gateway in _routes():
+            if int(network) and not int(gateway) and network not in settings.ipsec.pool:
+                return _towards(network + 1)
+    return own_address(settings)
+
+
+def _towards(peer: Address) -> str:
+    """The address that packets to a peer leave with."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.connect((str(peer), 9))  # a datagram socket that connects sends nothing: it only picks a route
         return str(sock.getsockname()[0])
 
 
-def _default_gateway(table: str) -> Address | None:
-    """The gateway in the kernel's routing table (`/proc/net/route`)."""
-    for line in table.splitlines()[1:]:
-        fields = line.split()
-        if fields[1] == "00000000" and fields[2] != "00000000":
-            return ipaddress.ip_address(socket.inet_ntoa(struct.pack("<I", int(fields[2], 16))))
-    return None
+def _default_gateway() -> Address | None:
+    return next((gateway for network, gateway in _routes() if not int(network) and int(gateway)), None)
+
+
+def _routes() -> list[tuple[ipaddress.IPv4Address, ipaddress.IPv4Address]]:
+    """Network and gateway of each route of the kernel."""
+
+    def address(field: str) -> ipaddress.IPv4Address:
+        return ipaddress.IPv4Address(struct.pack("<I", int(field, 16)))
+
+    rows = (line.split() for line in _ROUTES.read_text(encoding="ascii").splitlines()[1:])
+    return [(address(row[1]), address(row[2])) for row in rows]

@@ -47,7 +47,9 @@ def test_only_the_networks_that_were_named_reach_it(lab: Lab, tmp_path: Path) ->
     manager, stranger = lab.host("manager", "10.82.0.10/24"), lab.host("stranger", "10.82.0.66/24")
     config = tmp_path / "appliance.yaml"
     config.write_text("api: 0.0.0.0:8443\napi_networks: [10.82.0.10/32]\n")
-    with Appliance(machine, isolation="container", options=("--config", str(config))) as appliance:
+    options = ("--config", str(config), "--listen", "0.0.0.0:11311")
+    with Appliance(machine, isolation="container", options=options) as appliance:
+        assert appliance.master_uri == "http://10.82.0.2:11311", "there is no default route, but one network"
         certificate = certificate_of(appliance, machine, 8443)
         assert machine.run(partial(status, certificate, "127.0.0.1", 8443)) == "200"
         assert stranger.run(partial(status, certificate, "10.82.0.2", 8443)) == "ConnectionRefusedError"
