@@ -1,5 +1,6 @@
 """The Debian package, built once for all its tests, and clean machines to install it on."""
 
+import os
 import subprocess
 import sys
 import tarfile
@@ -19,6 +20,7 @@ _NODE_PACKAGES = (
     "python3-std-msgs",
     "systemd-resolved",
 )
+LATER = "+40h"
 SLOW_SECONDS = 1200.0  # of what is over in seconds on a machine of its own
 
 
@@ -36,6 +38,36 @@ def package() -> Path:
     )
     assert done.returncode == 0, done.stderr[-3000:]
     return ROOT / done.stdout.split()[0]
+
+
+def elsewhere(folder: Path) -> Path:
+    """The checkout as it is, as somebody else has it: in this folder, which is new, and for nobody but its owner."""
+    git = ["git", "-c", f"safe.directory={ROOT}", "-c", f"safe.directory={ROOT}/.git"]
+    subprocess.run(
+        [*git, "clone", "--quiet", "--no-hardlinks", str(ROOT), str(folder)], umask=0o077, check=True
+    )
+    changes = subprocess.run(
+        [*git, "diff", "--binary", "HEAD"], cwd=ROOT, capture_output=True, check=True
+    ).stdout
+    if changes:
+        subprocess.run([*git, "apply"], cwd=folder, input=changes, umask=0o077, check=True)
+    return folder
+
+
+def build_later(module: str, *options: str, folder: Path, **environment: str) -> Path:
+    """Run a module of `distribution` in this folder `LATER`, by the clock it sees: what it names first."""
+    command = [need_program("faketime", "faketime"), "-f", LATER, sys.executable, "-m", module, *options]
+    done = subprocess.run(
+        command,
+        cwd=folder,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        umask=0o077,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return folder / done.stdout.split()[0]
 
 
 def clean_machine(

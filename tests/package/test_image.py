@@ -19,6 +19,7 @@ import pytest
 from appliance import __version__
 from distribution.checkout import ROOT
 from examples.landshark.lab import Lab
+from tests.package.conftest import LATER, build_later, elsewhere
 from tests.support.docker import BASE, Engine, MachineInside, builder
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
@@ -26,7 +27,6 @@ from tests.support.requirements import needs
 pytestmark = pytest.mark.timeout(1800)  # the image is built
 NAME = f"rosrv/appliance:{__version__}"
 OPTIONS = ("--network", "host", "--build-arg", f"BASE={BASE}")
-LATER = "+40h"
 INSIDE = """\
 from importlib.metadata import distributions
 import re
@@ -212,24 +212,9 @@ def test_two_builds_are_the_same(engine: Engine, unpacked: Path, tmp_path: Path)
 
     In another folder, too, where files are for nobody but their owner.
     """
-    elsewhere = tmp_path / "elsewhere"
-    git = ["git", "-c", f"safe.directory={ROOT}", "-c", f"safe.directory={ROOT}/.git"]
-    subprocess.run(
-        [*git, "clone", "--quiet", "--no-hardlinks", str(ROOT), str(elsewhere)], umask=0o077, check=True
-    )
-    changes = subprocess.run(
-        [*git, "diff", "--binary", "HEAD"], cwd=ROOT, capture_output=True, check=True
-    ).stdout
-    if changes:
-        subprocess.run([*git, "apply"], cwd=elsewhere, input=changes, umask=0o077, check=True)
     engine.go_ahead(LATER)
-    command = ["faketime", "-f", LATER, sys.executable, "-m", "distribution.image", *OPTIONS]
-    environment = os.environ | {"DOCKER_HOST": engine.address}
-    done = subprocess.run(
-        command, cwd=elsewhere, env=environment, capture_output=True, text=True, umask=0o077, check=False
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    second = elsewhere / done.stdout.split()[0]
+    folder = elsewhere(tmp_path / "elsewhere")
+    second = build_later("distribution.image", *OPTIONS, folder=folder, DOCKER_HOST=engine.address)
     assert differences(next(unpacked.glob("rosrv-image_*.tar")), second)[:50] == []
 
 

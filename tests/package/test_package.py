@@ -5,15 +5,13 @@ The machine has the packages that ours depends on (it has no network to fetch th
 
 import filecmp
 import json
-import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.package.conftest import SLOW_SECONDS, clean_machine
+from tests.package.conftest import SLOW_SECONDS, build_later, clean_machine, elsewhere
 from tests.support.machine import Done, Machine
 from tests.support.machine_disk import ROOT
 
@@ -144,10 +142,8 @@ def test_what_lintian_says_of_it(package: Path) -> None:
 
 
 def test_two_builds_are_the_same(package: Path, tmp_path: Path) -> None:
-    """Who builds the same commit gets the same package, byte by byte."""
-    kept = tmp_path / package.name
-    shutil.copyfile(package, kept)
-    subprocess.run(
-        [sys.executable, "-m", "distribution.deb", "amd64"], cwd=ROOT, capture_output=True, check=True
-    )
-    assert filecmp.cmp(package, kept, shallow=False)
+    """Who builds the same commit gets the same package, byte by byte: in another folder, two days later."""
+    folder = elsewhere(tmp_path / "elsewhere")
+    (folder / ".venv").symlink_to(ROOT / ".venv")
+    second = build_later("distribution.deb", "amd64", folder=folder)
+    assert filecmp.cmp(package, second, shallow=False)
