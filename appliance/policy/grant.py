@@ -38,7 +38,7 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """A text that grants what was asked, and a line for each right that it adds; both as before if none is missing."""
+    """A text that grants what was asked, and the rule for each right that it adds; as before if none is missing."""
 
     text: str
     added: tuple[str, ...]
@@ -152,19 +152,21 @@ def _with_word(text: str, entry: Entry, word: str) -> tuple[str, str]:
     last: Word | None = entry.values[-1] if entry.values else None
     end = line.index("=") + 1 if last is None else last.column - 1 + len(last.text)
     comma = "," if last is not None and "," in line[:end] else ""
-    lines[entry.key.line - 1] = f"{line[:end]}{comma} {word}{line[end:]}"
-    return "\n".join(lines), lines[entry.key.line - 1].strip()
+    rule = f"{line[:end]}{comma} {word}"
+    lines[entry.key.line - 1] = rule + line[end:]
+    return "\n".join(lines), " ".join(rule.split())
 
 
 def _with_takeover(text: str) -> tuple[str, str]:
+    option = f"takeover = {TAKEOVERS[-1]}"
     section = next((one for one in _sections(text) if one.name.text == OPTIONS), None)
     entry = None if section is None else _entry(section, "takeover")
     if entry is None:
-        return _with_line(text, section, OPTIONS, f"takeover = {TAKEOVERS[-1]}")
+        return _with_line(text, section, OPTIONS, option)
     lines, number, first = text.split("\n"), entry.key.line - 1, entry.values[0]
     rest = lines[number][first.column - 1 + len(first.text) :]
     lines[number] = f"{lines[number][: first.column - 1]}{TAKEOVERS[-1]}{rest}"
-    return "\n".join(lines), lines[number].strip()
+    return "\n".join(lines), option
 
 
 def _with_line(text: str, section: SectionText | None, name: str, line: str) -> tuple[str, str]:

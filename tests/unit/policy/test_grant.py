@@ -72,8 +72,11 @@ BASE = (
 
 
 def test_the_host_is_added_to_the_very_key() -> None:
-    """As the line is written: its commas, its comment."""
+    """As the line is written: its commas, its comment. What is said to be added is the rule alone."""
     assert changed(BASE, "publish", "/x") == ["/x = 10.0.0.1, 10.0.0.2, 10.0.0.9  # the two"]
+    padded = BASE.replace("/x =", "/x      =   ")
+    found = grant(padded, "p.ini", KNOWN, asked(str(HOST), "/it", "publish", "/x", {}))
+    assert found.added == ("/x = 10.0.0.1, 10.0.0.2, 10.0.0.9",)
 
 
 def test_a_new_key_keeps_whom_the_deciding_rule_names() -> None:
