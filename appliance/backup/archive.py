@@ -20,10 +20,10 @@ from typing import BinaryIO, Self
 
 from appliance.backup.contents import (
     AUDIT_LOG,
+    KEPT_PARTS,
     MOST_FILES,
     BackupError,
     belongs,
-    kept_parts,
     trouble_with,
 )
 
@@ -80,7 +80,7 @@ def _read_to_the_end(file: Path, raw: BinaryIO, room: int) -> None:
 
 
 def _entries(file: Path, archive: tarfile.TarFile) -> list[tarfile.TarInfo]:
-    parts = kept_parts()
+    parts = KEPT_PARTS
     entries: dict[str, tarfile.TarInfo] = {}
     while (entry := archive.next()) is not None:
         if entry.name in entries or not belongs(entry.name, parts) or trouble_with(entry.name, entry.size):

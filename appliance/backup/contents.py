@@ -6,8 +6,7 @@ interpret, or a file without end, is therefore nobody's to keep: it is told.
 
 from pathlib import PurePosixPath
 
-from appliance.supervisor.errors import StartError
-from appliance.supervisor.roles import roles_of
+from appliance.supervisor.roles import ROLES
 
 AUDIT_LOG = "control/audit.db"
 LARGEST = 1 << 30  # bytes of a file that is no database
@@ -16,19 +15,13 @@ _LONGEST_NAME = 100  # bytes: what an archive holds without a further header
 _DATABASES = "control/"  # the only part that has any
 # Of a running appliance only, or made anew at the next start. `.ahead`: what the copied database does not have yet.
 _PASSING = ("-wal", "-shm", ".lock", ".ahead", ".new", ".sock", ".pid", "strongswan.conf")
-_LOGS_OF_ROS = frozenset({"rosmaster", "rosout"})
+_LEFT_OUT = {"rosmaster", "rosout", "recordings"}  # logs of ROS, and what messages said
+KEPT_PARTS = frozenset(role.part for role in ROLES) - _LEFT_OUT
+"""The folders of a state directory that a backup has."""
 
 
 class BackupError(Exception):
     """A backup cannot be made or put back; the text says what is in the way, and what to do."""
-
-
-def kept_parts() -> frozenset[str]:
-    """The folders of a state directory that a backup has. Raises `BackupError`."""
-    try:
-        return frozenset(role.part for role in roles_of(syslog=True)) - _LOGS_OF_ROS
-    except StartError as error:
-        raise BackupError(str(error)) from error
 
 
 def is_passing(name: str) -> bool:

@@ -25,12 +25,12 @@ from typing import BinaryIO
 
 from appliance.backup.contents import (
     AUDIT_LOG,
+    KEPT_PARTS,
     LARGEST,
     MOST_FILES,
     BackupError,
     is_database,
     is_passing,
-    kept_parts,
     trouble_with,
 )
 from appliance.backup.database import copy_database
@@ -108,7 +108,7 @@ def _files(state: Path) -> Iterator[tuple[str, int]]:
     """What is kept, by name, open for reading: the log first, for the signer's memory is cut to it."""
     names = [
         name
-        for part in sorted(kept_parts())
+        for part in sorted(KEPT_PARTS)
         if (state / part).exists()  # else a role that never ran here
         for name in _names(state, part)
     ]

@@ -17,9 +17,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from appliance.backup.archive import checked_archive
-from appliance.backup.contents import BackupError, kept_parts
+from appliance.backup.contents import KEPT_PARTS, BackupError
 from appliance.supervisor.restore_mark import set_mark
-from appliance.supervisor.roles import roles_of
+from appliance.supervisor.roles import ROLES
 from appliance.supervisor.users import account_of
 
 _LOCK = "lock"  # by it `StateDirectory` knows an appliance's directory, also where root may not look into its parts
@@ -69,7 +69,7 @@ def _marked(state: Path) -> Iterator[None]:
         (state / _LOCK).touch(0o600, exist_ok=False)
         yield
     except BaseException:
-        for part in kept_parts():
+        for part in KEPT_PARTS:
             if (state / part).exists():
                 shutil.rmtree(state / part)
         (state / _LOCK).unlink(missing_ok=True)
@@ -94,7 +94,7 @@ def _extract(archive: tarfile.TarFile, entry: tarfile.TarInfo, state: Path) -> N
 
 def _hand_over(state: Path) -> None:
     """Give each part to its role's user; the files in it that others may read, to the group that may."""
-    for role in roles_of(syslog=True):
+    for role in (role for role in ROLES if role.part in KEPT_PARTS):
         account = account_of(role.user)
         group = account.gid if role.readable_by is None else account_of(role.readable_by).gid
         part = state / role.part

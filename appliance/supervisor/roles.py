@@ -1,6 +1,6 @@
 """The table of processes: who each is, what it may have, and how it is started.
 
-To add a process, add its row to `roles_of`. A role is one of our own programs (`entry`: a function that
+To add a process, add its row to `ROLES`. A role is one of our own programs (`entry`: a function that
 is given the lifeline) or somebody else's (`program`: what is executed, and its environment).
 """
 
@@ -19,6 +19,7 @@ from appliance.supervisor.walls.plan import NETWORK, ROUTES, Walls
 ROSMASTER = Path("/usr/bin/rosmaster")
 ROSOUT = Path("/usr/lib/rosout/rosout")
 SYSTEM_PYTHON = Path("/usr/bin/python3")
+ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
 
 
 @dataclass(frozen=True)
@@ -90,108 +91,6 @@ class Role:
     walls: Callable[[Facts], Walls] = lambda _facts: Walls(listed=True)
 
 
-def roles_of(
-    *,
-    rosmaster: Path = ROSMASTER,
-    rosout: Path = ROSOUT,
-    api: bool = True,
-    syslog: bool = False,
-    recorder: bool = False,
-) -> tuple[Role, ...]:
-    """The roles in the order they are started, with or without REST, the forwarder of the audit log, the recorder.
-
-    Raises `StartError` when a program is missing.
-    """
-    for program, package in ((rosmaster, "python3-rosmaster"), (rosout, "rosout")):
-        if shutil.which(program) is None:
-            raise StartError(f"{program} is not there: install it with `apt install {package}`")
-    # Most of ours read the configuration and talk to control.
-    ours = partial(Role, path=lambda facts: facts.config, links=("control",))
-    roles = (
-        Role(
-            "rosmaster", "rosmaster", "rosmaster",
-            program=lambda facts: Program(
-                (str(SYSTEM_PYTHON), "-s", str(rosmaster), "--core", "-p", str(facts.rosmaster_port)),
-                _of_ros(facts, "rosmaster", f"http://127.0.0.1:{facts.rosmaster_port}"),
-            ),
-            asks=True, outlives_control=True, files=8192,
-            walls=lambda facts: Walls(
-                families=ROUTES,
-                programs=runnable(SYSTEM_PYTHON),
-                binds=(facts.rosmaster_port,),
-                reaches=None,  # the inner faces: the firewall knows their port
-            ),
-        ),
-        ours(
-            "signer", "rosrv-signer", "signer", "appliance.ipsec.signer:main",
-            secret=lambda facts: facts.ca_passphrase_file, network=False, outlives_control=True,
-        ),
-        ours(
-            "relay", "rosrv-relay", "relay", "appliance.supervisor.relay_entry:main",
-            ended_early=300, indexed=True, files=65_536,
-            walls=lambda _facts: Walls(listed=True, families=NETWORK, reaches=None),
-        ),
-        ours(
-            "control", "rosrv", "control", "appliance.control.process:main",
-            ended_early=100, files=65_536, links=("relay", "signer", "api", "charon", "syslog", "recorder"),
-            readable_by="rosrv-api",
-            walls=lambda facts: Walls(
-                listed=True, families=ROUTES, reads=(*around(*facts.control_reads), str(DPKG)), binds=None,
-                reaches=None,
-            ),
-        ),
-        Role(
-            "rosout", "rosrv-rosout", "rosout",
-            program=lambda facts: Program(
-                (str(rosout), *_messages_at(facts.rosout_ports)),
-                _of_ros(facts, "rosout", str(facts.rosout_master)),
-            ),
-            after="control",
-            walls=lambda _facts: Walls(
-                families=ROUTES,
-                programs=runnable(rosout),
-                binds=None,  # its API is where the kernel likes; the firewall says who gets there
-                reaches=None,
-            ),
-        ),
-        ours(
-            "api", "rosrv-api", "api", "appliance.api.process:main",
-            ended_early=800, files=4096, after="control", listens=True, dispensable=True,
-            walls=lambda facts: Walls(
-                listed=True, reads=(str(facts.part("control")), str(facts.part("recordings")))
-            ),
-        ),
-        ours(
-            "charon", "rosrv-ipsec", "ipsec", "appliance.ipsec.process:main",
-            path=lambda facts: facts.part("ipsec"), dispensable=True, on_demand=True,
-            capabilities=("NET_ADMIN", "NET_BIND_SERVICE"),
-            walls=lambda _facts: Walls(
-                families=ROUTES,
-                programs=("/usr", "/lib", "/lib64"),
-                writes=("/dev/net", "/proc/sys/net"),
-            ),
-        ),
-        ours(
-            "syslog", "rosrv-syslog", "syslog", "appliance.forwarding.process:main",
-            ended_early=600, after="control", dispensable=True, group="rosrv-api",
-            walls=lambda facts: Walls(
-                listed=True,
-                families=ROUTES,
-                reads=(str(facts.part("control")), *around(*facts.syslog_reads)),
-                reaches=None if facts.syslog_port is None else (facts.syslog_port,),
-            ),
-        ),
-        ours(
-            "recorder", "rosrv-recorder", "recordings", "appliance.recorder.process:main",
-            ended_early=500, after="control", dispensable=True, group="rosrv-api", readable_by="rosrv-api",
-            network=False,
-            walls=lambda facts: Walls(listed=True, reads=(str(facts.part("control")),)),
-        ),
-    )  # fmt: skip
-    wanted = {"api": api, "syslog": syslog, "recorder": recorder}
-    return tuple(role for role in roles if wanted.get(role.name, True))
-
-
 def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
     """The environment of a program of ROS; rosmaster binds loopback only because of ROS_IP."""
     return {
@@ -209,3 +108,106 @@ def _messages_at(ports: range | None) -> tuple[str, ...]:
     A life that ended may have left connections behind, which keep its port for a minute.
     """
     return () if ports is None else (f"__tcpros_server_port:={first_free(ports)}",)
+
+
+# Most of ours read the configuration and talk to control.
+_ours = partial(Role, path=lambda facts: facts.config, links=("control",))
+ROLES = (
+    Role(
+        "rosmaster", "rosmaster", "rosmaster",
+        program=lambda facts: Program(
+            (str(SYSTEM_PYTHON), "-s", str(ROSMASTER), "--core", "-p", str(facts.rosmaster_port)),
+            _of_ros(facts, "rosmaster", f"http://127.0.0.1:{facts.rosmaster_port}"),
+        ),
+        asks=True, outlives_control=True, files=8192,
+        walls=lambda facts: Walls(
+            families=ROUTES,
+            programs=runnable(SYSTEM_PYTHON),
+            binds=(facts.rosmaster_port,),
+            reaches=None,  # the inner faces: the firewall knows their port
+        ),
+    ),
+    _ours(
+        "signer", "rosrv-signer", "signer", "appliance.ipsec.signer:main",
+        secret=lambda facts: facts.ca_passphrase_file, network=False, outlives_control=True,
+    ),
+    _ours(
+        "relay", "rosrv-relay", "relay", "appliance.supervisor.relay_entry:main",
+        ended_early=300, indexed=True, files=65_536,
+        walls=lambda _facts: Walls(listed=True, families=NETWORK, reaches=None),
+    ),
+    _ours(
+        "control", "rosrv", "control", "appliance.control.process:main",
+        ended_early=100, files=65_536, links=("relay", "signer", "api", "charon", "syslog", "recorder"),
+        readable_by="rosrv-api",
+        walls=lambda facts: Walls(
+            listed=True, families=ROUTES, reads=(*around(*facts.control_reads), str(DPKG)), binds=None,
+            reaches=None,
+        ),
+    ),
+    Role(
+        "rosout", "rosrv-rosout", "rosout",
+        program=lambda facts: Program(
+            (str(ROSOUT), *_messages_at(facts.rosout_ports)),
+            _of_ros(facts, "rosout", str(facts.rosout_master)),
+        ),
+        after="control",
+        walls=lambda _facts: Walls(
+            families=ROUTES,
+            programs=runnable(ROSOUT),
+            binds=None,  # its API is where the kernel likes; the firewall says who gets there
+            reaches=None,
+        ),
+    ),
+    _ours(
+        "api", "rosrv-api", "api", "appliance.api.process:main",
+        ended_early=800, files=4096, after="control", listens=True, dispensable=True,
+        walls=lambda facts: Walls(
+            listed=True, reads=(str(facts.part("control")), str(facts.part("recordings")))
+        ),
+    ),
+    _ours(
+        "charon", "rosrv-ipsec", "ipsec", "appliance.ipsec.process:main",
+        path=lambda facts: facts.part("ipsec"), dispensable=True, on_demand=True,
+        capabilities=("NET_ADMIN", "NET_BIND_SERVICE"),
+        walls=lambda _facts: Walls(
+            families=ROUTES,
+            programs=("/usr", "/lib", "/lib64"),
+            writes=("/dev/net", "/proc/sys/net"),
+        ),
+    ),
+    _ours(
+        "syslog", "rosrv-syslog", "syslog", "appliance.forwarding.process:main",
+        ended_early=600, after="control", dispensable=True, group="rosrv-api",
+        walls=lambda facts: Walls(
+            listed=True,
+            families=ROUTES,
+            reads=(str(facts.part("control")), *around(*facts.syslog_reads)),
+            reaches=None if facts.syslog_port is None else (facts.syslog_port,),
+        ),
+    ),
+    _ours(
+        "recorder", "rosrv-recorder", "recordings", "appliance.recorder.process:main",
+        ended_early=500, after="control", dispensable=True, group="rosrv-api", readable_by="rosrv-api",
+        network=False,
+        walls=lambda facts: Walls(listed=True, reads=(str(facts.part("control")),)),
+    ),
+)  # fmt: skip
+"""In the order they are started."""
+
+
+def roles_of(*, api: bool = True, syslog: bool = False, recorder: bool = False) -> tuple[Role, ...]:
+    """The roles of an appliance with or without REST, the forwarder of the audit log, the recorder.
+
+    Raises `StartError` when a program of ROS is missing.
+    """
+    require_programs(ROS_PROGRAMS)
+    wanted = {"api": api, "syslog": syslog, "recorder": recorder}
+    return tuple(role for role in ROLES if wanted.get(role.name, True))
+
+
+def require_programs(packages: Mapping[Path, str]) -> None:
+    """Raises `StartError` when one of the programs is missing; it says which package has it."""
+    for program, package in packages.items():
+        if shutil.which(program) is None:
+            raise StartError(f"{program} is not there: install it with `apt install {package}`")

@@ -8,7 +8,7 @@ import yaml
 from appliance.config_sources import resolve
 from appliance.hosts.rest_place import rest_place
 from appliance.supervisor.privileges import SUPERVISORS
-from appliance.supervisor.roles import roles_of
+from appliance.supervisor.roles import ROLES
 from appliance.supervisor.users import NUMERIC_IDS
 from distribution.site import BESIDE
 
@@ -43,8 +43,7 @@ def test_every_process_is_in_the_table_of_rights() -> None:
     text = (ROOT / "docs" / "next-to-your-robot.md").read_text()
     rows = re.findall(r"^\| `([a-z]+)` \| `([a-z-]+)` \| ([^|]*) \|", text, re.MULTILINE)
     documented = {name: (user, set(re.findall(r"[A-Z][A-Z_]+", rights))) for name, user, rights in rows}
-    roles = roles_of(rosmaster=TRUE, rosout=TRUE, api=True, syslog=True, recorder=True)
-    expected = {role.name: (role.user, set(role.capabilities)) for role in roles}
+    expected = {role.name: (role.user, set(role.capabilities)) for role in ROLES}
     assert documented == expected | {"supervisor": ("root", granted())}
 
 

@@ -18,7 +18,7 @@ from appliance.shares.table import (
     RVMASTER_CONNECTIONS,
     RVMASTER_FAREWELLS,
 )
-from appliance.supervisor.roles import roles_of
+from appliance.supervisor.roles import ROLES
 
 BESIDE = 1024  # databases, links, listeners, calls to ROSMaster, threads
 TRUE = Path("/bin/true")
@@ -26,7 +26,7 @@ TRUE = Path("/bin/true")
 
 def test_all_shares_together_fit_the_descriptors() -> None:
     """Every connection, every node's ports and a call to every node at once: each process may open as much."""
-    files = {role.name: role.files for role in roles_of(rosmaster=TRUE, rosout=TRUE)}
+    files = {role.name: role.files for role in ROLES}
     ports = NODE_PORTS.bounds.whole
     nodes = ports // 2  # with one relay, which is where there are most
     connections = RVMASTER_CONNECTIONS.bounds.whole + RVMASTER_FAREWELLS.bounds.whole

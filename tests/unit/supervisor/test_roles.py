@@ -5,16 +5,17 @@ from pathlib import Path
 import pytest
 
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.roles import Facts, roles_of
+from appliance.supervisor.roles import ROLES, Facts, require_programs, roles_of
 from appliance.supervisor.users import NUMERIC_IDS
 
 FACTS = Facts(Path("/s"), Path("/s/run/config.json"), 12311, "http://127.0.0.1:5")
 HERE = Path("/bin/true")
+BY_NAME = {role.name: role for role in ROLES}
 
 
 def test_rosmaster_is_told_to_hide() -> None:
     """The real master is started so that it binds loopback only, on the port it was given."""
-    role = next(role for role in roles_of(rosmaster=HERE, rosout=HERE) if role.name == "rosmaster")
+    role = BY_NAME["rosmaster"]
     assert role.program is not None
     program = role.program(FACTS)
     assert program.environment["ROS_IP"] == "127.0.0.1"
@@ -23,14 +24,14 @@ def test_rosmaster_is_told_to_hide() -> None:
 
 def test_rosmaster_runs_nothing_of_its_home() -> None:
     """The folder that the state keeps for it is no place from which Python takes code."""
-    role = next(role for role in roles_of(rosmaster=HERE, rosout=HERE) if role.name == "rosmaster")
+    role = BY_NAME["rosmaster"]
     assert role.program is not None
     assert role.program(FACTS).argv[:2] == ("/usr/bin/python3", "-s")
 
 
 def test_rosout_writes_no_files() -> None:
     """What nodes say fills no disk."""
-    role = next(role for role in roles_of(rosmaster=HERE, rosout=HERE) if role.name == "rosout")
+    role = BY_NAME["rosout"]
     assert role.program is not None
     assert role.program(FACTS).environment["ROSOUT_DISABLE_FILE_LOGGING"] == "1"
 
@@ -38,53 +39,50 @@ def test_rosout_writes_no_files() -> None:
 def test_a_missing_rosmaster_is_an_error_that_says_what_to_install(tmp_path: Path) -> None:
     """The message has the command that installs it."""
     with pytest.raises(StartError, match="apt install python3-rosmaster"):
-        roles_of(rosmaster=tmp_path / "rosmaster", rosout=HERE)
-    with pytest.raises(StartError, match="apt install rosout"):
-        roles_of(rosmaster=HERE, rosout=tmp_path / "rosout")
+        require_programs({HERE: "coreutils", tmp_path / "rosmaster": "python3-rosmaster"})
+    require_programs({HERE: "coreutils"})
 
 
 def test_links_are_between_roles_and_go_both_ways() -> None:
     """If one end of a link is new, the row of that end says so: a restart of either renews it."""
-    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE, syslog=True, recorder=True)}
-    for role in roles.values():
+    for role in ROLES:
         for other in role.links:
-            assert role.name in roles[other].links
+            assert role.name in BY_NAME[other].links
 
 
 def test_the_forwarder_is_there_when_it_has_something_to_do() -> None:
     """It has a user of its own, in the group that may read the audit log; the others do without it."""
-    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE, syslog=True)}
-    forwarder = roles["syslog"]
-    assert "syslog" not in {role.name for role in roles_of(rosmaster=HERE, rosout=HERE)}
-    assert forwarder.user not in {role.user for role in roles.values() if role is not forwarder}
-    assert forwarder.group == roles["control"].readable_by
+    forwarder = BY_NAME["syslog"]
+    assert forwarder in roles_of(syslog=True)
+    assert forwarder not in roles_of()
+    assert forwarder.user not in {role.user for role in ROLES if role is not forwarder}
+    assert forwarder.group == BY_NAME["control"].readable_by
     assert forwarder.dispensable
     assert not forwarder.capabilities
 
 
 def test_the_recorder_is_there_when_it_is_wanted() -> None:
     """It has a user of its own and no network, reads the audit log, and its recordings are for the api to read."""
-    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE, recorder=True)}
-    recorder = roles["recorder"]
-    assert "recorder" not in {role.name for role in roles_of(rosmaster=HERE, rosout=HERE)}
-    assert recorder.user not in {role.user for role in roles.values() if role is not recorder}
-    assert recorder.group == recorder.readable_by == roles["api"].user
+    recorder = BY_NAME["recorder"]
+    assert recorder in roles_of(recorder=True)
+    assert recorder not in roles_of()
+    assert recorder.user not in {role.user for role in ROLES if role is not recorder}
+    assert recorder.group == recorder.readable_by == BY_NAME["api"].user
     assert (recorder.dispensable, recorder.network, recorder.capabilities) == (True, False, ())
 
 
 def test_rows_are_consistent() -> None:
     """Each role has a user of the design and is either ours or a program; no two of ours share a part."""
-    roles = roles_of(rosmaster=HERE, rosout=HERE, syslog=True, recorder=True)
-    assert all(role.user in NUMERIC_IDS for role in roles)
-    assert all((role.entry is None) != (role.program is None) for role in roles)
-    parts = [role.part for role in roles if role.entry]
+    assert all(role.user in NUMERIC_IDS for role in ROLES)
+    assert all((role.entry is None) != (role.program is None) for role in ROLES)
+    parts = [role.part for role in ROLES if role.entry]
     assert len(parts) == len(set(parts))
 
 
 def test_rest_can_be_left_out() -> None:
     """Without REST there is no such role; it is the one that the others do without."""
-    roles = {role.name: role for role in roles_of(rosmaster=HERE, rosout=HERE)}
-    assert set(roles) - {role.name for role in roles_of(rosmaster=HERE, rosout=HERE, api=False)} == {"api"}
-    assert roles["api"].dispensable
-    assert not roles["control"].dispensable
-    assert roles["control"].readable_by == roles["api"].user
+    api, control = BY_NAME["api"], BY_NAME["control"]
+    assert [role for role in roles_of() if role not in roles_of(api=False)] == [api]
+    assert api.dispensable
+    assert not control.dispensable
+    assert control.readable_by == api.user

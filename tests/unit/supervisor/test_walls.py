@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.supervisor.roles import Facts, roles_of
+from appliance.supervisor.roles import ROLES, Facts
 from appliance.supervisor.walls import landlock, seccomp
 from appliance.supervisor.walls.calls import FORBIDDEN, LISTED, STARTS_PROGRAMS
 from appliance.supervisor.walls.folders import around, furnished, runnable
@@ -87,7 +87,7 @@ def test_what_an_older_kernel_does_not_limit_is_told(abi: int, lacks: int) -> No
 
 def test_every_process_of_ours_is_listed_but_that_which_starts_charon() -> None:
     """Who parses what strangers send has a list, and only programs of others (and their starter) run programs."""
-    for role in roles_of(rosmaster=HERE, rosout=HERE, syslog=True, recorder=True):
+    for role in ROLES:
         walls = role.walls(FACTS)
         assert walls.listed is (role.name not in {"rosmaster", "rosout", "charon"}), role.name
         assert bool(walls.programs) is not walls.listed
