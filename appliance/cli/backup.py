@@ -1,17 +1,15 @@
 """`rosrv backup`, `restore` and `purge`: the state directory in one file, and back; and its end."""
 
-import json
-import sys
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 
-from appliance.audit.output import printable
 from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up
 from appliance.backup.purge import purge as remove
 from appliance.backup.restore import restore as put_back
+from appliance.cli.output import Json, printable, refused, say, say_json
 from appliance.cli.running import DEFAULT_STATE, State
 
 _NewState = Annotated[
@@ -20,13 +18,12 @@ _NewState = Annotated[
         "--state", envvar="ROSRV_STATE", help="State directory to make; must not exist, or be empty"
     ),
 ]
-_Json = Annotated[bool, typer.Option("--json", help="One JSON object")]
 
 
 def backup(
     file: Annotated[Path, typer.Argument(help="Where to; must not exist. It has keys in it: keep it as one")],
     state: State = DEFAULT_STATE,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Write the state directory to one file: audit log, registrations, policies, keys. The appliance may run.
 
@@ -37,18 +34,18 @@ def backup(
     try:
         names = back_up(state, file)
     except BackupError as error:
-        _fail(str(error))
+        raise _failed(str(error)) from None
     size = file.stat().st_size
     if as_json:
-        sys.stdout.write(json.dumps({"file": str(file), "files": len(names), "bytes": size}) + "\n")
+        say_json({"file": str(file), "files": len(names), "bytes": size})
     else:
-        sys.stdout.write(f"{printable(str(file))}: {len(names)} files, {size} bytes\n")
+        say(f"{file}: {len(names)} files, {size} bytes")
 
 
 def restore(
     file: Annotated[Path, typer.Argument(help="What `rosrv backup` wrote")],
     state: _NewState = DEFAULT_STATE,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Make a state directory of a backup; `rosrv up --state` there goes on from it. Nothing is written over.
 
@@ -57,12 +54,11 @@ def restore(
     try:
         names = put_back(file, state)
     except BackupError as error:
-        _fail(str(error))
+        raise _failed(str(error)) from None
     if as_json:
-        sys.stdout.write(json.dumps({"state": str(state), "files": len(names)}) + "\n")
-        return
-    place = printable(str(state))
-    sys.stdout.write(f"{place}: {len(names)} files; prove the log: rosrv audit verify --state {place}\n")
+        say_json({"state": str(state), "files": len(names)})
+    else:
+        say(f"{state}: {len(names)} files; prove the log: rosrv audit verify --state {state}")
 
 
 def purge(
@@ -71,7 +67,7 @@ def purge(
         str | None,
         typer.Option(metavar="DIR", help="The state directory once more, for scripts; else it is asked for"),
     ] = None,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Remove a state directory for good: audit log, policies, keys of the appliance and of its hosts. It must not run.
 
@@ -85,19 +81,16 @@ def purge(
         )
         confirm = str(typer.prompt(text, err=True))
     if Path(confirm).absolute() != state.absolute():
-        _fail(f"{confirm} is not {state}: nothing was removed")
+        raise _failed(f"{confirm} is not {state}: nothing was removed")
     try:
         files, written = remove(state)
     except BackupError as error:
-        _fail(str(error))
+        raise _failed(str(error)) from None
     if as_json:
-        sys.stdout.write(json.dumps({"state": str(state), "files": files, "written_over": written}) + "\n")
+        say_json({"state": str(state), "files": files, "written_over": written})
     else:
-        sys.stdout.write(
-            f"{printable(str(state))} is gone: {files} files, {written} of them written over first\n"
-        )
+        say(f"{state} is gone: {files} files, {written} of them written over first")
 
 
-def _fail(text: str) -> NoReturn:
-    sys.stderr.write(f"rosrv: {printable(text)}\n")
-    raise typer.Exit(1)
+def _failed(text: str) -> typer.Exit:
+    return refused([f"rosrv: {text}"])

@@ -48,6 +48,7 @@ _Open = Annotated[
     list[str] | None, typer.Option("--open", help="Services of the host that stay open: tcp/22")
 ]
 _Ports = Annotated[str, typer.Option(help="The host's local port range, where ROS nodes listen")]
+_Within = Annotated[str, typer.Option(help="With --token: how long it is good: 30m, 1h, 7d")]
 
 
 @app.command()
@@ -63,7 +64,7 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
         bool,
         typer.Option("--token", help="Print a one-time token and write a script; the host makes its own key"),
     ] = False,
-    within: Annotated[str, typer.Option(help="With --token: how long it is good: 30m, 1h, 7d")] = "1h",
+    within: _Within = "1h",
     csr: _Csr = None,
     days: _Days = 90,
     out: _Out = None,
@@ -81,20 +82,10 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
             raise usage_error(
                 "--csr and --token are two ways: with a token the host brings its request itself"
             )
-        order = HostToken(
-            name,
-            token_seconds=span_given("--within", within, "30m, 1h or 7d", "rosrv host"),
-            days=days,
-            address=address,
-            new=True,
-        )
+        order = HostToken(name, token_seconds=_seconds(within), days=days, address=address, new=True)
         _write_script(running, order, wishes, out, as_json=as_json)
-        return
-    with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
-        writer = KitWriter(output, csr=csr)
-        wishes, reason = placed(running, wishes, as_json=as_json)
-        order_kit = HostAdd(name, writer.request, days, address)
-        writer.write(running.ask_or_exit(order_kit, as_json=as_json), wishes, reason, as_json=as_json)
+    else:
+        _write_kit(running, HostAdd(name, "", days, address), csr, wishes, out, as_json=as_json)
 
 
 @app.command()
@@ -106,7 +97,7 @@ def kit(  # noqa: PLR0917  as above
     token: Annotated[
         bool, typer.Option("--token", help="A one-time token instead: the host comes with another key")
     ] = False,
-    within: Annotated[str, typer.Option(help="With --token: how long it is good: 30m, 1h, 7d")] = "1h",
+    within: _Within = "1h",
     csr: _Csr = None,
     days: _Days = 90,
     out: _Out = None,
@@ -120,16 +111,10 @@ def kit(  # noqa: PLR0917  as above
     """
     wishes = wishes_of(appliance, ports, opened)
     if token:
-        order = HostToken(
-            name, token_seconds=span_given("--within", within, "30m, 1h or 7d", "rosrv host"), days=days
-        )
+        order = HostToken(name, token_seconds=_seconds(within), days=days)
         _write_script(running, order, wishes, out, as_json=as_json)
-        return
-    with new_output(out, f"rosrv-{name}.tar.gz", as_json=as_json) as output:
-        writer = KitWriter(output, csr=csr)
-        wishes, reason = placed(running, wishes, as_json=as_json)
-        body = running.ask_or_exit(HostRenew(name, writer.request, days), as_json=as_json)
-        writer.write(body, wishes, reason, as_json=as_json)
+    else:
+        _write_kit(running, HostRenew(name, "", days), csr, wishes, out, as_json=as_json)
 
 
 @app.command("list")
@@ -190,6 +175,26 @@ def revoke(running: Appliance, name: _Name, as_json: Json = False) -> None:
         say(f"{body.name} is awaited no longer: its one-time token opens nothing")
     else:
         say(f"{body.name} ({body.address}) is revoked; {body.taken_back} registrations and grants taken back")
+
+
+def _seconds(within: str) -> float:
+    return span_given("--within", within, "30m, 1h or 7d", "rosrv host")
+
+
+def _write_kit(
+    running: Appliance,
+    order: HostAdd | HostRenew,
+    csr: Path | None,
+    wishes: Wishes,
+    out: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    with new_output(out, f"rosrv-{order.name}.tar.gz", as_json=as_json) as output:
+        writer = KitWriter(output, csr=csr)
+        wishes, reason = placed(running, wishes, as_json=as_json)
+        body = running.ask_or_exit(replace(order, request=writer.request), as_json=as_json)
+        writer.write(body, wishes, reason, as_json=as_json)
 
 
 def _write_script(
