@@ -1,4 +1,6 @@
-"""The monitor of a property as a picture, in the language of Graphviz (``--dot``)."""
+"""What is drawn of the monitor of a property, and that in the language of Graphviz (``--dot``)."""
+
+from dataclasses import dataclass
 
 from appliance.rosmop.logics.interface import CompiledProperty, FiniteProperty
 from appliance.rosmop.logics.lint import Graph, graph_of
@@ -6,44 +8,70 @@ from appliance.rosmop.logics.pattern import MODES, TimedPattern
 from appliance.rosmop.logics.tfsm import TimedMachine
 
 
-def to_dot(compiled: CompiledProperty) -> str | None:
-    """The automaton as a ``digraph``; None if the monitor is not a finite one."""
+@dataclass(frozen=True)
+class Box:
+    """A state: its name and the categories told in it that are not its name; `double`: its border is."""
+
+    name: str
+    told: str
+    double: bool
+
+
+@dataclass(frozen=True)
+class Diagram:
+    """The states that can be reached, by their numbers, and all events that lead from one to another."""
+
+    initial: int
+    states: dict[int, Box]
+    edges: dict[tuple[int, int], str]
+
+
+def diagram_of(compiled: CompiledProperty) -> Diagram | None:
+    """What is drawn of a property; None if its monitor is not a finite one."""
     graph = graph_of(compiled)
     if graph is None:
         return None
-    shown = _reachable(graph)
+    states: dict[int, Box] = {}
+    edges: dict[tuple[int, int], list[str]] = {}
+    for state in _reachable(graph):
+        told = graph.verdicts[state]
+        name = _name(compiled, state)
+        more = ", ".join(category for category in told if category != name)
+        states[state] = Box(name, more, bool(told) and name not in told)
+        for trace, target in graph.edges[state]:
+            edges.setdefault((state, target), []).append(" ".join(trace))
+    return Diagram(graph.initial, states, {ends: ", ".join(events) for ends, events in edges.items()})
+
+
+def to_dot(compiled: CompiledProperty) -> str | None:
+    """The automaton as a ``digraph``; None if the monitor is not a finite one."""
+    diagram = diagram_of(compiled)
+    if diagram is None:
+        return None
     lines = [
         f"digraph {_quoted(compiled.logic)} {{",
         "  rankdir=LR;",
         "  node [shape=box, style=rounded];",
         '  start [shape=point, label=""];',
-        f"  start -> {graph.initial};",
+        f"  start -> {diagram.initial};",
     ]
-    for state in shown:
-        told = graph.verdicts[state]
-        name = _name(compiled, state)
-        more = [category for category in told if category != name]
-        label = f"{name}\\n{', '.join(more)}" if more else name
-        double = ", peripheries=2" if told and name not in told else ""
-        lines.append(f"  {state} [label={_quoted(label)}{double}];")
-    for state in shown:
-        labels: dict[int, list[str]] = {}
-        for trace, target in graph.edges[state]:
-            labels.setdefault(target, []).append(" ".join(trace))
-        lines += [
-            f"  {state} -> {target} [label={_quoted(', '.join(events))}];"
-            for target, events in labels.items()
-        ]
+    for number, box in diagram.states.items():
+        label = _quoted(f"{box.name}\\n{box.told}" if box.told else box.name)
+        lines.append(f"  {number} [label={label}{', peripheries=2' if box.double else ''}];")
+    lines += [
+        f"  {source} -> {target} [label={_quoted(events)}];"
+        for (source, target), events in diagram.edges.items()
+    ]
     return "\n".join([*lines, "}", ""])
 
 
 def _reachable(graph: Graph) -> list[int]:
-    found = {graph.initial: None}
+    found = {graph.initial}
     waiting = [graph.initial]
     while waiting:
         for _, target in graph.edges[waiting.pop()]:
             if target not in found:
-                found[target] = None
+                found.add(target)
                 waiting.append(target)
     return sorted(found)
 

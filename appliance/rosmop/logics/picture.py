@@ -3,20 +3,18 @@
 Colours and sizes are attributes, not styles: a page whose content security policy forbids styles shows them too, and
 one that has a style sheet can give the classes `title`, `event`, `state` and `edge` its own.
 
-The drawing reads the Graphviz text of the logics: states in columns by their distance from the start, one curve for
-each pair of states with all events that lead from one to the other.
+States are in columns by their distance from the start; there is one curve for each pair of states, with all events
+that lead from one to the other.
 """
 
-import re
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from appliance.rosmop.logics.dot import to_dot
+from appliance.rosmop.logics.dot import Diagram, diagram_of, to_dot
 from appliance.rosmop.logics.interface import CompiledProperty
 
-_STATE = re.compile(r'^  (\d+) \[label="((?:\\.|[^"\\])*)"(, peripheries=2)?\];$', re.MULTILINE)
-_EDGE = re.compile(r'^  (\w+) -> (\d+)(?: \[label="((?:\\.|[^"\\])*)"\])?;$', re.MULTILINE)
 _WIDTH, _HEIGHT = 150, 44  # of a state
 _COLUMN, _ROW, _MARGIN = 300, 120, 60
 _TITLE = 'text-anchor="start" font-weight="bold"'
@@ -44,13 +42,19 @@ def svg_of(properties: Sequence[CompiledProperty]) -> str | None:
     parts: list[str] = []
     top, right = 0, 0
     for compiled in properties:
-        graph = to_dot(compiled)
-        if graph is None:
+        diagram = diagram_of(compiled)
+        if diagram is None:
             continue
         title = f"{compiled.logic}: {' '.join(compiled.formula.split())[:120]}"
         parts.append(f'<text class="title" x="{_MARGIN}" y="{top + 30}" {_TITLE}>{escape(title)}</text>')
-        states = _placed(graph, top + _MARGIN)
-        parts += [_edge(states, *found) for found in _EDGE.findall(graph)]
+        states = _placed(diagram, top + _MARGIN)
+        first = states[diagram.initial]
+        middle = first.y + _HEIGHT // 2
+        parts.append(f'<path class="edge" d="M{first.x - 30} {middle}H{first.x}" {_LINE}/>')
+        parts += [
+            _edge(states[source], states[target], events)
+            for (source, target), events in diagram.edges.items()
+        ]
         parts += [_drawn(state) for state in states.values()]
         top = max(state.y for state in states.values()) + _ROW
         right = max(right, *(state.x for state in states.values()))
@@ -75,29 +79,24 @@ def _document(parts: Sequence[str], width: int, height: int) -> str:
     )
 
 
-def _placed(graph: str, top: int) -> dict[str, _State]:
+def _placed(diagram: Diagram, top: int) -> dict[int, _State]:
     """Every state at its place: the column is the distance from the start."""
-    edges = [(source, target) for source, target, _ in _EDGE.findall(graph)]
-    distance = {"start": -1}
-    waiting = ["start"]
+    distance = {diagram.initial: 0}
+    waiting = deque([diagram.initial])
     while waiting:
-        current = waiting.pop(0)
-        for source, target in edges:
+        current = waiting.popleft()
+        for source, target in diagram.edges:
             if source == current and target not in distance:
                 distance[target] = distance[current] + 1
                 waiting.append(target)
-    rows: dict[int, int] = {}
+    rows: Counter[int] = Counter()
     states = {}
-    for number, label, double in _STATE.findall(graph):
-        column = distance.get(number, 0)
-        row = rows[column] = rows.get(column, -1) + 1
-        x, y = _MARGIN + column * _COLUMN, top + row * _ROW + (column % 2) * 30 + 30
-        states[number] = _State(_plain(label), bool(double), x, y)
+    for number, box in diagram.states.items():
+        column = distance[number]
+        x, y = _MARGIN + column * _COLUMN, top + rows[column] * _ROW + (column % 2) * 30 + 30
+        rows[column] += 1
+        states[number] = _State(" · ".join(filter(None, (box.name, box.told))), box.double, x, y)
     return states
-
-
-def _plain(label: str) -> str:
-    return label.replace("\\n", " · ").replace('\\"', '"').replace("\\\\", "\\")
 
 
 def _drawn(state: _State) -> str:
@@ -115,19 +114,14 @@ def _drawn(state: _State) -> str:
     )
 
 
-def _edge(states: dict[str, _State], source: str, target: str, label: str) -> str:
-    to = states[target]
-    middle = to.y + _HEIGHT // 2
-    if source == "start":
-        return f'<path class="edge" d="M{to.x - 30} {middle}H{to.x}" {_LINE}/>'
-    shown = escape(_plain(label))
-    at = states[source]
-    if source == target:
+def _edge(at: _State, to: _State, events: str) -> str:
+    shown = escape(events)
+    if at is to:
         x, y = at.x + _WIDTH // 2, at.y
         path = f"M{x - 20} {y}C{x - 35} {y - 34} {x + 35} {y - 34} {x + 20} {y}"
         return _labelled(path, x, y - 30, shown)
     if to.x > at.x:
-        x1, y1, x2, y2 = at.x + _WIDTH, at.y + _HEIGHT // 2, to.x, middle
+        x1, y1, x2, y2 = at.x + _WIDTH, at.y + _HEIGHT // 2, to.x, to.y + _HEIGHT // 2
         path = f"M{x1} {y1}C{x1 + 60} {y1} {x2 - 60} {y2} {x2} {y2}"
         return _labelled(path, (x1 + x2) // 2, (y1 + y2) // 2 - 6, shown)
     x1, y1, x2, y2 = at.x + _WIDTH // 2, at.y + _HEIGHT, to.x + _WIDTH // 2, to.y + _HEIGHT
