@@ -10,6 +10,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := appliance tests examples benchmarks distribution
 LONG_PROOFS := $(addprefix tests/proofs/test_,histories.py insertion_traces.py insertion_at_large.py certifier.py events.py)
+LONG_UNIT := $(shell grep --invert-match '^\#' tests/long.txt)
 PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples' tests/unit)
 
 .PHONY: help setup demo check static unit test test-system test-package prove wheel package image site release bench clean
@@ -24,7 +25,7 @@ demo: ## the appliance at work: a simulated robot, its operator and an attacker,
 	@scripts/setup --run
 	@$(BIN)/rosrv demo $(ARGS)
 
-check: setup ## format, lint, types, dependency directions, unit tests
+check: setup ## format, lint, types, dependency directions, unit tests but the long ones
 	$(MAKE) --jobs=2 --output-sync=target static unit
 
 static:
@@ -34,10 +35,10 @@ static:
 	$(BIN)/lint-imports
 
 unit:
-	$(PYTEST) tests/unit -n auto --quiet
+	$(PYTEST) tests/unit $(addprefix --ignore=,$(LONG_UNIT)) -n auto --quiet
 
-test: check ## check, and the tests with real ROS nodes (root: they make network namespaces)
-	$(PYTEST) tests/integration tests/proofs/test_insertion.py -n auto --dist loadfile --quiet --durations=10
+test: check ## check, the long unit tests, and those with real ROS nodes (root: they make network namespaces)
+	$(PYTEST) tests/integration $(LONG_UNIT) tests/proofs/test_insertion.py -n auto --dist loadfile --quiet --durations=10
 
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system

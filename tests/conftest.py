@@ -117,10 +117,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """`-n auto`: as many as there are cores, at least two; twice as many unit tests, for many wait for something."""
+    """`-n auto`: more than there are cores, at least two, for all wait much; unit tests most of the time."""
     cores = len(os.sched_getaffinity(0))
     units_only = all("tests/unit" in argument for argument in config.args)
-    return 2 * cores if units_only else max(2, cores)
+    return 2 * cores if units_only else max(2, 3 * cores // 2)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
