@@ -26,7 +26,7 @@ from appliance.api.moments import given
 from appliance.api.preconditions import IfMatch, etag, expected_revision
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Operator, Viewer, answered, ask
-from appliance.api.routing import ETAG, Responses, Routes, Tagged, answer, body, content
+from appliance.api.routing import ETAG, Responses, Routes, Tagged, answer, body, content, tagged
 from appliance.api.services import Services
 from appliance.channel import admin
 from appliance.channel.answers import hosts as answers
@@ -74,8 +74,7 @@ def _add_looks(router: Routes, services: Services) -> None:
     @router.get("")
     async def hosts(bearer: Viewer) -> Tagged[answers.Hosts]:
         """Every host that is enrolled, declared or awaited, with its tunnel; and machines that nodes run on."""
-        found = await ask(control, admin.HostList(), bearer)
-        return Tagged(found, found.revision)
+        return tagged(await ask(control, admin.HostList(), bearer))
 
     @router.get("/{name}", responses=_UNKNOWN)
     async def host(name: OneName, bearer: Viewer) -> Tagged[answers.Host]:
@@ -128,8 +127,7 @@ def _add_enrolment(router: Routes, services: Services) -> None:
         if_match: IfMatch = None,
     ) -> Tagged[answers.EnrolmentToken]:
         """A one-time token: with it the host enrols itself, for the first time or anew with another key."""
-        made = await _token(services, name, wishes, _expected(if_match), bearer)
-        return Tagged(made, made.revision)
+        return tagged(await _token(services, name, wishes, _expected(if_match), bearer))
 
     @router.post(
         "/{name}/kit",
@@ -154,14 +152,12 @@ def _add_changes(router: Routes, services: Services) -> None:
     @router.post("/reload", operation_id="reload_hosts", responses=_CHANGES)
     async def reload(bearer: Operator, if_match: IfMatch = None) -> Tagged[answers.Reloaded]:
         """Read hosts.yaml again: tunnels that it wants or no longer wants; nobody is enrolled or revoked by it."""
-        done = await ask(control, admin.HostsReload(_expected(if_match)), bearer)
-        return Tagged(done, done.revision)
+        return tagged(await ask(control, admin.HostsReload(_expected(if_match)), bearer))
 
     @router.delete("/{name}", operation_id="revoke_host", responses=_CHANGES | _UNKNOWN)
     async def revoke(name: OneName, bearer: Admin, if_match: IfMatch = None) -> Tagged[answers.Revoked]:
         """Let a host in no more: its certificate, tunnel, registrations and connections end within a second."""
-        done = await ask(control, admin.HostRevoke(name, _expected(if_match)), bearer)
-        return Tagged(done, done.revision)
+        return tagged(await ask(control, admin.HostRevoke(name, _expected(if_match)), bearer))
 
     @router.put("/{name}/ports", operation_id="tell_host_ports", responses=_CHANGES | _UNKNOWN)
     async def ports(

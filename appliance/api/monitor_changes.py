@@ -22,7 +22,7 @@ from appliance.api.policy_models import Rollback
 from appliance.api.preconditions import IfMatch, etag, expected_tag
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Admin, Operator, answered, ask
-from appliance.api.routing import ETAG, Responses, Routes, Tagged, body
+from appliance.api.routing import ETAG, Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
@@ -44,6 +44,8 @@ def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1/monitors", tags=["monitors"])
     _add_texts(router, services)
+    _add_revisions(router, services.control)
+    _add_removals(router, services.control)
     _add_switches(router, services.control)
     return router
 
@@ -104,6 +106,10 @@ def _add_texts(router: Routes, services: Services) -> None:
         tried = admin.MonitorLoad({file: new.text}, new.definitions, new.note, expected, None, signatures)
         return await _tried(services, tried, bearer)
 
+
+def _add_revisions(router: Routes, control: ControlLink) -> None:
+    """What the folder has, and what was in force before."""
+
     @router.post("/reload", responses=_CHANGES)
     async def reload_monitors(
         bearer: Operator, *, if_match: IfMatch = None, prune: Prune = False, confirm_within: Confirm = None
@@ -113,9 +119,8 @@ def _add_texts(router: Routes, services: Services) -> None:
             raise ProblemError(
                 403, "not-for-this-role", "removing what the folder does not have is for admins"
             )
-        return await _replaced(
-            control, admin.MonitorReload(_expected(if_match), prune, confirm_within), bearer
-        )
+        order = admin.MonitorReload(_expected(if_match), prune, confirm_within)
+        return await _replaced(control, order, bearer)
 
     @router.post("/rollback", responses=_CHANGES)
     async def roll_back_monitors(
@@ -127,17 +132,17 @@ def _add_texts(router: Routes, services: Services) -> None:
     @router.post("/confirm", responses=_CHANGES)
     async def confirm_monitors(bearer: Operator, if_match: IfMatch = None) -> Tagged[MonitorsConfirmed]:
         """Keep specifications that were loaded with `confirm_within`."""
-        done = await _ordered(control, admin.MonitorConfirm(_expected(if_match)), bearer)
-        return Tagged(done, done.tag)
+        return tagged(await _ordered(control, admin.MonitorConfirm(_expected(if_match)), bearer))
 
+
+def _add_removals(router: Routes, control: ControlLink) -> None:
     @router.delete("/{name}", responses=_CHANGES | UNKNOWN)
     async def remove_monitor(
         name: OneName, bearer: Admin, if_match: IfMatch = None, confirm_within: Confirm = None
     ) -> Tagged[Replaced]:
         """Remove the file of a monitor (or the file of this name); refused where others use its variables."""
-        return await _replaced(
-            control, admin.MonitorRemove([name], _expected(if_match), confirm_within), bearer
-        )
+        order = admin.MonitorRemove([name], _expected(if_match), confirm_within)
+        return await _replaced(control, order, bearer)
 
     @router.delete("", responses=_CHANGES | UNKNOWN)
     async def remove_monitors(
@@ -150,9 +155,8 @@ def _add_texts(router: Routes, services: Services) -> None:
         confirm_within: Confirm = None,
     ) -> Tagged[Replaced]:
         """The same for several at once."""
-        return await _replaced(
-            control, admin.MonitorRemove(name, _expected(if_match), confirm_within), bearer
-        )
+        order = admin.MonitorRemove(name, _expected(if_match), confirm_within)
+        return await _replaced(control, order, bearer)
 
 
 def _add_switches(router: Routes, control: ControlLink) -> None:
@@ -182,17 +186,18 @@ async def _tried(services: Services, order: admin.MonitorLoad, bearer: Bearer) -
         raise _stale(text, loaded.tag)
     async with services.judging:
         draft = await asyncio.to_thread(judge, loaded, order)
-    would = Replaced(
-        loaded=False,
-        revision=loaded.revision,
-        tag=loaded.tag,
-        added=draft.added,
-        changed=draft.changed,
-        removed=draft.removed,
-        warnings=draft.warnings,
-        monitors=draft.monitors,
+    return tagged(
+        Replaced(
+            loaded=False,
+            revision=loaded.revision,
+            tag=loaded.tag,
+            added=draft.added,
+            changed=draft.changed,
+            removed=draft.removed,
+            warnings=draft.warnings,
+            monitors=draft.monitors,
+        )
     )
-    return Tagged(would, loaded.tag)
 
 
 async def _replaced(
@@ -201,7 +206,7 @@ async def _replaced(
     done = await _ordered(control, order, bearer)
     rows = (await ask(control, admin.MonitorsWanted(), bearer)).monitors
     fields = asdict(done) | {"warnings": findings_of(done.warnings)}
-    return Tagged(Replaced(**fields, loaded=True, monitors=[row.name for row in rows]), done.tag)
+    return tagged(Replaced(**fields, loaded=True, monitors=[row.name for row in rows]))
 
 
 async def _switched(
@@ -212,8 +217,7 @@ async def _switched(
         order = admin.MonitorSwitch(names, to.enabled, expected)
     elif to.trial is not None:
         order = admin.MonitorTrial(names, to.trial, expected)
-    done = await _ordered(control, order, bearer)
-    return Tagged(done, done.tag)
+    return tagged(await _ordered(control, order, bearer))
 
 
 async def _file_of(control: ControlLink, name: str, bearer: Bearer) -> str:

@@ -13,7 +13,7 @@ from appliance.api.monitor_models import Happened, History, Monitor
 from appliance.api.policy_models import OneRevision
 from appliance.api.problems import ProblemError
 from appliance.api.roles import VIEWER, Viewer, ask
-from appliance.api.routing import Responses, Routes, Tagged, file
+from appliance.api.routing import Responses, Routes, Tagged, file, tagged
 from appliance.api.services import Services
 from appliance.audit.output import Entry, rfc3339
 from appliance.audit.query import Filter
@@ -64,8 +64,7 @@ def routes(services: Services) -> Routes:
         texts: Annotated[bool, Query(description="with the texts of the specifications")] = False,
     ) -> Tagged[Monitors]:
         """All monitors with state and counters, and whether they are what the folder has."""
-        loaded = await ask(services.control, MonitorsWanted(texts=texts), bearer)
-        return Tagged(loaded, loaded.tag)
+        return tagged(await ask(services.control, MonitorsWanted(texts=texts), bearer))
 
     @router.get("/revisions", operation_id="monitor_revisions")
     async def revisions(bearer: Viewer) -> MonitorRevisionList:
@@ -93,7 +92,7 @@ def routes(services: Services) -> Routes:
             uses=sorted(found.code.uses),
             hold=found.code.hold,
         )
-        return Tagged(shown, loaded.tag)
+        return tagged(shown)
 
     @router.get("/{name}/picture", responses=_PICTURE | UNKNOWN, response_class=Response)
     async def monitor_picture(name: OneName, bearer: Viewer) -> Response:

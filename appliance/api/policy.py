@@ -18,11 +18,12 @@ from appliance.api.policy_models import (
     Text,
 )
 from appliance.api.roles import Viewer, ask
-from appliance.api.routing import Responses, Routes, Tagged, body
+from appliance.api.routing import Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services
 from appliance.channel.admin import PolicyRevisions, PolicyWanted
 from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.policy import PolicyInForce, PolicyRevisionList, RevisionText
+from appliance.policy.cases import CaseResult
 from appliance.policy.explain import Explanation
 from appliance.policy.model import Category, Rule
 
@@ -71,7 +72,7 @@ def routes(services: Services) -> Routes:
     async def policy(bearer: Viewer) -> Tagged[PolicyInForce]:
         """The policy in force, with its ETag."""
         known = await ask(control, PolicyWanted(), bearer)
-        return Tagged(msgspec.convert(known, PolicyInForce, from_attributes=True), known.revision)
+        return tagged(msgspec.convert(known, PolicyInForce, from_attributes=True))
 
     @router.get("/revisions", operation_id="policy_revisions")
     async def revisions(bearer: Viewer) -> PolicyRevisionList:
@@ -87,16 +88,8 @@ def routes(services: Services) -> Routes:
     async def explained(question: Question, bearer: Bearer) -> Explained:
         current = await ask(control, PolicyWanted(), bearer)
         async with services.judging:
-            found = await asyncio.to_thread(
-                explanation,
-                question.text,
-                current,
-                host=question.host,
-                node=question.node,
-                category=question.category,
-                resource=question.resource,
-            )
-        return _explained(found)
+            asked = msgspec.structs.asdict(question)
+            return _explained(await asyncio.to_thread(explanation, current=current, **asked))
 
     @router.get("/explain", operation_id="explain")
     async def explain_request(
@@ -122,29 +115,30 @@ def routes(services: Services) -> Routes:
         current = await ask(control, PolicyWanted(), bearer)
         async with services.judging:
             ran = (await asyncio.to_thread(judge_text, draft.text, current, cases=True)).results
-        cases = [
-            Case(
-                file=case.file,
-                line=case.line,
-                column=case.column,
-                **case.request.fields(),
-                expected="allow" if case.expected else "deny",
-                decision=case.decision.word,
-                reason=case.decision.reason,
-                passed=case.passed,
-            )
-            for case in ran
-        ]
+        cases = sorted(map(_case, ran), key=lambda case: case.passed)
         passed = sum(case.passed for case in cases)
         return Tested(
             file=current.cases_file,
             exists=current.cases is not None,
             passed=passed,
             failed=len(cases) - passed,
-            cases=sorted(cases, key=lambda one: one.passed)[:_MOST_SHOWN],
+            cases=cases[:_MOST_SHOWN],
         )
 
     return router
+
+
+def _case(case: CaseResult) -> Case:
+    return Case(
+        file=case.file,
+        line=case.line,
+        column=case.column,
+        **case.request.fields(),
+        expected="allow" if case.expected else "deny",
+        decision=case.decision.word,
+        reason=case.decision.reason,
+        passed=case.passed,
+    )
 
 
 def _rule(rule: Rule) -> RuleText:

@@ -16,7 +16,7 @@ from appliance.api.policy_models import Change, Ended, PolicyText, Report, Rollb
 from appliance.api.preconditions import IfMatch, expected_revision
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Operator, ask
-from appliance.api.routing import Responses, Routes, Tagged, body
+from appliance.api.routing import Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services
 from appliance.channel import admin
 from appliance.channel.answers.policy import Loaded, PolicyConfirmed
@@ -59,8 +59,7 @@ def routes(services: Services) -> Routes:
             )
         expected = None if dry_run and if_match is None else expected_revision(if_match)
         order = admin.PolicyLoad(posted.text, posted.note, confirm_within, expected, posted.signature)
-        report = await _load(services, order, bearer, dry_run=dry_run)
-        return Tagged(report, report.revision)
+        return tagged(await _load(services, order, bearer, dry_run=dry_run))
 
     @router.post("/rollback", operation_id="roll_back_policy", responses=_CHANGES)
     async def rollback(
@@ -68,8 +67,7 @@ def routes(services: Services) -> Routes:
     ) -> Tagged[Loaded]:
         """Bring a kept revision into force again, as a new one."""
         order = admin.PolicyRollback(to.revision, expected_revision(if_match))
-        loaded = await ask(services.control, order, bearer)
-        return Tagged(loaded, loaded.revision)
+        return tagged(await ask(services.control, order, bearer))
 
     @router.post("/reload", operation_id="reload_policy", responses=_CHANGES)
     async def reload(
@@ -77,14 +75,12 @@ def routes(services: Services) -> Routes:
     ) -> Tagged[Loaded]:
         """Read the policy file again."""
         order = admin.PolicyReload(confirm_within, expected_revision(if_match))
-        loaded = await ask(services.control, order, bearer)
-        return Tagged(loaded, loaded.revision)
+        return tagged(await ask(services.control, order, bearer))
 
     @router.post("/confirm", operation_id="confirm_policy", responses=_CHANGES)
     async def confirm(bearer: Operator, if_match: IfMatch = None) -> Tagged[PolicyConfirmed]:
         """Keep a policy that was loaded with `confirm_within`."""
-        confirmed = await ask(services.control, admin.PolicyConfirm(expected_revision(if_match)), bearer)
-        return Tagged(confirmed, confirmed.revision)
+        return tagged(await ask(services.control, admin.PolicyConfirm(expected_revision(if_match)), bearer))
 
     return router
 

@@ -33,6 +33,11 @@ class Tagged(NamedTuple, Generic[A]):
     tag: int | str
 
 
+def tagged(body: A) -> Tagged[A]:
+    """With the tag that it has itself, or its revision."""
+    return Tagged(body, getattr(body, "tag", None) or body.revision)  # type: ignore[attr-defined]  # it has one
+
+
 def answer(body: Any, status: int = 200, tag: int | str | None = None) -> Response:
     """A struct as JSON."""
     headers = None if tag is None else {"ETag": etag(tag)}
