@@ -1,8 +1,8 @@
 // What a relay costs at least: one connection in, one out, no grants, no control, nothing recorded.
 //
-//   copying_relay PORT
+//   copying_relay PORT [epoll]
 //
-// Prints the port it listens on, takes one subscriber, connects to the publisher at PORT, passes on both connection
+// `epoll`: it asks before each read whether there is something, as one must that has more than two connections. Prints the port it listens on, takes one subscriber, connects to the publisher at PORT, passes on both connection
 // headers and then the messages. Each is looked at as a monitor would: of the fixed part of relay_load/Sample it reads
 // `number` and `value`, writes `value` and steps a machine of two states; the rest is streamed, as it arrives.
 #include <arpa/inet.h>
@@ -11,6 +11,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/epoll.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
@@ -66,10 +67,19 @@ static void look_at(char *frame) {
   state = !state;
 }
 
-static void relay(int from, int to) {
+static int watch(int fd) {
+  struct epoll_event wanted = {.events = EPOLLIN};
+  int watching = epoll_create1(0);
+  if (watching < 0 || epoll_ctl(watching, EPOLL_CTL_ADD, fd, &wanted)) fail("epoll");
+  return watching;
+}
+
+static void relay(int from, int to, int watching) {
   static char buffer[BUFFER];
+  struct epoll_event found[16];
   size_t kept = 0, rest = 0;  // bytes of a head that is not whole yet; bytes of a message still to come
   for (;;) {
+    if (watching >= 0 && epoll_wait(watching, found, 16, -1) < 0) fail("epoll_wait");
     ssize_t got = recv(from, buffer + kept, BUFFER - kept, 0);
     if (got <= 0) return;
     size_t filled = kept + got, at = 0;
@@ -92,7 +102,7 @@ static void relay(int from, int to) {
 int main(int argc, char **argv) {
   struct sockaddr_in here = {.sin_family = AF_INET, .sin_addr.s_addr = htonl(INADDR_LOOPBACK)};
   socklen_t size = sizeof here;
-  if (argc != 2) return 2;
+  if (argc != 2 && argc != 3) return 2;
   int listening = socket(AF_INET, SOCK_STREAM, 0);
   if (bind(listening, (struct sockaddr *)&here, size) || listen(listening, 1)) fail("listen");
   getsockname(listening, (struct sockaddr *)&here, &size);
@@ -105,6 +115,6 @@ int main(int argc, char **argv) {
   tune(publisher);
   pass_header(subscriber, publisher);
   pass_header(publisher, subscriber);
-  relay(publisher, subscriber);
+  relay(publisher, subscriber, argc == 3 ? watch(publisher) : -1);
   return 0;
 }

@@ -53,11 +53,11 @@ Results = dict[tuple[str, int, str], list[Result]]
 
 
 class CopyingRelay:
-    """The relay in C, a fresh one each run."""
+    """The relay in C, a fresh one each run; `epoll`: it waits for what comes as one with many connections does."""
 
-    name = "C relay"
-
-    def __init__(self) -> None:
+    def __init__(self, *, epoll: bool = False) -> None:
+        self.name = "C with epoll" if epoll else "C relay"
+        self._options = ["epoll"] if epoll else []
         source = HERE / "copying_relay.c"
         if not COPYING.exists() or COPYING.stat().st_mtime < source.stat().st_mtime:
             COPYING.parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +68,8 @@ class CopyingRelay:
     def target(self, publisher: int) -> tuple[int, str]:
         """Start one in front of this publisher."""
         self.close()
-        self._process = subprocess.Popen([str(COPYING), str(publisher)], stdout=subprocess.PIPE, text=True)
+        command = [str(COPYING), str(publisher), *self._options]
+        self._process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert self._process.stdout is not None
         self.pid = self._process.pid
         return int(self._process.stdout.readline()), "-"
@@ -204,7 +205,7 @@ def cell(results: Results, mode: str, size: int, name: str) -> str:
 
 def begin(systems: list[System], *, peers: bool) -> None:
     """Start what is put in the middle in turns."""
-    systems += [Direct(), CopyingRelay(), Relay("relay alone")]
+    systems += [Direct(), CopyingRelay(), CopyingRelay(epoll=True), Relay("relay alone")]
     systems += [monitored(others) for others in (0, 10, 50)]
     if peers:
         systems.append(RosRelay())
