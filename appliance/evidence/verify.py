@@ -5,7 +5,8 @@
 
 It takes Python 3.8 or newer and the command `openssl` (3.0 or newer). Exit status 0: right; 1: not; 2: not a bundle.
 
-1. manifest.json has the SHA-256 of every member but proof.json, and there is no other member.
+1. manifest.json has the SHA-256 of every member but proof.json, and there is no other member, nor a byte in a ZIP file
+   that is no member's and that the format does not ask for.
 2. proof.json is the audit record of this export, and has the SHA-256 of manifest.json.
 3. Every audit record has the hash of the one before, up to a checkpoint that the appliance's key signed. A run of
    records is complete, and the records beside it are of another time.
@@ -26,9 +27,11 @@ if __name__ == "__main__" and not (sys.flags.isolated or getattr(sys.flags, "saf
 import argparse
 import hashlib
 import json
+import struct
 import subprocess
 import tempfile
 import zipfile
+import zlib
 from collections import Counter
 from pathlib import Path
 from typing import Any, Callable, Iterator
@@ -43,6 +46,9 @@ COLUMNS = (
 MOST = 16 << 20  # bytes of a member that is read at once, or of a line
 CHAIN = {"previous", "hash", "then", "checkpoint"}
 SEALED = ("log", "number", "sequence", "hash", "time", "previous", "removed")
+# Of a ZIP file: an entry of the directory, the header of a member, the end; what the appliance writes where it is free.
+ENTRY, HEADER, END = map(struct.Struct, ("<4s4B4H3L5H2L", "<4s2B4H3L2H", "<4s4H2LH"))
+FREE, LARGE = (3, 0, 0, 33, 0, 0, 0o644 << 16), 0xFFFFFFFF
 Opener = Callable[[str], Any]
 
 
@@ -79,25 +85,97 @@ def packed(value: Any) -> bytes:
     return bytes([(0xC4 if data is value else 0xD9) + power]) + len(data).to_bytes(1 << power, "big") + data
 
 
-def opened(place: Path) -> tuple[list[str], Opener]:
-    """The names in a ZIP file or a folder, and what opens one."""
+def extra(*sizes: int) -> bytes:
+    """The extra field for sizes that a header has no room for."""
+    return struct.pack(f"<2H{len(sizes)}Q", 1, 8 * len(sizes), *sizes)
+
+
+def ends(file: Any, size: int) -> bool:
+    """Whether the compressed text that begins here has so many bytes, and zeros in the bits that are left over."""
+    unpacker = zlib.decompressobj(-15)
+    while size > 1 and not unpacker.eof:
+        piece = file.read(min(size - 1, 4096))
+        unpacker.decompress(piece)
+        size -= len(piece) or size
+    last, other = file.read(1)[0], unpacker.copy()
+    text = unpacker.decompress(bytes([last]))
+    spare = last and other.decompress(bytes([last ^ 1 << last.bit_length() - 1])) == text and other.eof
+    return size == 1 and unpacker.eof and not unpacker.unused_data and not spare
+
+
+def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
+    """What a ZIP file has that is no member's; empty where another program packed it, which is free in some bytes."""
+    file: Any = archive.fp
+    file.seek(archive.start_dir)
+    directory, at, begin, members = file.read(MOST), 0, 0, archive.infolist()
+    free: set[Any] = {FREE}  # what packers write as they like
+    for one in members:
+        name, where, packed, size = one.filename, one.header_offset, one.compress_size, one.file_size
+        entry = ENTRY.unpack_from(directory, begin)
+        text = directory[begin + ENTRY.size :][: entry[12]]
+        begin += ENTRY.size + sum(entry[12:15])
+        usual = {*entry[1:4:2]} <= {20, 45} and not entry[5] & ~0x808
+        free.add(usual and (*entry[2:5:2], *entry[7:9], *entry[15:18]))
+        if where != at:
+            yield f"bytes {at} to {where}: belong to no member"
+        large = (b"", extra(size, packed), extra(where), extra(size, packed, where))
+        if one.comment or one.extra not in large:
+            yield f"{name!a}: has a comment or an extra field"
+        file.seek(where)
+        header = HEADER.unpack(file.read(HEADER.size))
+        name_here = file.read(header[10])
+        told = (0, 0, 0) if one.flag_bits & 8 else (one.CRC, packed, size)
+        same = (
+            header[0] == b"PK\3\4" and header[1] in (20, entry[3]) and header[2:8] == (*entry[4:9], told[0])
+        )
+        if not same or header[8:10] not in (told[1:], (LARGE, LARGE)) or name_here != text:
+            yield f"{name!a}: its header is another than in the directory"
+        if file.read(header[11]) not in (b"", extra(0, 0), extra(size, packed)):
+            yield f"{name!a}: has an extra field"
+        at = file.tell() + packed
+        if not (ends(file, packed) if one.compress_type else packed == size):
+            yield f"{name!a}: something stands behind it"
+        file.seek(at)
+        forms = ("<4sLQQ", "<4s3L") if max(packed, size) < LARGE else ("<4sLQQ",)
+        sealed, after = (
+            [struct.pack(form, b"PK\7\x08", one.CRC, packed, size) for form in forms],
+            file.read(24),
+        )
+        at += next((len(seal) for seal in sealed if after.startswith(seal)), 0) if one.flag_bits & 8 else 0
+    start, count = archive.start_dir, len(members)
+    if at != start:
+        yield f"bytes {at} to {start}: belong to no member"
+    few = min(count, 0xFFFF)
+    end = END.pack(b"PK\5\6", 0, 0, few, few, min(begin, LARGE), min(start, LARGE), 0)
+    much = struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, count, count, begin, start)
+    if directory[begin:] not in (end, much + struct.pack("<4sLQL", b"PK\6\7", 0, start + begin, 1) + end):
+        yield f"bytes {start + begin} to the end: are not the end of this ZIP file"
+    if free != {FREE}:
+        yield ""
+
+
+def opened(place: Path) -> tuple[list[str], Opener, Iterator[str]]:
+    """The names in a ZIP file or a folder, what opens one, and what is beside them."""
     if not place.is_dir():
         archive = zipfile.ZipFile(place)
-        return archive.namelist(), archive.open
+        return archive.namelist(), archive.open, foreign(archive)
     paths = [path for path in place.rglob("*") if path.is_symlink() or not path.is_dir()]
     strange = {path: "" if path.is_file() and not path.is_symlink() else " (no file)" for path in paths}
     names = [path.relative_to(place).as_posix() + strange[path] for path in paths]
-    return names, lambda name: (place / name).open("rb")
+    return names, lambda name: (place / name).open("rb"), iter(())
 
 
 class Verifier:
     """What is wrong with a bundle (`findings`), and what it does not prove (`notes`)."""
 
     def __init__(
-        self, names: list[str], opener: Opener, key: Path, copies: dict[int, dict[str, Any]]
+        self, place: Path, key: Path | None, folder: Path, copies: dict[int, dict[str, Any]]
     ) -> None:
-        self.names, self.open, self.key, self.copies = names, opener, key, copies
-        order = ["openssl", "pkey", "-pubin", "-outform", "DER", "-in", str(key)]
+        self.names, self.open, self.foreign = opened(place)
+        self.key, self.copies = folder / "key", copies
+        with key.open("rb") if key else self.open("audit.pub") as file:
+            self.key.write_bytes(file.read(MOST))
+        order = ["openssl", "pkey", "-pubin", "-outform", "DER", "-in", str(self.key)]
         self.raw_key = subprocess.run(order, check=True, capture_output=True).stdout[-32:].hex()
         self.findings: list[str] = []
         self.notes: list[str] = []
@@ -110,7 +188,7 @@ class Verifier:
     def run(self) -> None:
         """Look at everything; what cannot be read is a finding as well."""
         looks = {
-            "manifest.json": self.look_at_members, "proof.json": self.look_at_proof,
+            "the ZIP file": self.look_beside, "manifest.json": self.look_at_members, "proof.json": self.look_at_proof,
             "records.ndjson": self.look_at_records, "what the log has the hashes of": self.look_at_texts,
         }  # fmt: skip
         for what, look in looks.items():
@@ -125,6 +203,12 @@ class Verifier:
         if len(data) > MOST:
             raise ValueError(f"{name} has more than {MOST} bytes")
         return data
+
+    def look_beside(self) -> None:
+        """Rule 1, of what is no member's."""
+        for found in self.foreign:
+            self.findings += [f"the ZIP file: {found}"] if found else []
+            self.notes += [] if found else ["times and attributes in the ZIP file: another program packed it"]
 
     def look_at_members(self) -> None:
         """Rule 1."""
@@ -284,13 +368,9 @@ def main(arguments: list[str]) -> int:
     given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         try:
-            names, opener = opened(given.bundle)
-            key = Path(folder, "key")
-            with given.key.open("rb") if given.key else opener("audit.pub") as file:
-                key.write_bytes(file.read(MOST))
             lines = given.checkpoints.read_text().splitlines() if given.checkpoints else []
             copies = {copy["number"]: copy for copy in map(json.loads, lines)}
-            verifier = Verifier(names, opener, key, copies)
+            verifier = Verifier(given.bundle, given.key, Path(folder), copies)
         except Exception as error:
             print(printable(f"nothing can be verified: {error}"))
             return 2

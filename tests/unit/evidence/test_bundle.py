@@ -246,16 +246,87 @@ def test_a_name_that_is_there_twice_is_named(bundle: Path, tmp_path: Path, revie
 def test_a_file_that_is_cut_or_damaged_is_never_right(
     bundle: Path, tmp_path: Path, reviewer: Reviewer
 ) -> None:
-    """Cut anywhere, or with another byte anywhere: it is wrong, or each member is what it was."""
+    """Cut anywhere, or with another byte anywhere: it is wrong, or each text is what it was, and a header says it."""
     whole, members, chance = bundle.read_bytes(), members_of(bundle), random.Random(6)  # noqa: S311  the same each time
     place = tmp_path / "damaged.zip"
     for length in [0, 1, len(whole) - 1, *chance.sample(range(len(whole)), 5)]:
         place.write_bytes(whole[:length])
         assert reviewer.status(place) == 2
-    for position in chance.sample(range(len(whole)), 60):
+    with zipfile.ZipFile(bundle) as archive:
+        frame = [*range(archive.start_dir - 24, len(whole))]
+        frame += [one.header_offset + byte for one in archive.infolist() for byte in range(50)]
+    for position in chance.sample(range(len(whole)), 30) + chance.sample(frame, 120):
         place.write_bytes(whole[:position] + bytes([whole[position] ^ 0x20]) + whole[position + 1 :])
-        assert reviewer.status(place) or members_of(place) == members, position
+        if not reviewer.status(place):
+            assert members_of(place) == members
+            assert position not in frame or "another program packed it" in reviewer.said, position
     assert reviewer.status(tmp_path / "missing.zip") == 2
+
+
+def _longer(place: Path) -> bytes:
+    """With four bytes in the last member that its size counts, and that nobody unpacks."""
+    with zipfile.ZipFile(place) as archive:
+        last, end, whole = archive.infolist()[-1], archive.start_dir, place.read_bytes()
+    whole = whole[:end] + b"evil" + whole[end:]
+    for at, number in (
+        (last.header_offset + 18, last.compress_size + 4),
+        (whole.rindex(b"PK\1\2") + 20, last.compress_size + 4),
+        (len(whole) - 6, end + 4),
+    ):
+        whole = whole[:at] + struct.pack("<L", number) + whole[at + 4 :]
+    return whole
+
+
+def test_what_is_beside_the_members_is_named(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
+    """Before, between and behind them, in comments and extra fields: a ZIP tool shows none of it."""
+    members, place = members_of(bundle), tmp_path / "x.zip"
+    whole = bundle.read_bytes()
+
+    def packed(change: Callable[[zipfile.ZipFile], object] = lambda _archive: None, **about: Any) -> Path:
+        with zipfile.ZipFile(place, "w") as archive:
+            for name, data in members.items():
+                one = zipfile.ZipInfo(name)
+                for field, value in about.items():
+                    setattr(one, field, value)
+                archive.writestr(one, data)
+            change(archive)
+        return place
+
+    def raw(data: bytes) -> Path:
+        place.write_bytes(data)
+        return place
+
+    def between(archive: zipfile.ZipFile) -> None:
+        """As a tool does that removes a member from the directory alone."""
+        archive.writestr("left", b"out")
+        archive.filelist.pop()
+
+    def commented(archive: zipfile.ZipFile) -> None:
+        archive.comment = b"read me"
+
+    assert reviewer.status(packed()) == 0
+    assert "unproven  times and attributes in the ZIP file: another program packed it" in reviewer.said
+    assert reviewer.status(packed(compress_type=zipfile.ZIP_DEFLATED)) == 0
+    assert reviewer.status(bundle) == 0
+    assert "another program" not in reviewer.said
+    with zipfile.ZipFile(bundle) as archive:
+        first = archive.infolist()[0]
+    end = first.header_offset + 30 + len(first.filename) + 20 + first.compress_size
+    cases: list[tuple[Callable[[], Path], str]] = [
+        (lambda: raw(b"before" + whole), "bytes 0 to 6: belong to no member"),
+        (lambda: raw(whole + b"after"), "to the end: are not the end"),
+        (lambda: raw(whole[: end + 24] + b"hole" + whole[end + 24 :]), "belong to no member"),
+        (lambda: packed(between), "belong to no member"),
+        (lambda: packed(commented), "to the end: are not the end"),
+        (lambda: packed(comment=b"read me"), "'verify.py': has a comment or an extra field"),
+        (lambda: packed(extra=b"\xca\xfe\x04\0evil"), "'verify.py': has an extra field"),
+        (lambda: packed(extra=struct.pack("<2HQ", 1, 8, 0xE511)), "'verify.py': has an extra field"),
+        (lambda: raw(_longer(packed(compress_type=zipfile.ZIP_DEFLATED))), "'proof.json': something stands behind"),
+        (lambda: raw(_longer(packed())), "'proof.json': something stands behind it"),
+    ]  # fmt: skip
+    for wrong, words in cases:
+        assert reviewer.status(wrong()) == 1, (words, reviewer.said)
+        assert words in reviewer.said
 
 
 @pytest.mark.parametrize("kind", ["link", "fifo", "folder"])
@@ -525,6 +596,6 @@ def test_the_verifier_is_a_program_for_python_3_8() -> None:
     imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
     imported |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert imported == {
-        "__future__", "argparse", "collections", "hashlib", "json", "pathlib", "subprocess", "sys", "tempfile",
-        "typing", "zipfile",
+        "__future__", "argparse", "collections", "hashlib", "json", "pathlib", "struct", "subprocess", "sys",
+        "tempfile", "typing", "zipfile", "zlib",
     }  # fmt: skip
