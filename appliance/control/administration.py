@@ -1,8 +1,8 @@
 """What operators can do with the running appliance, over the admin socket and over REST alike.
 
 One core for both: a request of `appliance.channel.admin` in, an answer out. A request is answered by the method that
-takes it: of `Looks`, `PolicyOrders`, `MonitorOrders`, `HostOrders`, `TokenOrders`, `RecordingOrders` or
-`EvidenceOrders`. To add a question, write the request and the struct that answers it, and such a method.
+takes it: of `Looks`, `PolicyOrders`, `MonitorOrders`, `TokenOrders`, `RecordingOrders`, `EvidenceOrders`, or `Hosts`
+and its parts. To add a question, write the request and the struct that answers it, and such a method.
 """
 
 import inspect
@@ -14,7 +14,6 @@ from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
-from appliance.control.host_orders import HostOrders
 from appliance.control.looks import Looks
 from appliance.control.monitor_orders import MonitorOrders
 from appliance.control.policies import PolicyRefusedError, RevisionChangedError
@@ -22,6 +21,10 @@ from appliance.control.policy_orders import PolicyOrders
 from appliance.control.recording_orders import RecorderAwayError, RecordingOrders
 from appliance.control.token_orders import TokenOrders
 from appliance.control.tokens import TokenRefusedError
+from appliance.hosts.certification import Certification
+from appliance.hosts.checked_ports import CheckedPorts
+from appliance.hosts.hosts import Hosts
+from appliance.hosts.self_service import SelfService
 from appliance.hosts.table import (
     HostForbiddenError,
     HostRefusedError,
@@ -47,7 +50,10 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     RecorderAwayError: "failed",
     NotSealedError: "failed",
 }
-_Orders = PolicyOrders | MonitorOrders | HostOrders | TokenOrders | RecordingOrders | EvidenceOrders
+_Orders = (
+    PolicyOrders | MonitorOrders | TokenOrders | RecordingOrders | EvidenceOrders
+    | Hosts | SelfService | CheckedPorts | Certification
+)  # fmt: skip
 _Method = Callable[..., Awaitable[Any]]
 
 

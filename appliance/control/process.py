@@ -22,6 +22,7 @@ from appliance.audit.record import Severity
 from appliance.audit.retention import Retention
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
+from appliance.channel.admin import HostsReload
 from appliance.channel.answers.status import AuditState
 from appliance.channel.channel import Channel
 from appliance.config import Settings, load_resolved
@@ -32,7 +33,6 @@ from appliance.control.clock import Clock
 from appliance.control.doors import Doors
 from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.forwarder import Forwarded
-from appliance.control.host_orders import HostOrders
 from appliance.control.lifeline import ControlLifeline
 from appliance.control.looks import Looks
 from appliance.control.monitor_orders import MonitorOrders
@@ -195,6 +195,7 @@ class _Control:
             self._certification,
             partial(find_endpoint, self._settings.ipsec.endpoint, self._lifeline.endpoint),
             expel=self._parts.expel,
+            carried_out=self._parts.relay.carried_out,
             machines=self._parts.machines,
         )
 
@@ -244,7 +245,10 @@ class _Control:
             looks,
             PolicyOrders(base.policies, base.store, parts.relay.carried_out),
             MonitorOrders(parts),
-            HostOrders(self._hosts, parts.relay.carried_out),
+            self._hosts,
+            self._hosts.itself,
+            self._hosts.ports,
+            self._certification,
             TokenOrders(self._tokens),
             parts.recordings,
             EvidenceOrders(self._audit, base.trail),
@@ -388,7 +392,7 @@ class _Control:
 
     async def _reload_hosts(self) -> None:
         try:
-            await self._hosts.reload("disk")
+            await self._hosts.reload(HostsReload(), "disk")
         except HostRefusedError as error:
             _log.error("hosts.yaml was refused", reason=str(error))
 

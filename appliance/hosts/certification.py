@@ -16,6 +16,7 @@ from typing import Any
 
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
+from appliance.channel import admin
 from appliance.channel.answers.hosts import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
 from appliance.hosts.authority import Authority, AuthorityError
@@ -157,7 +158,7 @@ class Certification:
             kept=kept or {},
         )
 
-    async def revocations(self) -> RevocationList:
+    async def revocations(self, _request: admin.RevocationsWanted) -> RevocationList:
         """The authority's list of revoked certificates, in PEM. Raises `HostRefusedError`."""
         try:
             listed = await self.tunnels.revocations.signed()
@@ -165,7 +166,7 @@ class Certification:
             raise HostRefusedError(str(error), ours=True) from error
         return RevocationList(listed.decode())
 
-    async def authority(self) -> AuthorityCertificate:
+    async def authority(self, _request: admin.AuthorityWanted) -> AuthorityCertificate:
         """The authority's certificate, in PEM. Raises `HostRefusedError`."""
         return AuthorityCertificate((await self.authority_certificate()).decode())
 

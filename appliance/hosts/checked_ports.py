@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 
 from appliance.audit.record import Severity
+from appliance.channel import admin
 from appliance.channel.answers.hosts import PortsTold
 from appliance.hosts.certification import Certification
 from appliance.hosts.table import HostRefusedError
@@ -28,23 +29,15 @@ class CheckedPorts:
         self._view = view
         self._machines = machines
 
-    async def tell(
-        self,
-        name: str,
-        state: str,
-        opened: list[int],
-        *,
-        checked: float,
-        who: str,
-        expected: int | None = None,
-    ) -> PortsTold:
-        """What somebody saw of a machine's ports from outside. Raises as `add`."""
-        self._table.require(expected)
-        key = self._known_machine(name)
+    async def tell(self, request: admin.HostPorts, who: str) -> PortsTold:
+        """What somebody saw of a machine's ports from outside. Raises `HostRefusedError`, `HostsChangedError`."""
+        self._table.require(request.expected)
+        key, state = self._known_machine(request.name), request.state
         now = time.time()
+        checked = now if request.checked is None else request.checked
         if checked > now + _CLOCKS_DIFFER:
             raise HostRefusedError("the moment of the check is more than a day ahead")
-        row = PortsRow(key, state, sorted(set(opened))[:_MOST_PORTS], min(checked, now), who)
+        row = PortsRow(key, state, sorted(set(request.open))[:_MOST_PORTS], min(checked, now), who)
         self._table.keep_ports(row)
         self._trail.happened(
             "ports checked",

@@ -1,5 +1,7 @@
 """The hosts that come through tunnels, as operators deal with them: enrolled, awaited, given kits, revoked.
 
+Each request about hosts is answered by the method that takes it, here, of `itself`, of `ports` or of `Certification`.
+
 Invariants:
 
 1. A revoked host is out of the policy, and its registrations are taken back, before anything is awaited.
@@ -12,6 +14,7 @@ import ssl
 from collections.abc import Awaitable, Callable
 
 from appliance.audit.record import Severity
+from appliance.channel import admin
 from appliance.channel.answers import hosts as answers
 from appliance.channel.answers.status import IpsecState
 from appliance.hosts.certification import Certification
@@ -29,16 +32,19 @@ from appliance.store.hosts import AwaitedRow
 class Hosts:
     """All hosts; `itself` is what they do themselves.
 
-    `expel(address, reason)` takes back what a host has, and says how much that was. `endpoint()` finds where hosts
+    `expel(address, reason)` takes back what a host has, and says how much that was. `find_endpoint()` finds where hosts
     reach the appliance, as `appliance.hosts.endpoint` has it; `machines()` is the number of nodes by address.
+    `carried_out()` waits until the relays have carried out what they were told: who was told that a host is out finds
+    its connections closed.
     """
 
     def __init__(
         self,
         certification: Certification,
-        endpoint: Callable[[], Awaitable[answers.Endpoint]],
+        find_endpoint: Callable[[], Awaitable[answers.Endpoint]],
         *,
         expel: Callable[[Address, str], int],
+        carried_out: Callable[[], Awaitable[None]],
         machines: Callable[[], dict[str, int]],
     ) -> None:
         self._certification = certification
@@ -49,15 +55,14 @@ class Hosts:
         self._awaited = certification.awaited
         self._view = HostView(self._table, self._awaited, self._tunnels)
         self.itself = SelfService(certification)
-        self.revocations = certification.revocations
-        self.authority = certification.authority
         self.ports = CheckedPorts(certification, self._view, machines)
-        self.endpoint = endpoint
+        self._find_endpoint = find_endpoint
         self._expel = expel
+        self._carried_out = carried_out
 
     # --- what others ask ---
 
-    def overview(self) -> answers.Hosts:
+    async def listed(self, _request: admin.HostList) -> answers.Hosts:
         """Every host and machine, and how the tunnels stand."""
         machines = self.ports.in_clear_text()
         status = self._view.status(machines)
@@ -76,68 +81,58 @@ class Hosts:
         """Every host, enrolled, awaited or declared."""
         return self._view.rows()
 
+    async def endpoint(self, _request: admin.HostEndpoint) -> answers.Endpoint:
+        """Where hosts reach the appliance."""
+        return await self._find_endpoint()
+
+    async def kit(self, request: admin.HostKit) -> answers.KitParts:
+        """What an enrolled host's kit is made of now. Raises `HostRefusedError`."""
+        self._table.enrolled_row(request.name)
+        return await self._certification.kit(request.name, None)
+
     # --- what operators do ---
 
-    async def add(
-        self,
-        name: str,
-        request: str,
-        *,
-        days: float,
-        who: str,
-        address: str | None = None,
-        expected: int | None = None,
-    ) -> answers.KitParts:
+    async def add(self, request: admin.HostAdd, who: str) -> answers.KitParts:
         """Enrol a host; what its kit is made of. Raises `HostRefusedError`, `HostsChangedError`."""
+        name = request.name
         async with self._certification.changing:
-            self._table.require(expected)
+            self._table.require(request.expected)
             self._require_not_enrolled(name)
             self._table.require_name(name)
-            wanted = self._table.address_for(name, address, self._awaited.addresses())
+            wanted = self._table.address_for(name, request.address, self._awaited.addresses())
             await self._tunnels.open()
             with self._certification.unless_revoked(name):
-                made = await self._certification.issue(name, request, days)
+                made = await self._certification.issue(name, request.request, request.days)
             self._certification.enrolled(name, wanted, made, who)
             return await self._certification.finish(name)
 
-    async def renew(
-        self, name: str, request: str, *, days: float, who: str, expected: int | None = None
-    ) -> answers.KitParts:
+    async def renew(self, request: admin.HostRenew, who: str) -> answers.KitParts:
         """A new certificate for a host, the one before revoked. Raises as `add`."""
+        name = request.name
         async with self._certification.changing:
-            self._table.require(expected)
+            self._table.require(request.expected)
             row = self._table.enrolled_row(name)
             await self._tunnels.open()
             with self._certification.unless_revoked(name):
-                made = await self._certification.issue(name, request, days)
+                made = await self._certification.issue(name, request.request, request.days)
             self._certification.keep(name, row.address, made)
             self._certification.renewed(name, row.serial, made.serial, made.expires, who)
             return await self._certification.finish(name)
 
-    async def token(
-        self,
-        name: str,
-        *,
-        kit: dict[str, str],
-        seconds: float,
-        days: float,
-        address: str | None,
-        new: bool,
-        who: str,
-        expected: int | None = None,
-    ) -> answers.EnrolmentToken:
-        """A one-time token for a host; an empty `endpoint` of `kit` is found. Raises as `add`."""
-        found = answers.Endpoint(kit["endpoint"], "") if kit["endpoint"] else await self.endpoint()
+    async def token(self, request: admin.HostToken, who: str) -> answers.EnrolmentToken:
+        """A one-time token for a host. Raises as `add`."""
+        name = request.name
+        found = answers.Endpoint(request.endpoint, "") if request.endpoint else await self._find_endpoint()
         async with self._certification.changing:
-            self._table.require(expected)
+            self._table.require(request.expected)
             self._table.require_name(name)
-            if new:
+            if request.new:
                 self._require_not_enrolled(name)
-            if not 0 < seconds <= LONGEST_SECONDS:
+            if not 0 < request.token_seconds <= LONGEST_SECONDS:
                 raise HostRefusedError(
                     f"a one-time token ends after at most {LONGEST_SECONDS / 86_400:.0f} days"
                 )
-            if not 0 < days <= LONGEST_DAYS:
+            if not 0 < request.days <= LONGEST_DAYS:
                 raise HostRefusedError(f"a certificate is good for at most {LONGEST_DAYS} days")
             if self._certification.rest.port is None:
                 raise HostRefusedError(self._certification.rest.trouble)
@@ -145,15 +140,19 @@ class Hosts:
                 raise HostRefusedError("REST is not there: `rosrv status` and the log say why", ours=True)
             if len(self._awaited.rows()) >= MOST:
                 raise HostRefusedError(f"{MOST} hosts are awaited already: revoke some")
-            promised = self._table.address_for(name, address, self._awaited.addresses())
+            promised = self._table.address_for(name, request.address, self._awaited.addresses())
             await self._tunnels.open()
             authority = await self._certification.authority_certificate()
             row, text = self._awaited.add(
                 name,
-                seconds=seconds,
+                seconds=request.token_seconds,
                 address=promised,
-                days=days,
-                kit=kit | {"endpoint": found.endpoint},
+                days=request.days,
+                kit={
+                    "endpoint": found.endpoint,
+                    "ports": request.ports,
+                    "open": ",".join(request.open),
+                },
                 who=who,
             )
             self._table.changed()
@@ -185,9 +184,10 @@ class Hosts:
                 script=joining.script(),
             )
 
-    async def revoke(self, name: str, who: str, expected: int | None = None) -> answers.Revoked:
+    async def revoke(self, request: admin.HostRevoke, who: str) -> answers.Revoked:
         """Let a host in no more and cut what it has; or await it no longer. Raises as `add`."""
-        self._table.require(expected)
+        name = request.name
+        self._table.require(request.expected)
         self._certification.revoked(name)
         awaited = self._awaited.rows().get(name)
         self._awaited.forget(name)
@@ -210,11 +210,12 @@ class Hosts:
             who=who,
         )
         await self._store.settled()
+        await self._carried_out()
         return answers.Revoked(self._table.revision, name, row.address, row.serial, taken)
 
-    async def reload(self, who: str, expected: int | None = None) -> answers.Reloaded:
+    async def reload(self, request: admin.HostsReload, who: str) -> answers.Reloaded:
         """Read hosts.yaml again: which tunnels are wanted. Raises as `add`; a bad file changes nothing."""
-        self._table.require(expected)
+        self._table.require(request.expected)
         before = {row.name for row in self._table.admitted()}
         try:
             self._table.declared.reload()
@@ -244,6 +245,7 @@ class Hosts:
             divergence=divergence,
             who=who,
         )
+        await self._carried_out()
         return answers.Reloaded(
             self._table.revision,
             sorted(self._table.declared.hosts),
@@ -251,11 +253,6 @@ class Hosts:
             sorted(before - after),
             divergence,
         )
-
-    async def kit(self, name: str) -> answers.KitParts:
-        """What an enrolled host's kit is made of now. Raises `HostRefusedError`."""
-        self._table.enrolled_row(name)
-        return await self._certification.kit(name, None)
 
     def _require_not_enrolled(self, name: str) -> None:
         row = self._table.rows.get(name)

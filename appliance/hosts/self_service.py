@@ -17,6 +17,7 @@ import ipaddress
 import time
 
 from appliance.audit.record import Severity
+from appliance.channel import admin
 from appliance.channel.answers.hosts import KitParts, NewCertificate, Renewed
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment_tokens import BadEnrolmentTokenError
@@ -44,35 +45,40 @@ class SelfService:
             if name.startswith(_RENEWED)
         }
 
-    async def enrol(self, token: str, request: str, peer: str) -> KitParts:
+    async def enrol(self, request: admin.HostEnrol) -> KitParts:
         """A host brings its one-time token and a signing request. Raises `HostRefusedError`."""
         async with self._certification.changing:
             try:
-                awaited = self._certification.awaited.take(token)
+                awaited = self._certification.awaited.take(request.token)
             except BadEnrolmentTokenError as error:
                 self._trail.happened(
-                    "enrolment refused", str(error), severity=Severity.WARNING, decision="deny", host=peer
+                    "enrolment refused",
+                    str(error),
+                    severity=Severity.WARNING,
+                    decision="deny",
+                    host=request.peer,
                 )
                 raise HostForbiddenError(str(error)) from error
             name = awaited.name
             try:
                 await self._tunnels.open()
                 with self._certification.unless_revoked(name):
-                    made = await self._certification.issue(name, request, awaited.days)
+                    made = await self._certification.issue(name, request.request, awaited.days)
             except HostForbiddenError:
                 raise
             except HostRefusedError:
                 self._certification.awaited.give_back(awaited)
                 raise
             self._certification.enrolled(
-                name, awaited.address, made, awaited.who, token=awaited.id, peer=peer
+                name, awaited.address, made, awaited.who, token=awaited.id, peer=request.peer
             )
             return await self._certification.finish(name, awaited.kit)
 
-    async def renew(self, name: str, request: str, proof: bytes, peer: str) -> NewCertificate:
+    async def renew(self, request: admin.HostRenewItself) -> NewCertificate:
         """A host asks in its tunnel for its next certificate. Raises `HostRefusedError`."""
+        name = request.name
         async with self._certification.changing:
-            row = self._in_its_tunnel(name, peer)
+            row = self._in_its_tunnel(name, request.peer)
             certificate = self._table.certificates.get(name)
             if certificate is None or not certificate.certificate:
                 raise HostRefusedError(f"the certificate of {name} is not kept here: rosrv host kit {name}")
@@ -80,7 +86,11 @@ class SelfService:
             self._require_patience(name, life)
             with self._certification.unless_revoked(name):
                 made = await self._certification.issue(
-                    name, request, life / 86_400, proof=proof, former=certificate.certificate.encode()
+                    name,
+                    request.request,
+                    life / 86_400,
+                    proof=request.proof,
+                    former=certificate.certificate.encode(),
                 )
             self._table.keep_next(name, made)
             self._note_renewal(name)
@@ -90,9 +100,10 @@ class SelfService:
                 name, made.serial, made.expires, made.certificate.decode(), authority.decode()
             )
 
-    async def renewed(self, name: str, peer: str) -> Renewed:
+    async def renewed(self, request: admin.HostRenewed) -> Renewed:
         """A host has put its next certificate in place. Raises `HostRefusedError`."""
-        before = self._in_its_tunnel(name, peer).serial
+        name = request.name
+        before = self._in_its_tunnel(name, request.peer).serial
         row = self._table.take_next(name)
         if row is None:
             raise HostRefusedError(f"{name} was given no certificate that is to follow: renew first")

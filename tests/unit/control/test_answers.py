@@ -11,7 +11,6 @@ from appliance.channel.admin import answer_to
 from appliance.channel.answers.graph import TopicMessage
 from appliance.control import (
     evidence_orders,
-    host_orders,
     looks,
     monitor_orders,
     policy_orders,
@@ -19,6 +18,10 @@ from appliance.control import (
     token_orders,
 )
 from appliance.control.administration import request_of
+from appliance.hosts.certification import Certification
+from appliance.hosts.checked_ports import CheckedPorts
+from appliance.hosts.hosts import Hosts
+from appliance.hosts.self_service import SelfService
 
 METHODS = [
     method
@@ -26,7 +29,10 @@ METHODS = [
         looks.Looks,
         policy_orders.PolicyOrders,
         monitor_orders.MonitorOrders,
-        host_orders.HostOrders,
+        Hosts,
+        SelfService,
+        CheckedPorts,
+        Certification,
         token_orders.TokenOrders,
         recording_orders.RecordingOrders,
         evidence_orders.EvidenceOrders,

@@ -15,6 +15,20 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from appliance.audit.log import AuditLog
+from appliance.channel.admin import (
+    AuthorityWanted,
+    HostAdd,
+    HostEnrol,
+    HostList,
+    HostPorts,
+    HostRenew,
+    HostRenewed,
+    HostRenewItself,
+    HostRevoke,
+    HostsReload,
+    HostToken,
+    RevocationsWanted,
+)
 from appliance.channel.answers.hosts import Endpoint, EnrolmentToken, KitParts, PortsSeen
 from appliance.channel.messages import CertificateMade, Message, TunnelsEnclosed, TunnelsWanted
 from appliance.hosts.authority import Authority, AuthorityError
@@ -83,7 +97,7 @@ class Bench:
         self.trail = HeardTrail(self.log)
         self.table = HostTable(self.store, ipaddress.IPv4Network(pool), Declared(self.declared))
         self.tunnels = Tunnels(self.table, self.trail, self.authority, listen=(listen, 11311), say=self._said)
-        certification = Certification(
+        self.certification = certification = Certification(
             self.store,
             self.trail,
             self.authority,
@@ -96,7 +110,15 @@ class Bench:
         certification.served_by("sha256//pin")
         self.machines: dict[str, int] = {}
         self.each_hour = certification.each_hour
-        self.hosts = Hosts(certification, self._endpoint, expel=self._expel, machines=lambda: self.machines)
+        self.relays = asyncio.Event()
+        self.relays.set()
+        self.hosts = Hosts(
+            certification,
+            self._endpoint,
+            expel=self._expel,
+            carried_out=self._carried_out,
+            machines=lambda: self.machines,
+        )
 
     def close(self) -> None:
         """End the threads."""
@@ -106,6 +128,9 @@ class Bench:
     def _said(self, message: Message) -> None:
         self.asked.append(message)
         self.tunnels.answered(self.answer)
+
+    async def _carried_out(self) -> None:
+        await self.relays.wait()
 
     async def _endpoint(self) -> Endpoint:
         return Endpoint("10.0.0.1", "it is")
@@ -128,9 +153,7 @@ def sign(key: bytes, request: str) -> bytes:
 
 def add(bench: Bench, name: str, address: str | None = None) -> Coroutine[Any, Any, KitParts]:
     """Enrol a host with a key of its own."""
-    return bench.hosts.add(
-        name, signing_request(make_key(), name).decode(), days=90, address=address, who="tester"
-    )
+    return bench.hosts.add(HostAdd(name, signing_request(make_key(), name).decode(), 90, address), "tester")
 
 
 @pytest.fixture(autouse=True)
@@ -157,11 +180,11 @@ def test_addresses_are_given_in_order_and_kept(tmp_path: Path) -> None:
 
     async def work(bench: Bench) -> None:
         bench.declared.write_text("hosts:\n  - name: laptop\n    address: 10.113.11.3\n")
-        await bench.hosts.reload("tester")
+        await bench.hosts.reload(HostsReload(), "tester")
         assert (await add(bench, "a")).address == "10.113.11.2"
         assert (await add(bench, "b")).address == "10.113.11.4"
         assert (await add(bench, "laptop")).address == "10.113.11.3"
-        await bench.hosts.revoke("a", "tester")
+        await bench.hosts.revoke(HostRevoke("a"), "tester")
         assert (await add(bench, "c")).address == "10.113.11.5"
         assert (await add(bench, "a")).address == "10.113.11.2"
         assert (await add(bench, "d")).address == "10.113.11.6"
@@ -189,7 +212,7 @@ def test_a_name_that_cannot_be_had_is_refused(tmp_path: Path, name: str) -> None
 
     async def work(bench: Bench) -> None:
         with pytest.raises(HostRefusedError, match="no name for a host"):
-            await bench.hosts.add(name, "", days=90, who="tester")
+            await bench.hosts.add(HostAdd(name, "", 90), "tester")
 
     run(tmp_path, work)
 
@@ -230,12 +253,12 @@ def test_revoked_is_out_of_the_policy_before_anything_is_awaited(tmp_path: Path)
     async def work(bench: Bench) -> None:
         await add(bench, "a")
         bench.order.clear()
-        body = await bench.hosts.revoke("a", "tester")
+        body = await bench.hosts.revoke(HostRevoke("a"), "tester")
         assert bench.order == ["policy []", "expel 10.113.11.2"]
         assert body.taken_back == 3
         assert [row.serial for row in bench.store.hosts.revoked()] == [body.serial]
         with pytest.raises(HostRefusedError, match="enrolled are: none"):
-            await bench.hosts.revoke("a", "tester")
+            await bench.hosts.revoke(HostRevoke("a"), "tester")
 
     run(tmp_path, work)
 
@@ -248,7 +271,7 @@ def test_a_new_certificate_revokes_the_one_before(tmp_path: Path) -> None:
         with pytest.raises(HostRefusedError, match="rosrv host kit a"):
             await add(bench, "a")
         second = await bench.hosts.renew(
-            "a", signing_request(make_key(), "a").decode(), days=90, who="tester"
+            HostRenew("a", signing_request(make_key(), "a").decode(), 90), "tester"
         )
         assert second.address == first.address
         assert [row.serial for row in bench.store.hosts.revoked()] == [first.serial]
@@ -261,7 +284,7 @@ def test_a_bad_request_enrols_nobody(tmp_path: Path) -> None:
 
     async def work(bench: Bench) -> None:
         with pytest.raises(HostRefusedError, match="not a signing request"):
-            await bench.hosts.add("a", "rubbish", days=90, who="tester")
+            await bench.hosts.add(HostAdd("a", "rubbish", 90), "tester")
         assert bench.hosts.rows() == []
 
     run(tmp_path, work)
@@ -272,13 +295,13 @@ def test_declared_and_not_enrolled_is_shown(tmp_path: Path) -> None:
 
     async def work(bench: Bench) -> None:
         bench.declared.write_text("hosts:\n  - name: laptop\n")
-        await bench.hosts.reload("tester")
+        await bench.hosts.reload(HostsReload(), "tester")
         await add(bench, "a")
         rows = {row.name: (row.state, row.declared) for row in bench.hosts.rows()}
         assert rows == {"a": ("down", False), "laptop": ("not enrolled", True)}
         bench.declared.write_text("hosts: [")
         with pytest.raises(HostRefusedError, match="what was declared before holds"):
-            await bench.hosts.reload("tester")
+            await bench.hosts.reload(HostsReload(), "tester")
         assert [row.name for row in bench.hosts.rows()] == ["a", "laptop"]
         assert any("hosts.yaml" in trouble for trouble in bench.hosts.status().troubles)
 
@@ -294,8 +317,7 @@ def token(
     bench: Bench, name: str, *, seconds: float = 60, new: bool = True
 ) -> Coroutine[Any, Any, EnrolmentToken]:
     """A one-time token."""
-    kit = {"endpoint": "10.0.0.1", "ports": "32768-60999", "open": ""}
-    return bench.hosts.token(name, kit=kit, seconds=seconds, days=90, address=None, new=new, who="tester")
+    return bench.hosts.token(HostToken(name, "10.0.0.1", token_seconds=seconds, new=new), "tester")
 
 
 def recorded(bench: Bench, event: str) -> list[str]:
@@ -311,13 +333,13 @@ def test_a_one_time_token_enrols_once(tmp_path: Path) -> None:
         second = await token(bench, "a")
         for text in (first.token, "rosrv-enrol_000000000000_" + "x" * 43, "rubbish"):
             with pytest.raises(HostForbiddenError, match="wrong, was used before, or has ended"):
-                await bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9")
+                await bench.hosts.itself.enrol(HostEnrol(text, request_of("a"), "10.9.9.9"))
         assert bench.hosts.rows()[0].state == "awaited"
-        body = await bench.hosts.itself.enrol(second.token, request_of("a"), "10.9.9.9")
+        body = await bench.hosts.itself.enrol(HostEnrol(second.token, request_of("a"), "10.9.9.9"))
         assert body.address == second.address
         assert body.kept["endpoint"] == "10.0.0.1"
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.itself.enrol(second.token, request_of("a"), "10.9.9.9")
+            await bench.hosts.itself.enrol(HostEnrol(second.token, request_of("a"), "10.9.9.9"))
         secret = second.token.split("_", 2)[2].encode()
         for file in tmp_path.rglob("*"):
             if file.is_file():
@@ -332,8 +354,8 @@ def test_two_who_bring_a_token_at_once_get_one_certificate(tmp_path: Path) -> No
     async def work(bench: Bench) -> None:
         text = (await token(bench, "a")).token
         both = await asyncio.gather(
-            bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.8"),
-            bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9"),
+            bench.hosts.itself.enrol(HostEnrol(text, request_of("a"), "10.9.9.8")),
+            bench.hosts.itself.enrol(HostEnrol(text, request_of("a"), "10.9.9.9")),
             return_exceptions=True,
         )
         assert sorted(isinstance(one, HostForbiddenError) for one in both) == [False, True]
@@ -347,16 +369,16 @@ def test_a_bad_request_does_not_use_the_token_up(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         text = (await token(bench, "a")).token
         with pytest.raises(HostRefusedError, match="not a signing request"):
-            await bench.hosts.itself.enrol(text, "rubbish", "10.9.9.9")
-        await bench.hosts.itself.enrol(text, request_of("a"), "10.9.9.9")
+            await bench.hosts.itself.enrol(HostEnrol(text, "rubbish", "10.9.9.9"))
+        await bench.hosts.itself.enrol(HostEnrol(text, request_of("a"), "10.9.9.9"))
         short = (await token(bench, "b", seconds=0.05)).token
         await asyncio.sleep(0.06)
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.itself.enrol(short, request_of("b"), "10.9.9.9")
+            await bench.hosts.itself.enrol(HostEnrol(short, request_of("b"), "10.9.9.9"))
         taken_back = (await token(bench, "c")).token
-        assert (await bench.hosts.revoke("c", "tester")).serial == ""
+        assert (await bench.hosts.revoke(HostRevoke("c"), "tester")).serial == ""
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.itself.enrol(taken_back, request_of("c"), "10.9.9.9")
+            await bench.hosts.itself.enrol(HostEnrol(taken_back, request_of("c"), "10.9.9.9"))
 
     run(tmp_path, work)
 
@@ -369,7 +391,7 @@ def test_tokens_outlive_a_restart(tmp_path: Path) -> None:
         texts.append((await token(bench, "a")).token)
 
     async def after(bench: Bench) -> None:
-        assert (await bench.hosts.itself.enrol(texts[0], request_of("a"), "10.9.9.9")).name == "a"
+        assert (await bench.hosts.itself.enrol(HostEnrol(texts[0], request_of("a"), "10.9.9.9"))).name == "a"
 
     run(tmp_path, before)
     run(tmp_path, after)
@@ -381,23 +403,27 @@ def test_revoked_while_a_certificate_is_made(tmp_path: Path, how: str) -> None:
 
     async def work(bench: Bench) -> None:
         key = make_key()
-        await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
+        await bench.hosts.add(HostAdd("a", signing_request(key, "a").decode(), 90), "tester")
         text = (await token(bench, "a", new=False)).token
         tasks: list[asyncio.Task[Any]] = []
 
         def revoke() -> None:
             bench.authority.meanwhile = lambda: None
-            tasks.append(asyncio.get_running_loop().create_task(bench.hosts.revoke("a", "tester")))
+            tasks.append(
+                asyncio.get_running_loop().create_task(bench.hosts.revoke(HostRevoke("a"), "tester"))
+            )
 
         bench.authority.meanwhile = revoke
         request = request_of("a")
         with pytest.raises(HostForbiddenError, match="revoked meanwhile"):
             if how == "kit":
-                await bench.hosts.renew("a", request, days=90, who="tester")
+                await bench.hosts.renew(HostRenew("a", request, 90), "tester")
             elif how == "token":
-                await bench.hosts.itself.enrol(text, request, "10.9.9.9")
+                await bench.hosts.itself.enrol(HostEnrol(text, request, "10.9.9.9"))
             else:
-                await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
+                await bench.hosts.itself.renew(
+                    HostRenewItself("a", request, sign(key, request), "10.113.11.2")
+                )
         await asyncio.gather(*tasks)
         assert bench.hosts.rows()[0].state == "revoked"
         assert bench.tunnels.addresses == {}
@@ -410,19 +436,21 @@ def test_a_host_renews_itself(tmp_path: Path) -> None:
 
     async def work(bench: Bench) -> None:
         key = make_key()
-        first = await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
+        first = await bench.hosts.add(HostAdd("a", signing_request(key, "a").decode(), 90), "tester")
         request = request_of("a")
-        made = await bench.hosts.itself.renew("a", request, sign(key, request), "::ffff:10.113.11.2")
+        made = await bench.hosts.itself.renew(
+            HostRenewItself("a", request, sign(key, request), "::ffff:10.113.11.2")
+        )
         assert made.serial != first.serial
         assert bench.hosts.rows()[0].renewing
         assert bench.store.hosts.revoked() == []
-        await bench.hosts.itself.renewed("a", "10.113.11.2")
+        await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
         assert [row.serial for row in bench.store.hosts.revoked()] == [first.serial]
         assert bench.hosts.rows()[0].serial == made.serial
         with pytest.raises(HostRefusedError, match="renew first"):
-            await bench.hosts.itself.renewed("a", "10.113.11.2")
+            await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
         with pytest.raises(HostRefusedError, match="again in"):
-            await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
+            await bench.hosts.itself.renew(HostRenewItself("a", request, sign(key, request), "10.113.11.2"))
 
     run(tmp_path, work)
 
@@ -432,17 +460,19 @@ def test_renewals_make_a_host_wait_over_restarts(tmp_path: Path) -> None:
     keys = [make_key(), make_key(), make_key()]
 
     async def first(bench: Bench) -> None:
-        await bench.hosts.add("a", signing_request(keys[0], "a").decode(), days=90, who="tester")
+        await bench.hosts.add(HostAdd("a", signing_request(keys[0], "a").decode(), 90), "tester")
         request = signing_request(keys[1], "a").decode()
-        await bench.hosts.itself.renew("a", request, sign(keys[0], request), "10.113.11.2")
-        await bench.hosts.itself.renewed("a", "10.113.11.2")
+        await bench.hosts.itself.renew(HostRenewItself("a", request, sign(keys[0], request), "10.113.11.2"))
+        await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
 
     async def second(bench: Bench) -> None:
         await bench.tunnels.start()
         request = signing_request(keys[2], "a").decode()
         with pytest.raises(HostRefusedError, match="again in 4 days"):
-            await bench.hosts.itself.renew("a", request, sign(keys[1], request), "10.113.11.2")
-        await bench.hosts.renew("a", request, days=90, who="tester")
+            await bench.hosts.itself.renew(
+                HostRenewItself("a", request, sign(keys[1], request), "10.113.11.2")
+            )
+        await bench.hosts.renew(HostRenew("a", request, 90), "tester")
 
     run(tmp_path, first)
     run(tmp_path, second)
@@ -453,11 +483,13 @@ def test_a_short_life_needs_a_short_wait(tmp_path: Path, monkeypatch: pytest.Mon
 
     async def work(bench: Bench) -> None:
         keys = [make_key(), make_key(), make_key()]
-        await bench.hosts.add("a", signing_request(keys[0], "a").decode(), days=100 / 86_400, who="tester")
+        await bench.hosts.add(HostAdd("a", signing_request(keys[0], "a").decode(), 100 / 86_400), "tester")
         for former, key in itertools.pairwise(keys):
             request = signing_request(key, "a").decode()
-            await bench.hosts.itself.renew("a", request, sign(former, request), "10.113.11.2")
-            await bench.hosts.itself.renewed("a", "10.113.11.2")
+            await bench.hosts.itself.renew(
+                HostRenewItself("a", request, sign(former, request), "10.113.11.2")
+            )
+            await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
             now = time.time()
             monkeypatch.setattr(time, "time", lambda now=now: now + 6)
 
@@ -469,8 +501,8 @@ def test_nobody_renews_for_another(tmp_path: Path) -> None:
 
     async def work(bench: Bench) -> None:
         key, other = make_key(), make_key()
-        await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
-        await bench.hosts.add("b", signing_request(other, "b").decode(), days=90, who="tester")
+        await bench.hosts.add(HostAdd("a", signing_request(key, "a").decode(), 90), "tester")
+        await bench.hosts.add(HostAdd("b", signing_request(other, "b").decode(), 90), "tester")
         request = request_of("a")
         good = sign(key, request)
         for name, peer in (
@@ -480,15 +512,15 @@ def test_nobody_renews_for_another(tmp_path: Path) -> None:
             ("b", "10.113.11.2"),
         ):
             with pytest.raises(HostForbiddenError):
-                await bench.hosts.itself.renew(name, request, good, peer)
+                await bench.hosts.itself.renew(HostRenewItself(name, request, good, peer))
             with pytest.raises(HostForbiddenError):
-                await bench.hosts.itself.renewed(name, peer)
+                await bench.hosts.itself.renewed(HostRenewed(name, peer))
         with pytest.raises(HostRefusedError, match="not signed by the key"):
-            await bench.hosts.itself.renew("a", request, sign(other, request), "10.113.11.2")
+            await bench.hosts.itself.renew(HostRenewItself("a", request, sign(other, request), "10.113.11.2"))
         assert len(recorded(bench, "renewal refused")) == 8
         bench.tunnels.answered(TunnelsEnclosed(None, "the firewall is gone"))
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.itself.renew("a", request, good, "10.113.11.2")
+            await bench.hosts.itself.renew(HostRenewItself("a", request, good, "10.113.11.2"))
 
     run(tmp_path, work)
 
@@ -498,16 +530,18 @@ def test_revoking_amid_a_renewal_revokes_both_certificates(tmp_path: Path) -> No
 
     async def work(bench: Bench) -> None:
         key = make_key()
-        first = await bench.hosts.add("a", signing_request(key, "a").decode(), days=90, who="tester")
+        first = await bench.hosts.add(HostAdd("a", signing_request(key, "a").decode(), 90), "tester")
         request = request_of("a")
-        made = await bench.hosts.itself.renew("a", request, sign(key, request), "10.113.11.2")
-        await bench.hosts.revoke("a", "tester")
+        made = await bench.hosts.itself.renew(
+            HostRenewItself("a", request, sign(key, request), "10.113.11.2")
+        )
+        await bench.hosts.revoke(HostRevoke("a"), "tester")
         assert {row.serial for row in bench.store.hosts.revoked()} == {
             first.serial,
             made.serial,
         }
         with pytest.raises(HostForbiddenError):
-            await bench.hosts.itself.renewed("a", "10.113.11.2")
+            await bench.hosts.itself.renewed(HostRenewed("a", "10.113.11.2"))
         again = await add(bench, "a")
         assert again.address == first.address
         assert again.serial not in {first.serial, made.serial}
@@ -520,13 +554,17 @@ def test_the_list_is_signed_once_however_often_it_is_asked_for(tmp_path: Path) -
 
     async def work(bench: Bench) -> None:
         first = await add(bench, "a")
-        assert "BEGIN CERTIFICATE" in (await bench.hosts.authority()).authority
+        assert "BEGIN CERTIFICATE" in (await bench.certification.authority(AuthorityWanted())).authority
         assert bench.authority.lists == 0
-        answers = await asyncio.gather(*(bench.hosts.revocations() for _ in range(20)))
+        answers = await asyncio.gather(
+            *(bench.certification.revocations(RevocationsWanted()) for _ in range(20))
+        )
         assert bench.authority.lists == 1
         assert len({one.revocations for one in answers}) == 1
-        await bench.hosts.revoke("a", "tester")
-        after = x509.load_pem_x509_crl((await bench.hosts.revocations()).revocations.encode())
+        await bench.hosts.revoke(HostRevoke("a"), "tester")
+        after = x509.load_pem_x509_crl(
+            (await bench.certification.revocations(RevocationsWanted())).revocations.encode()
+        )
         assert [f"{one.serial_number:x}" for one in after] == [first.serial]
         assert bench.authority.lists == 2
 
@@ -541,14 +579,14 @@ def test_a_full_list_replaces_no_certificate(tmp_path: Path, monkeypatch: pytest
         for name in ("a", "b"):
             await add(bench, name)
         for _ in range(2):
-            await bench.hosts.renew("a", request_of("a"), days=90, who="tester")
+            await bench.hosts.renew(HostRenew("a", request_of("a"), 90), "tester")
         key_before = bench.hosts.rows()[1].serial
         with pytest.raises(HostRefusedError, match=r"list of revoked certificates is full.*before 2"):
-            await bench.hosts.renew("b", request_of("b"), days=90, who="tester")
+            await bench.hosts.renew(HostRenew("b", request_of("b"), 90), "tester")
         assert bench.hosts.rows()[1].serial == key_before
         await add(bench, "c")
-        await bench.hosts.revoke("a", "tester")
-        await bench.hosts.renew("b", request_of("b"), days=90, who="tester")
+        await bench.hosts.revoke(HostRevoke("a"), "tester")
+        await bench.hosts.renew(HostRenew("b", request_of("b"), 90), "tester")
         assert bench.hosts.status().troubles == []
 
     run(tmp_path, work)
@@ -558,17 +596,17 @@ def test_a_change_for_another_state_is_refused(tmp_path: Path) -> None:
     """Two engineers cannot overwrite each other: the revision grows with every change, over restarts."""
 
     async def work(bench: Bench) -> None:
-        seen = bench.hosts.overview().revision
+        seen = (await bench.hosts.listed(HostList())).revision
         await add(bench, "a")
         for late in (
-            bench.hosts.revoke("a", "tester", seen),
-            bench.hosts.renew("a", request_of("a"), days=90, who="tester", expected=seen),
-            bench.hosts.ports.tell("a", "closed", [], checked=1.0, who="tester", expected=seen),
-            bench.hosts.reload("tester", seen),
+            bench.hosts.revoke(HostRevoke("a", seen), "tester"),
+            bench.hosts.renew(HostRenew("a", request_of("a"), 90, seen), "tester"),
+            bench.hosts.ports.tell(HostPorts("a", "closed", [], 1.0, seen), "tester"),
+            bench.hosts.reload(HostsReload(seen), "tester"),
         ):
             with pytest.raises(HostsChangedError):
                 await late
-        await bench.hosts.revoke("a", "tester", bench.hosts.overview().revision)
+        await bench.hosts.revoke(HostRevoke("a", (await bench.hosts.listed(HostList())).revision), "tester")
 
     run(tmp_path, work)
 
@@ -592,7 +630,7 @@ def test_odd_names_that_are_names(tmp_path: Path, name: str) -> None:
     async def work(bench: Bench) -> None:
         await add(bench, name)
         assert bench.hosts.rows()[0].name == name
-        await bench.hosts.revoke(name, "tester")
+        await bench.hosts.revoke(HostRevoke(name), "tester")
 
     run(tmp_path, work)
 
@@ -603,7 +641,7 @@ def test_two_hundred_hosts(tmp_path: Path) -> None:
     async def work(bench: Bench) -> None:
         request = request_of("x")
         for number in range(200):
-            await bench.hosts.add(f"h{number}", request, days=1, who="tester")
+            await bench.hosts.add(HostAdd(f"h{number}", request, 1), "tester")
         assert len({row.address for row in bench.hosts.rows()}) == 200
 
     async def again(bench: Bench) -> None:
@@ -622,7 +660,7 @@ def test_a_tunnel_that_is_not_wanted_stays_closed(tmp_path: Path) -> None:
         await add(bench, "b")
         bench.order.clear()
         bench.declared.write_text("hosts:\n  - {name: a, tunnel: false, groups: [ocu]}\n  - name: c\n")
-        body = await bench.hosts.reload("tester")
+        body = await bench.hosts.reload(HostsReload(), "tester")
         assert bench.order == ["policy ['b']", "expel 10.113.11.2"]
         assert (body.closed, body.opened) == (["a"], [])
         assert body.divergence == ["b: enrolled, not in hosts.yaml", "c: in hosts.yaml, not enrolled"]
@@ -633,7 +671,7 @@ def test_a_tunnel_that_is_not_wanted_stays_closed(tmp_path: Path) -> None:
             "down",
         )
         bench.declared.unlink()
-        assert (await bench.hosts.reload("tester")).opened == ["a"]
+        assert (await bench.hosts.reload(HostsReload(), "tester")).opened == ["a"]
         assert sorted(bench.tunnels.addresses) == ["a", "b"]
 
     run(tmp_path, work)
@@ -649,12 +687,12 @@ def test_the_first_tunnel_that_is_wanted_counts_in_the_policy(tmp_path: Path) ->
         await bench.tunnels.start()
         assert not bench.asked
         bench.declared.unlink()
-        body = await bench.hosts.reload("tester")
+        body = await bench.hosts.reload(HostsReload(), "tester")
         assert body.opened == ["a"]
         assert list(bench.tunnels.addresses) == ["a"]
         assert bench.order[-1] == "policy ['a']"
         bench.order.clear()
-        await bench.hosts.reload("tester")
+        await bench.hosts.reload(HostsReload(), "tester")
         assert not bench.order
 
     run(tmp_path, enrol)
@@ -666,9 +704,9 @@ def test_a_certificate_that_ends_soon_is_said_once(tmp_path: Path) -> None:
     """In the log once, in the status as long as it is so; a short life warns in its last third."""
 
     async def work(bench: Bench) -> None:
-        await bench.hosts.add("short", request_of("a"), days=10, who="tester")
+        await bench.hosts.add(HostAdd("short", request_of("a"), 10), "tester")
         assert bench.hosts.status().troubles == []
-        await bench.hosts.renew("short", request_of("a"), days=1e-5, who="tester")
+        await bench.hosts.renew(HostRenew("short", request_of("a"), 1e-5), "tester")
         await asyncio.sleep(0.7)
         bench.each_hour()
         bench.each_hour()
@@ -686,17 +724,40 @@ def test_what_was_seen_of_ports_is_kept(tmp_path: Path) -> None:
         await add(bench, "a")
         bench.machines = {"10.0.0.7": 3, "127.0.0.1": 1, "10.113.11.2": 2}
         assert (
-            await bench.hosts.ports.tell("10.113.11.2", "open", [40001], checked=5.0, who="eve")
+            await bench.hosts.ports.tell(HostPorts("10.113.11.2", "open", [40001], 5.0), "eve")
         ).name == "a"
-        await bench.hosts.ports.tell("10.0.0.7", "closed", [], checked=6.0, who="eve")
+        await bench.hosts.ports.tell(HostPorts("10.0.0.7", "closed", [], 6.0), "eve")
         with pytest.raises(HostRefusedError, match="enrolled are: a"):
-            await bench.hosts.ports.tell("nobody", "open", [], checked=5.0, who="eve")
+            await bench.hosts.ports.tell(HostPorts("nobody", "open", [], 5.0), "eve")
         with pytest.raises(HostRefusedError, match="a day ahead"):
-            await bench.hosts.ports.tell("a", "closed", [], checked=4e9, who="eve")
-        overview = bench.hosts.overview()
+            await bench.hosts.ports.tell(HostPorts("a", "closed", [], 4e9), "eve")
+        overview = await bench.hosts.listed(HostList())
         assert overview.hosts[0].ports == PortsSeen("open", 5.0, [40001], "eve")
         assert [(one.address, one.nodes, one.ports.state) for one in overview.machines] == [
             ("10.0.0.7", 3, "closed")
         ]
+
+    run(tmp_path, work)
+
+
+@pytest.mark.parametrize("order", [HostRevoke("a"), HostsReload()], ids=["revoke", "reload"])
+def test_who_is_told_that_a_host_is_out_finds_its_connections_closed(
+    tmp_path: Path, order: HostRevoke | HostsReload
+) -> None:
+    """The answer waits for the relays."""
+
+    async def work(bench: Bench) -> None:
+        await add(bench, "a")
+        bench.relays.clear()
+        hosts = bench.hosts
+        asked = asyncio.ensure_future(
+            hosts.revoke(order, "alice") if isinstance(order, HostRevoke) else hosts.reload(order, "alice")
+        )
+        await bench.store.settled()
+        for _ in range(10):
+            await asyncio.sleep(0)
+        assert not asked.done()
+        bench.relays.set()
+        await asked
 
     run(tmp_path, work)
