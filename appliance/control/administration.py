@@ -1,8 +1,8 @@
 """What operators can do with the running appliance, over the admin socket and over REST alike.
 
 One core for both: a request of `appliance.channel.admin` in, an answer out. A request is answered by the method that
-takes it: of `Looks`, `PolicyOrders`, `MonitorOrders`, `TokenOrders`, `RecordingOrders`, `EvidenceOrders`, or `Hosts`
-and its parts. To add a question, write the request and the struct that answers it, and such a method.
+takes it: of `Looks`, `PolicyOrders`, `MonitorOrders`, `Tokens`, `RecordingOrders`, `EvidenceOrders`, or `Hosts` and
+its parts. To add a question, write the request and the struct that answers it, and such a method.
 """
 
 import inspect
@@ -19,8 +19,7 @@ from appliance.control.monitor_orders import MonitorOrders
 from appliance.control.policies import PolicyRefusedError, RevisionChangedError
 from appliance.control.policy_orders import PolicyOrders
 from appliance.control.recording_orders import RecorderAwayError, RecordingOrders
-from appliance.control.token_orders import TokenOrders
-from appliance.control.tokens import TokenRefusedError
+from appliance.control.tokens import TokenRefusedError, Tokens
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import CheckedPorts
 from appliance.hosts.hosts import Hosts
@@ -51,7 +50,7 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     NotSealedError: "failed",
 }
 _Orders = (
-    PolicyOrders | MonitorOrders | TokenOrders | RecordingOrders | EvidenceOrders
+    PolicyOrders | MonitorOrders | Tokens | RecordingOrders | EvidenceOrders
     | Hosts | SelfService | CheckedPorts | Certification
 )  # fmt: skip
 _Method = Callable[..., Awaitable[Any]]

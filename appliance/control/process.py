@@ -43,7 +43,6 @@ from appliance.control.robot import master_address, robot_addresses
 from appliance.control.signing import Signing
 from appliance.control.spare_memory import SpareMemory
 from appliance.control.standing import HostStanding
-from appliance.control.token_orders import TokenOrders
 from appliance.control.tokens import Tokens
 from appliance.hosts.authority import Authority
 from appliance.hosts.certification import Certification
@@ -249,7 +248,7 @@ class _Control:
             self._hosts.itself,
             self._hosts.ports,
             self._certification,
-            TokenOrders(self._tokens),
+            self._tokens,
             parts.recordings,
             EvidenceOrders(self._audit, base.trail),
             durable=base.trail.durable,

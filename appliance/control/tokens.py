@@ -1,14 +1,17 @@
 """The access tokens of REST: made, listed and revoked here, and nowhere else.
 
 The api is told what it needs to recognise a token (never the secret). Every token that is made or revoked is
-recorded.
+recorded. What operators ask is answered by the method that takes it.
 """
 
 import time
 from collections.abc import Callable
+from typing import cast
 
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
+from appliance.channel import admin
+from appliance.channel.answers import tokens as answers
 from appliance.channel.messages import TokenKept
 from appliance.store.state import StateStore
 from appliance.store.tokens import BadTokenNameError, TokenRow, make_token
@@ -34,9 +37,9 @@ class Tokens:
         self._untold = bool(store.settings().get(_UNTOLD))
         self._changed = changed
 
-    def rows(self) -> list[TokenRow]:
+    async def listed(self, _request: admin.TokenList) -> answers.Tokens:
         """Every token that was made, the oldest first."""
-        return list(self._rows.values())
+        return answers.Tokens([answers.Token(*_fields(row)) for row in self._rows.values()])
 
     def usable(self) -> list[TokenKept]:
         """What the api recognises tokens by; it looks at `expires` itself."""
@@ -67,9 +70,8 @@ class Tokens:
         self._untold = True
         self._store.save_setting(_UNTOLD, "yes")
         if self._named(FIRST_NAME, time.time()) is not None:
-            await self.revoke(FIRST_NAME)
-        _row, text = await self.add(FIRST_NAME, "admin", DEFAULT_SECONDS)
-        return text
+            await self.revoke(admin.TokenRevoke(FIRST_NAME))
+        return (await self.add(admin.TokenAdd(FIRST_NAME, "admin", DEFAULT_SECONDS))).token
 
     def told(self) -> None:
         """Whoever started the appliance has the first token."""
@@ -77,12 +79,9 @@ class Tokens:
             self._untold = False
             self._store.save_setting(_UNTOLD, "")
 
-    async def add(self, name: str, role: str, seconds: float) -> tuple[TokenRow, str]:
-        """Make a token that ends after `seconds`; its text is given here and never again.
-
-        Raises `TokenRefusedError`.
-        """
-        now = time.time()
+    async def add(self, request: admin.TokenAdd) -> answers.NewToken:
+        """Make a token; its text is given here and never again. Raises `TokenRefusedError`."""
+        name, seconds, now = request.name, request.seconds, time.time()
         if not 0 < seconds <= LONGEST_SECONDS:
             raise TokenRefusedError(f"a token ends after at most {LONGEST_SECONDS / 86_400:.0f} days")
         if self._named(name, now) is not None:
@@ -91,7 +90,7 @@ class Tokens:
             )
         self._require_room(now)
         try:
-            row, text = make_token(name, role, now=now, seconds=seconds)
+            row, text = make_token(name, request.role, now=now, seconds=seconds)
         except BadTokenNameError as error:
             raise TokenRefusedError(str(error)) from error
         self._keep(row)
@@ -105,11 +104,11 @@ class Tokens:
             expires=row.expires,
         )
         await self._store.settled()
-        return row, text
+        return answers.NewToken(*_fields(row), token=text)
 
-    async def revoke(self, name: str) -> TokenRow:
+    async def revoke(self, request: admin.TokenRevoke) -> answers.Token:
         """End a token now. Raises `TokenRefusedError`."""
-        now = time.time()
+        name, now = request.name, time.time()
         row = self._named(name, now)
         if row is None:
             known = ", ".join(sorted(one.name for one in self._rows.values() if one.usable(now))) or "none"
@@ -124,7 +123,7 @@ class Tokens:
             id=row.id,
         )
         await self._store.settled()
-        return revoked
+        return answers.Token(*_fields(revoked))
 
     def _named(self, name: str, now: float) -> TokenRow | None:
         return next((row for row in self._rows.values() if row.name == name and row.usable(now)), None)
@@ -137,3 +136,7 @@ class Tokens:
         self._rows[row.id] = row
         self._store.save_token(row)
         self._changed()
+
+
+def _fields(row: TokenRow) -> tuple[str, str, answers.TokenRole, float, float, float | None]:
+    return row.name, row.id, cast(answers.TokenRole, row.role), row.created, row.expires, row.revoked

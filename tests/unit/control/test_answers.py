@@ -15,9 +15,9 @@ from appliance.control import (
     monitor_orders,
     policy_orders,
     recording_orders,
-    token_orders,
 )
 from appliance.control.administration import request_of
+from appliance.control.tokens import Tokens
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import CheckedPorts
 from appliance.hosts.hosts import Hosts
@@ -33,7 +33,7 @@ METHODS = [
         SelfService,
         CheckedPorts,
         Certification,
-        token_orders.TokenOrders,
+        Tokens,
         recording_orders.RecordingOrders,
         evidence_orders.EvidenceOrders,
     )

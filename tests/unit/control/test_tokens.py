@@ -7,6 +7,7 @@ import pytest
 
 from appliance.audit.log import AuditLog
 from appliance.audit_trail import AuditTrail
+from appliance.channel.admin import TokenAdd
 from appliance.control.tokens import Tokens
 from appliance.store.state import StateStore
 from appliance.store.tokens import is_secret, parse_token
@@ -84,5 +85,5 @@ async def test_a_control_that_learns_late_that_it_was_told_keeps_it(lives: Lives
 async def test_a_state_from_before_has_no_first_token_made(lives: Lives) -> None:
     """Tokens that were made without this being noted are taken as told."""
     tokens = lives.next()
-    await tokens.add("alice", "admin", 60)
+    await tokens.add(TokenAdd("alice", "admin", 60))
     assert await lives.next().first() is None

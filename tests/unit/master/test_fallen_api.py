@@ -14,7 +14,7 @@ import pytest
 
 from appliance.audit.record import Severity
 from appliance.channel import admin, messages
-from appliance.channel.admin import A, AdminAnswer, AdminRequest, AnyRequest, decode
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, AnyRequest, TokenAdd, TokenRevoke, decode
 from appliance.channel.channel import Channel
 from appliance.channel.messages import Asked
 from appliance.control.rest import RestLink
@@ -121,7 +121,7 @@ def test_nothing_is_done_for_a_name(tmp_path: Path) -> None:
     """What an api has of tokens that it was not shown, names, ids, hashes and salts, orders and reads nothing."""
 
     async def story(world: World) -> None:
-        row, _token = await world.tokens.add("alice", "admin", 600)
+        row = await world.tokens.add(TokenAdd("alice", "admin", 600))
         api = Api(world)
         [kept] = world.tokens.usable()
         guesses = ["", "alice", row.id, f"rosrv_{row.id}_{'A' * 43}", f"rosrv-read_{row.id}_{'A' * 43}"]
@@ -148,7 +148,7 @@ def test_a_signed_order_is_carried_out_as_it_is(tmp_path: Path) -> None:
     """What the holder signed is done once, in his name."""
 
     async def story(world: World) -> None:
-        _row, token = await world.tokens.add("alice", "admin", 600)
+        token = (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
         api = Api(world)
         answer = await api.ask(
             admin.HostRevoke("laptop", 3), reading_key(token), await api.signed(token, REVOKE)
@@ -165,7 +165,7 @@ def test_a_seen_order_is_good_once(tmp_path: Path) -> None:
     """Sent again at once, over a new link or to a new life of control: refused each time, and recorded."""
 
     async def story(world: World) -> None:
-        _row, token = await world.tokens.add("alice", "admin", 600)
+        token = (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
         shown = reading_key(token)
         api = Api(world)
         kept_back = await api.signed(token, REVOKE)
@@ -201,7 +201,7 @@ def test_no_byte_of_an_order_can_be_another(tmp_path: Path, change: dict[str, An
     """A request that is not byte for byte the signed one is refused, whatever order is passed on with it."""
 
     async def story(world: World) -> None:
-        _row, token = await world.tokens.add("alice", "admin", 600)
+        token = (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
         api = Api(world)
         forged = msgspec.structs.replace(await api.signed(token, REVOKE), **change)
         for order in (
@@ -228,7 +228,7 @@ def test_another_order_under_a_good_proof_is_an_alarm(tmp_path: Path, order: Adm
     """The proof holds for the request, not for what the api makes of it; only an api that fell does this."""
 
     async def story(world: World) -> None:
-        _row, token = await world.tokens.add("alice", "admin", 600)
+        token = (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
         api = Api(world)
         signed = await api.signed(token, REVOKE)
         assert (await api.ask(order, reading_key(token), signed)).trouble == "forbidden"
@@ -247,8 +247,8 @@ def test_ones_proof_is_not_anothers(tmp_path: Path) -> None:
     """An order that bob signed is not alice's, with her reading key beside it, and counts for his role only."""
 
     async def story(world: World) -> None:
-        _row, alice = await world.tokens.add("alice", "admin", 600)
-        _row, bob = await world.tokens.add("bob", "operator", 600)
+        alice = (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
+        bob = (await world.tokens.add(TokenAdd("bob", "operator", 600))).token
         api = Api(world)
         by_bob = await api.signed(bob, REVOKE)
         order = admin.HostRevoke("laptop", 3)
@@ -265,10 +265,10 @@ def test_a_revoked_token_signs_nothing(tmp_path: Path) -> None:
     """An order that was signed before its token was revoked, and kept back by the api, is refused afterwards."""
 
     async def story(world: World) -> None:
-        _row, token = await world.tokens.add("alice", "admin", 600)
+        token = (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
         api = Api(world)
         kept_back = await api.signed(token, REVOKE)
-        await world.tokens.revoke("alice")
+        await world.tokens.revoke(TokenRevoke("alice"))
         for shown in (reading_key(token), token):
             answer = await api.ask(admin.HostRevoke("laptop", 3), shown, kept_back)
             assert (answer.ok, answer.trouble) == (False, "forbidden")
@@ -284,7 +284,7 @@ def test_a_reading_key_changes_nothing(tmp_path: Path) -> None:
     """What an api has seen of a client that signs opens what there is to see, and no order without a proof."""
 
     async def story(world: World) -> None:
-        _row, token = await world.tokens.add("alice", "admin", 600)
+        token = (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
         api = Api(world)
         assert (await api.ask(admin.PolicyWanted(), reading_key(token))).ok
         refused = await api.ask(admin.PolicyLoad("[Nodes]\n", expected=3), reading_key(token), LOAD)
@@ -301,7 +301,7 @@ def test_bare_tokens_change_things_only_where_they_may(tmp_path: Path, *, requir
     """A script's bare token is proof enough, unless api_require_proof is on; then it still opens the views."""
 
     async def story(world: World) -> None:
-        _row, token = await world.tokens.add("alice", "admin", 600)
+        token = (await world.tokens.add(TokenAdd("alice", "admin", 600))).token
         await world.store.settled()
         world.begin(require_proof=require_proof)
         api = Api(world)
@@ -321,7 +321,8 @@ def test_a_token_of_an_earlier_version_is_good_as_it_was(tmp_path: Path) -> None
     """Without keys kept of it a token is shown itself, and is recognised by its hash; it proves no more than that."""
 
     async def story(world: World) -> None:
-        row, token = await world.tokens.add("alice", "admin", 600)
+        row = await world.tokens.add(TokenAdd("alice", "admin", 600))
+        token = row.token
         world.store.database.submit("DELETE FROM token_keys WHERE id = ?", (row.id,))
         await world.store.settled()
         world.begin(require_proof=False)
