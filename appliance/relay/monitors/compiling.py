@@ -16,6 +16,7 @@ from appliance.relay.loop import READ, Loop
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.ros.standard import standard_definitions
+from appliance.rosmop.certify.properties import certificates_of
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.syntax.errors import SpecificationError
 
@@ -103,6 +104,12 @@ class Compiler:
                 margins=True,
                 slices=message.slices,
             )
+            for one in (monitors, *monitors.trials):
+                _, wrong = certificates_of(
+                    one.monitors
+                )  # control has checked its own: these are what will judge
+                if wrong:
+                    return [str(finding) for finding in wrong]
             monitors.write_module()
             return monitors
         except SpecificationError as error:
