@@ -598,7 +598,7 @@ class MonitorSet:
             return False
 
         key = (True,) if found is True else tuple(found)
-        self._bound = Bound(step.index, step.event.binds, key, message.time, self._sender)
+        self._bound = Bound(step.index, step.event.binds, key, message.time, self._sender, step.event.creates)
         happened = step.monitor.slices.step(step.index, key)  # type: ignore[union-attr]  # who has a key has slices
         if happened is not None:
             if happened:
@@ -635,7 +635,7 @@ class MonitorSet:
         refused, why = slices.refused, slices.why
         before, verdicts, faults = outcome.events, [*outcome.verdicts], [*outcome.faults]
         names: Sequence[str] = before
-        turn, dropped = self._turn, False
+        turn, dropped, reached = self._turn, False, 0
         if len(whole) + len(seeds) > 1:
             try:
                 step.monitor.context.spend(len(whole) + len(seeds), -1)
@@ -647,7 +647,8 @@ class MonitorSet:
             outcome.events, outcome.verdicts, outcome.faults = before, (), ()
             self._explains = len(verdicts) < EXPLAINED
             dropped = self._in_slice(step.monitor, one, outcome, message, act)
-            names = outcome.events if outcome.events is not before else names
+            if outcome.events is not before:
+                names, reached = outcome.events, reached + 1
             verdicts += outcome.verdicts  # many slices: a tuple would be copied with each
             faults += outcome.faults
             if dropped:
@@ -658,10 +659,14 @@ class MonitorSet:
             lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
             copied = None if message is None else Message(bytes(message.buffer), message.time)
             self._in_slice(step.monitor, one, unseen, copied, act)
+            reached += bool(unseen.events)
             del turn.log[lines:], turn.published[published:]
             turn.looked = looked
             faults += unseen.faults
         self._explains = True
+        trail = step.monitor.trail
+        if 0 < reached < len(whole) + len(seeds) and trail and trail[-1] is self._bound:
+            trail[-1] = self._bound._replace(everywhere=False)
         outcome.events, outcome.verdicts, outcome.faults = names, tuple(verdicts), tuple(faults)
         if refused is not None and not dropped:
             self._refuse_slice(step, refused, why, message, outcome)
@@ -870,7 +875,7 @@ class MonitorSet:
         if step.monitor.slices is None:
             act(outcome, None)
         else:
-            self._bound = Bound(step.index, (), (True,), due, NOBODY)
+            self._bound = Bound(step.index, (), (True,), due, NOBODY, step.event.creates)
             self._each(step, (True,), None, outcome, act)
             outcome.events = (step.name,)
         ticks[id(timer)] = ticks.get(id(timer), 0) + 1

@@ -86,6 +86,9 @@ class Happened(NamedTuple):
 class Bound(NamedTuple):
     """An event of a parametric specification that happened: which parameters (by number) it bound, and to what (`key`
     has True before the values).
+
+    `creates`: a slice may begin with it. `everywhere`: it happened in each slice that it belongs to; a `when` may look
+    at what slices differ in, and what one has dropped comes to no other.
     """
 
     event: int
@@ -93,6 +96,8 @@ class Bound(NamedTuple):
     key: tuple[Any, ...]
     time: int
     sender: Sender
+    creates: bool
+    everywhere: bool = True
 
 
 class Explanation(NamedTuple):
@@ -403,12 +408,18 @@ class _Trial:
 def of_slice(
     compiled: CompiledProperty, trail: Iterable[Bound], values: Mapping[int, Any], category: str
 ) -> Explanation | None:
-    """What made the verdict in the slice of a binding (parameters by number): it is the last that happened."""
-    found = Steps(compiled, 0)
+    """What made the verdict in the slice of a binding (parameters by number): it is the last that happened.
+
+    None where it takes an event of which it is not known whether it happened in this slice.
+    """
+    found, own = Steps(compiled, 0), dict[Happened, bool]()
     for one in trail:
-        if all(map(_same, map(values.get, one.binds), one.key[1:])):
-            found.add(Happened(one.event, one.time, one.sender))
-    return found.explain(category)
+        if all(map(_same, map(values.get, one.binds), one.key[1:])) and (own or one.creates):
+            happened = Happened(one.event, one.time, one.sender)
+            own[happened] = one.everywhere
+            found.add(happened)
+    why = found.explain(category)
+    return why if why is not None and all(own[one] for one in why.events) else None
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -5,8 +5,8 @@
 import gc
 import itertools
 import tracemalloc
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from random import Random
 
 import pytest
@@ -17,8 +17,10 @@ from appliance.rosmop.engine import EXPLAINED, MonitorSet
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.slices import GROWING_LIMIT, MAX_BINDING
 from appliance.rosmop.syntax.parser import parse
+from appliance.rosmop.why import Sender
 from tests.unit.rosmop.acting import definitions, load, message, refused
 from tests.unit.rosmop.interpreted import beside, check_same
+from tests.unit.rosmop.logics.driving import seeded
 
 FIELDS = {"p": ("std::string", "frame_id"), "q": ("uint32_t", "seq"), "r": ("ros::Time", "stamp")}
 FORMULAS = {
@@ -157,6 +159,72 @@ def test_slices_are_what_the_specification_says_of_each_binding(seed: int) -> No
         outcome = monitors.process(f"/{event}", body(values), place)
         check_same(outcome, interpreter.process(f"/{event}", body(values), place))
         assert told(outcome) == expected[place], (one.text(binding=True), events[: place + 1])
+
+
+def test_the_named_events_of_a_slice_alone_give_its_verdict() -> None:
+    """Given to the specification without parameters they tell the category; and each of them is of the slice."""
+    random, explained = seeded(44), 0
+    for _ in range(60):
+        one = replace(made(random), actions=dict.fromkeys("abc", ""))
+        one = replace(one, properties=tuple(text.replace("__RESET;", "") for text in one.properties))
+        events = trace(random, 20)
+        monitors = load(one.text(binding=True))
+        for place, (event, values) in enumerate(events):
+            outcome = monitors.process(f"/{event}", body(values), place, Sender(place + 1))
+            for verdict in outcome.verdicts[:EXPLAINED]:
+                assert verdict.why is not None
+                alone, last = load(one.text(binding=False)), Outcome()
+                for named in verdict.why.events:
+                    assert (named.time + 1, events[named.time][0]) == (
+                        named.sender.source,
+                        "abc"[named.event],
+                    )
+                    assert named.time in slice_of(one, events, verdict.binding)
+                    last = alone.process(f"/{events[named.time][0]}", body(events[named.time][1]), named.time)
+                assert (verdict.property, verdict.category) in [
+                    (each.property, each.category) for each in last.verdicts
+                ], (one.text(binding=True), events[: place + 1], verdict)
+                explained += 1
+    assert explained > 500
+
+
+def slice_of(one: Made, trace: Trace, binding: Mapping[str, object]) -> Sequence[int]:
+    """The places of the events that bind nothing else, from the first on that may begin a slice."""
+    shown = {name: str(given) for name, given in binding.items()}
+    own = [
+        place
+        for place, (event, values) in enumerate(trace)
+        if all(
+            (f"{values[name]}.0" if name == "r" else str(values[name])) == shown[name]
+            for name in one.binds[event]
+        )
+    ]
+    begun = [place for place in own if not one.creation or trace[place][0] in one.creation]
+    return [place for place in own if place >= begun[0]]
+
+
+@pytest.mark.parametrize(
+    ("look", "handler"),
+    [("when (n < 1)", ""), ("", "ptltl: !look @violation { if (id == 1) { DROP; } }")],
+    ids=["a condition", "a drop"],
+)
+def test_what_did_not_happen_in_a_slice_explains_nothing_of_it(look: str, handler: str) -> None:
+    """An event without the parameter happens in one slice and not in the other: there it is not named, nor guessed."""
+    text = f"""s(int id) {{
+        int n = 0;
+        creation event go(int id) /go std_msgs/Int32 '{{data:id}}' {{ n = n + id - 1; }}
+        event look() /look std_msgs/Empty '{{}}' {look} {{ }}
+        event end(int id) /end std_msgs/Int32 '{{data:id}}' {{ }}
+        ere: go look end @match {{ ROS_INFO("over"); }} @fail {{ ROS_INFO("over"); }}
+        {handler}
+    }}"""
+    monitors = load(text)
+    for place, (topic, given) in enumerate((("/go", 1), ("/go", 2), ("/look", 0), ("/end", 1), ("/end", 2))):
+        sent = message("std_msgs/Empty") if topic == "/look" else message("std_msgs/Int32", data=given)
+        outcome = monitors.process(topic, sent, place, Sender(place + 1))
+        if topic == "/end":
+            said = "match" if given == 1 else "fail"
+            assert [(one.category, one.why) for one in outcome.verdicts] == [(said, None)]
 
 
 GOALS = """
