@@ -65,17 +65,14 @@ class ProbeResult:
     port: int
     uid: int
     attempts: tuple[Attempt, ...]
-    listening: tuple[str, ...]  # addresses on which someone listens on the port
+    listening: tuple[
+        str, ...
+    ]  # addresses on which someone listens on the port: without any nothing is proven
 
     @property
     def closed(self) -> bool:
         """Nobody got through and every attempt had a clear end."""
         return not any(attempt.outcome in (Outcome.REACHED, Outcome.UNCLEAR) for attempt in self.attempts)
-
-    @property
-    def proves(self) -> bool:
-        """Someone listens, so that an attempt could have succeeded."""
-        return bool(self.listening)
 
     @property
     def listening_outside(self) -> tuple[str, ...]:

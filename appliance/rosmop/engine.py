@@ -442,14 +442,6 @@ class MonitorSet:
         self.began += tuple(name for trial in self.trials for name in trial.began)
         return outcome
 
-    def set_enabled(self, name: str, enabled: bool, time_ns: int) -> None:
-        """Let the events of a monitor happen, or not; raises KeyError.
-
-        Time that passed meanwhile does not count: timers and properties with time bounds begin anew.
-        """
-        self.monitor(name)
-        self.switch({name: enabled}, time_ns)
-
     def switch(self, enabled: Mapping[str, bool], time_ns: int) -> tuple[Monitor, ...]:
         """Let the events of monitors happen, or not, and leave unknown names out; the monitors that this changed.
 

@@ -50,13 +50,12 @@ class MachineError(Exception):
 class MachineTrap(Exception):  # noqa: N818  its name in WebAssembly
     """A call was stopped; what it had written stays.
 
-    `reason` says why ("integer division by zero"); `out_of_fuel`: its fuel was used up.
+    `reason` says why ("integer division by zero", "out of fuel").
     """
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
         self.reason = reason
-        self.out_of_fuel = reason == "out of fuel"
 
 
 class Machine:

@@ -11,11 +11,6 @@ def to_text_integer(value: int) -> bytes:
     return b"%d" % value
 
 
-def to_text_floating(value: float) -> bytes:
-    """`std::to_string` of a floating-point number: six digits behind the point."""
-    return b"%f" % value
-
-
 def to_text_streamed(value: float) -> bytes:
     """`std::cout << value`: six digits in all."""
     return b"%g" % value

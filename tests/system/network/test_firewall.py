@@ -476,14 +476,14 @@ def test_the_probe_sees_a_closed_and_an_open_port(protected: Host) -> None:
         firewall.install(settings(port))
         result = probe_port(protected.namespace, port)
         assert result.closed
-        assert result.proves
+        assert result.listening
         assert [one.outcome for one in result.attempts] == [Outcome.REFUSED] * 2
         assert result.listening_outside == ("::",)
         firewall.remove()
         result = probe_port(protected.namespace, port)
         assert not result.closed
         assert [one.outcome for one in result.attempts] == [Outcome.REACHED] * 2
-    assert not probe_port(protected.namespace, port).proves
+    assert not probe_port(protected.namespace, port).listening
     with listening(protected, "127.0.0.1") as port:
         assert probe_port(protected.namespace, port).listening == ("127.0.0.1",)
         assert probe_port(protected.namespace, port).listening_outside == ()

@@ -572,10 +572,10 @@ def test_a_disabled_monitor_does_nothing() -> None:
     """Its events do not happen and messages are relayed untouched; enabled again, it goes on with its state."""
     monitors = load("a() { int n;" + on("/t", "e", 'n++; ROS_INFO("%d", n); return;') + "}")
     monitors.process("/t", number(0), 0)
-    monitors.set_enabled("a", False, 1)
+    monitors.switch({"a": False}, 1)
     outcome = monitors.process("/t", number(0), 1)
     assert (outcome.result, outcome.events, monitors.wants("/t")) == ("passed", (), False)
-    monitors.set_enabled("a", True, 2)
+    monitors.switch({"a": True}, 2)
     assert printed(monitors.process("/t", number(0), 2)) == ["2"]
 
 
@@ -737,9 +737,9 @@ def test_time_does_not_pass_for_a_disabled_monitor() -> None:
     """A deadline that passed while it was disabled is not told; time bounds begin anew."""
     monitors = load("a() {" + on("/t") + TIMED + "}")
     monitors.process("/t", number(0), SECOND)
-    monitors.set_enabled("a", False, 2 * SECOND)
+    monitors.switch({"a": False}, 2 * SECOND)
     assert monitors.advance(10 * SECOND) == []
-    monitors.set_enabled("a", True, 10 * SECOND)
+    monitors.switch({"a": True}, 10 * SECOND)
     assert monitors.process("/t", number(0), 11 * SECOND).before == ()
 
 

@@ -625,10 +625,10 @@ def test_a_disabled_monitor_has_no_part_in_a_walk() -> None:
     """Its topic has none; where there are others, they alone."""
     fed = Fed(event("n = count;"), event("n++;").replace("s()", "t()"))
     for one in (fed.monitors, fed.interpreter):
-        one.set_enabled("s", False, 5)
+        one.switch({"s": False}, 5)
     fed.check([plain(7)] * 3)
     assert fed.state() == ["n 0", "n 3"]
-    fed.monitors.set_enabled("t", False, 5)
+    fed.monitors.switch({"t": False}, 5)
     assert fed.monitors.walker("/plain") is None
 
 
