@@ -169,11 +169,25 @@ class Desk:
             raise ProblemError(503, "log-unreadable", str(error)) from error
 
 
+_NO_GRANT: Responses = {409: {"description": "No line of a policy grants it."}}
+_UNKNOWN: Responses = {404: {"description": "There is no such record."}}
+
+
+def _json(schema: dict[str, Any]) -> Responses:
+    return {200: {"description": "OK", "content": {"application/json": {"schema": schema}}}}
+
+
 def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1/audit", tags=["audit"])
     desk = Desk(services)
+    _add_searches(router, services, desk)
+    _add_proofs(router, services, desk)
+    _add_one(router, services, desk)
+    return router
 
+
+def _add_searches(router: Routes, services: Services, desk: Desk) -> None:
     @router.get("", responses=_json(_PAGE))
     async def search_audit(
         bearer: Viewer,
@@ -205,6 +219,8 @@ def routes(services: Services) -> Routes:
         following = _follow(services, desk, follower, bearer, wanted.text)
         return Held(EventSourceResponse(following, ping=_PING_SECONDS), give_back)
 
+
+def _add_proofs(router: Routes, services: Services, desk: Desk) -> None:
     @router.get("/verify", dependencies=[OPERATOR])
     async def verify_audit() -> Verification:
         """Prove that the log is complete and unchanged; for operators, one at a time.
@@ -220,8 +236,7 @@ def routes(services: Services) -> Routes:
         limit: Limit = 1000,
     ) -> LogCheckpoints:
         """Signed checkpoints, to be kept on another machine: `rosrv audit verify --checkpoints` takes them."""
-        found = await desk.read(signed_checkpoints, desk.path, after, limit)
-        return LogCheckpoints(found)
+        return LogCheckpoints(await desk.read(signed_checkpoints, desk.path, after, limit))
 
     @router.get(
         "/export",
@@ -240,6 +255,10 @@ def routes(services: Services) -> Routes:
         return Held(
             StreamingResponse(in_thread(_joined(found)), media_type="application/x-ndjson"), give_back
         )
+
+
+def _add_one(router: Routes, services: Services, desk: Desk) -> None:
+    """A record, and what can be said of it."""
 
     @router.get("/{record_id}", responses=_json(_ONE) | _UNKNOWN)
     async def audit_record(
@@ -277,16 +296,6 @@ def routes(services: Services) -> Routes:
                 return await asyncio.to_thread(granted, shown.entry.record, known)
             except UngrantableError as error:
                 raise ProblemError(409, "not-by-a-policy", str(error)) from None
-
-    return router
-
-
-_NO_GRANT: Responses = {409: {"description": "No line of a policy grants it."}}
-_UNKNOWN: Responses = {404: {"description": "There is no such record."}}
-
-
-def _json(schema: dict[str, Any]) -> Responses:
-    return {200: {"description": "OK", "content": {"application/json": {"schema": schema}}}}
 
 
 async def _follow(

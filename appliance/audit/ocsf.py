@@ -30,25 +30,13 @@ CLASSES = {
 _OTHER = 99
 _BY_CALL = -1
 _CREATE, _READ, _UPDATE, _DELETE = 1, 2, 3, 4  # of API Activity; Entity Management has the same
-_ENROL, _UNENROL, _ENABLE, _DISABLE, _ACTIVATE, _DEACTIVATE, _RESUME = (
-    6,
-    7,
-    8,
-    9,
-    10,
-    11,
-    13,
-)  # Entity Management
+# Entity Management
+_ENROL, _UNENROL, _ENABLE, _DISABLE, _ACTIVATE, _DEACTIVATE, _RESUME = 6, 7, 8, 9, 10, 11, 13
 _START, _STOP, _RESTART, _CHANGED = 3, 4, 5, 8  # Application Lifecycle
 _LOG_DELETE, _LOG_START, _LOG_STOP, _LOG_RESTART = 2, 6, 7, 8  # Event Log Activity
 _FOUND, _CLOSED = 1, 3  # Detection Finding
-_OPEN, _CLOSE, _REFUSE, _TRAFFIC, _RENEW = (
-    1,
-    2,
-    5,
-    6,
-    3,
-)  # Network and Tunnel Activity; the last of Tunnel alone
+# Network and Tunnel Activity; the last of Tunnel alone
+_OPEN, _CLOSE, _REFUSE, _TRAFFIC, _RENEW = 1, 2, 5, 6, 3
 _CALLS = (  # how the calls of the ROS Master and of HTTP begin
     (_CREATE, ("register", "subscribe", "POST")),
     (_READ, ("get", "has", "lookup", "search", "GET", "HEAD")),
