@@ -9,6 +9,7 @@ connections. Format: http://wiki.ros.org/Bags/Format/2.0.
 import os
 import struct
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -74,8 +75,9 @@ class BagWriter:
         return self._file.tell()
 
     def leave(self) -> None:
-        """End without an index: another writer may go on."""
-        self._file.close()
+        """End without an index: another writer may go on, after what had been written; a full disk takes no more."""
+        with suppress(OSError):
+            self._file.close()
 
     def close(self) -> None:
         """Write the index of the whole, and end."""

@@ -165,10 +165,13 @@ class Recorder:
                 reason = f"others asked for it {MOST_LENT} times within seconds: try again in half a minute"
                 self._answers.append(messages.RecordingRefused(wanted.number, reason))
                 return
-            lent = self._in_progress(progress)
             self._shelf.mark_lent(progress.id)
-            lent.step()
-            recording = lent.finish((), self._revisions)
+            lent = self._in_progress(progress)
+            try:
+                lent.step()
+                recording = lent.finish((), self._revisions)
+            finally:
+                lent.leave()
             self._shelf.lend(recording)
         except OSError as error:
             self._shelf.discard_part(progress.id)

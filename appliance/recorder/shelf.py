@@ -113,6 +113,7 @@ class Shelf:
 
     def mark_lent(self, recording_id: str) -> None:
         """What is made in its folder is not to be kept. Raises `OSError`."""
+        self.part(recording_id).mkdir(mode=0o750, exist_ok=True)
         (self.part(recording_id) / _LENT).touch()
 
     def can_lend(self, now: int) -> bool:

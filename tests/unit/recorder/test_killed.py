@@ -69,7 +69,7 @@ def _killed_at(scene: Scene, operation: int) -> bool:
 def test_killed_at_each_operation_with_files(tmp_path: Path, memory: str) -> None:
     """Each recording that has a name is whole; what was removed is told until it is noted; nothing else is left."""
     removed, kept = set[int](), set[int]()
-    for operation in count(1, 1 if memory == "same" else 3):
+    for operation in count(1):
         folder = tmp_path / str(operation)
         folder.mkdir()
         scene = Scene(folder, before=30)

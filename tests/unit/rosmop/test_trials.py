@@ -171,6 +171,51 @@ def test_every_logic(logic: str) -> None:
     assert "Verdict" in str(both.check(time + 10_000_000))
 
 
+@pytest.mark.parametrize("logic", ["fsm", "ere", "cfg", "ltl", "ptltl", "ptcaret", "tick"])
+def test_every_logic_that_can_be_parametric(logic: str) -> None:
+    """Each slice has its own state, variables and ticks, from the first message that it sees."""
+    names = ("begin", "end") if logic == "ptcaret" else ("e0", "e1")
+    events = "".join(
+        f"event {name}(int n) /n{at} std_msgs/UInt8 '{{data:n}}' {{ seen++; }} "
+        for at, name in enumerate(names)
+    )
+    rule = PROPERTIES.get(logic, "event tick() every 2ms { if (seen > 2) { seen = 0; LOG } }")
+    rule = rule.replace("DROP;", "DROP; LOG").replace("LOG", 'ROS_WARN("%d: %d", n, seen);')
+    texts = {
+        "0.rv": "a() { event e(int n) /n0 std_msgs/UInt8 '{data:n}' { if (n == 2) n = 1; if (n == 3) { return; } } }",
+        "1.rv": f"s(int n) {{ int seen = 0; creation {events} {rule} }}",
+    }
+    both, random, time = Both(texts, "s"), Random(logic), 0  # noqa: S311  draws examples
+    for _ in range(100):
+        time += random.choice((300_000, 1_000_000, 3_500_000))
+        both.give(f"/n{random.randrange(2)}", number(random.randrange(6)), time)
+    both.promote(time)
+    for _ in range(30):
+        time += random.choice((300_000, 1_000_000, 3_500_000))
+        both.go_on(f"/n{random.randrange(2)}", number(random.randrange(6)), time)
+    story = str(both.check(time + 10_000_000))
+    assert "LogLine" in story
+    assert logic == "tick" or "Verdict" in story
+
+
+@pytest.mark.parametrize("handler", ["@enforced { late++; }", "@violation { late++; __RESET; }"])
+def test_what_is_enforced_at_a_deadline(handler: str) -> None:
+    """What would have been published is what is, at the same times, with the variables as they are then."""
+    remedy = "help() { std_msgs::UInt8 one; one.data = late; PUBLISH(/n1, std_msgs/UInt8, one); }"
+    events = "".join(f"event e{at}() /n{at} std_msgs/UInt8 '{{}}' {{ }} " for at in range(2))
+    rule = f"pattern: globally: e0 causes e1 within 3ms enforced by help {handler}"
+    texts = {"1.rv": f"s() {{ int late = 0; {remedy} {events} {rule} }}"}
+    both, random, time = Both(texts, "s"), Random(handler), 0  # noqa: S311  draws examples
+    for _ in range(100):
+        time += random.choice((300_000, 1_000_000, 3_500_000))
+        both.give(f"/n{random.randrange(2)}", number(0), time)
+    both.promote(time)
+    for _ in range(30):
+        time += random.choice((300_000, 1_000_000, 3_500_000))
+        both.go_on(f"/n{random.randrange(2)}", number(0), time)
+    assert "Publi" in str(both.check(time + 10_000_000))
+
+
 # What it stands between, and with whom
 
 NUMBER = "int n) /n std_msgs/UInt8 '{data:n}'"

@@ -1,0 +1,80 @@
+"""A disk that fills while recordings are made: the recorder says so and goes on, and what has a name is whole."""
+
+import hashlib
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from appliance.channel import messages
+from appliance.channel.answers.recordings import Recording, Trigger
+from tests.support.requirements import need_root
+from tests.unit.recorder.test_recorder import SECOND, TEXT, Scene
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 4 MiB and a few files, in the place of the recordings."""
+    need_root()
+    place = tmp_path / "recordings"
+    place.mkdir()
+    order = ["mount", "-t", "tmpfs", "-o", "size=4m,nr_inodes=64", "rosrv-recordings-test", str(place)]
+    subprocess.run(order, check=True)
+    yield place
+    subprocess.run(["umount", "--lazy", place], check=True)
+
+
+@pytest.mark.parametrize("what", ["bytes", "files"])
+def test_whatever_is_being_done_when_it_is_full(disk: Path, tmp_path: Path, what: str) -> None:
+    """Filled after each step: orders are answered, nothing half is kept, and it records again when there is room."""
+    scene = Scene(tmp_path, disk=8 << 20)
+    order = Trigger(scene.clock.now, "order", "r", "eve")
+
+    def wanted(number: int) -> messages.RecordingWanted:
+        return messages.RecordingWanted(
+            number, msgspec.structs.replace(order, time=scene.clock.now + SECOND), 5, 1
+        )
+
+    missed = refused = 0
+    for number in range(12):
+        scene.recorder.step([wanted(number)])
+        for step in range(8):
+            scene.say(TEXT[:4] + bytes(100_000 if number % 2 else 100))
+            if step == number % 8:
+                fill(disk, what)
+                if number % 3 == 0:
+                    scene.begin_anew()
+            extra = {3: wanted(100), 5: messages.MemoryWanted(101, wanted(0).trigger, 0, 1 << 62)}
+            kept = [messages.RecordingNoted(path.name) for path in disk.iterdir() if len(path.name) == 20]
+            said = scene.later(0.5, *kept, *([extra[step]] if step in extra else []))
+            missed += sum(isinstance(one, messages.RecordingMissed) for one in said)
+            refused += sum(isinstance(one, messages.RecordingRefused) for one in said)
+        for path in disk.glob("filler*"):
+            path.unlink()
+        scene.later(1)
+        for path in disk.iterdir():
+            if len(path.name) == 20 and not (path / "lent").exists():
+                found = msgspec.json.decode((path / "recording.json").read_bytes(), type=Recording)
+                bag = (path / "recording.bag").read_bytes()
+                assert (len(bag), hashlib.sha256(bag).hexdigest()) == (found.size, found.sha256)
+                scene.later(0, messages.RecordingRemovalWanted(102, path.name, "eve"))
+    assert missed
+    assert refused
+    scene.recorder.step([wanted(200)])
+    assert scene.closed(scene.later(0.5) + scene.later(5))[-1].complete
+    scene.log.close()
+
+
+def fill(disk: Path, what: str) -> None:
+    """Leave no room for another byte, or another file."""
+    number = 0
+    try:
+        while True:
+            number += 1
+            with (disk / f"filler{number}").open("wb", buffering=0) as file:
+                while what == "bytes" and file.write(bytes(4096)):
+                    pass
+    except OSError:
+        return
