@@ -54,6 +54,20 @@ def test_axe_finds_nothing(theme: str, width: int, opened: Callable[..., Reader]
     assert {view: rows for view, rows in found.items() if rows} == {}
 
 
+def test_words_of_the_navigation_have_room(opened: Callable[..., Reader]) -> None:
+    """On a telephone, too: none touches its neighbour or the edge of the window."""
+    page = opened(width=390).go("now")
+    words = """() => [...document.querySelectorAll(".nav a > span:not(.key, .count)")].map((word) => {
+      const range = document.createRange();
+      range.selectNodeContents(word);
+      const { left, right } = range.getBoundingClientRect();
+      return [left, right];
+    })"""
+    edges = [edge for word in page.evaluate(words) for edge in word]
+    between = zip([0, *edges[1::2]], [*edges[::2], 390], strict=True)
+    assert min(right - left for left, right in between) > 6, edges
+
+
 def test_the_door_is_accessible(browser: Browser, appliance: Appliance) -> None:
     """The page for the token, too, in both themes."""
     for theme in ("light", "dark"):

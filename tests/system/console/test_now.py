@@ -50,6 +50,20 @@ def test_processes_of_one_role_are_told_apart(opened: Callable[..., Reader]) -> 
     assert page.evaluate(named, rows) == ["control", "relay 0", "api", "relay 1"]
 
 
+def test_rates_are_of_more_than_a_moment(opened: Callable[..., Reader]) -> None:
+    """Samples may come five in a second, and the relay's counts once: a steady flow is neither zero nor a spike."""
+    page = opened().go("now")
+    growth = """async (samples) => {
+      const { growth } = await import("/console/static/js/numbers.js");
+      return growth(samples, (one) => one.count).map((one) => one.value);
+    }"""
+    samples = [{"time": 100 + tick / 5, "count": 50 * (tick // 5)} for tick in range(51)]
+    rates = page.evaluate(growth, samples)
+    assert len(rates) > 40
+    assert all(25 < rate < 75 for rate in rates), rates
+    assert page.evaluate(growth, [*samples, {"time": 112, "count": 0}])[-1] is None
+
+
 def test_the_page_says_that_it_is_not_live_and_comes_back(
     appliance: Appliance, opened: Callable[..., Reader]
 ) -> None:

@@ -41,20 +41,23 @@ export function counted(value, one, many = `${one}s`) {
   return `${count(value)} ${value === 1 ? one : many}`;
 }
 
+const LEAST = 1.5; // seconds a rate is measured over: the relay tells its counts once in a second
+
 /**
- * How fast counters grew between samples; null where they began anew or nothing was known for long.
+ * How fast counters grew until each sample, since the newest one that is `LEAST` older; null where they began anew.
  * @template {{time: number}} S
  * @param {S[]} samples @param {(sample: S) => number} read
  * @returns {{time: number, value: number | null}[]}
  */
 export function growth(samples, read) {
   const found = [];
-  for (let index = 1; index < samples.length; index += 1) {
-    const before = samples[index - 1];
-    const after = samples[index];
-    const seconds = after.time - before.time;
-    const more = read(after) - read(before);
-    found.push({ time: after.time, value: more < 0 || seconds <= 0 ? null : more / seconds });
+  let before = 0;
+  for (const after of samples) {
+    while ((samples[before + 1]?.time ?? Infinity) <= after.time - LEAST) before += 1;
+    const seconds = after.time - samples[before].time;
+    if (seconds < LEAST) continue;
+    const more = read(after) - read(samples[before]);
+    found.push({ time: after.time, value: more < 0 ? null : more / seconds });
   }
   return found;
 }
