@@ -30,8 +30,10 @@ _LONGEST_PAUSE_SECONDS = 1.0
 
 def weight(record: Record) -> int:
     """About how many bytes a record takes on disk."""
-    texts = (record.caller_id, record.resource, record.reason, *map(str, record.detail.values()))
-    return _RECORD_BYTES + _BYTES_PER_CHARACTER * sum(len(text) for text in texts if text)
+    size = len(record.caller_id or "") + len(record.resource or "") + len(record.reason)
+    for value in record.detail.values():
+        size += len(value if type(value) is str else str(value))
+    return _RECORD_BYTES + _BYTES_PER_CHARACTER * size
 
 
 class Budget:

@@ -6,6 +6,7 @@ characters are cut and say how long they were; of details past `LARGEST_DETAIL` 
 names of the others.
 """
 
+from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -36,7 +37,8 @@ def to_columns(record: Record, sequence: int) -> StoredColumns:
         if (
             isinstance(record.detail, dict)
             and len(columns.detail) <= LARGEST_DETAIL
-            and all(map(_storable, columns, _KINDS))
+            and _of_columns(tuple(map(type, columns)))
+            and (_is_usual(columns) or all(map(_storable, columns)))
         ):
             return columns
     except (AttributeError, TypeError, ValueError, OverflowError, RecursionError):
@@ -55,10 +57,27 @@ def _columns(record: Record, sequence: int) -> StoredColumns:
     )  # fmt: skip
 
 
-def _storable(value: Any, kinds: tuple[type, ...]) -> bool:
+@lru_cache(256)
+def _of_columns(kinds: tuple[type, ...]) -> bool:
+    """Whether values of these types can stand in the columns."""
+    return all(kind in known for kind, known in zip(kinds, _KINDS, strict=True))
+
+
+def _is_usual(columns: StoredColumns) -> bool:
+    """Whether a look at all columns together shows that each is storable: texts are short and ASCII."""
+    texts = "".join(filter(None, (columns.id, columns.reason, *columns[4:14])))
+    line, revision, took = columns.rule_line or 0, columns.revision or 0, columns.duration_us or 0
+    numbers = (columns.sequence, columns.time, line, revision, took)
+    return (
+        len(texts) <= LONGEST_TEXT
+        and texts.isascii()
+        and min(numbers) >= 0
+        and max(numbers) <= _LARGEST_INTEGER
+    )
+
+
+def _storable(value: Any) -> bool:
     kind = type(value)
-    if kind not in kinds:
-        return False
     if kind is str:
         return len(value) <= LONGEST_TEXT and (
             value.isascii() or not any("\ud800" <= c <= "\udfff" for c in value)

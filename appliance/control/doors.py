@@ -47,9 +47,7 @@ class Doors:
                 connections_within(limits.connections), limits.connections_per_host
             ),
         )
-        self.turns = Turns(
-            RVMASTER_REQUESTS.bounds, standing, lambda host: policy().named_as(host), trail.pause
-        )
+        self.turns = Turns(RVMASTER_REQUESTS.bounds, standing, lambda host: policy().alike(host), trail.pause)
         self._own_visitors = Visitors(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
         self._own_turns = Turns(_SLOTS_FOR_ONE, _own_node)
         self._trail = trail

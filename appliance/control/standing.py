@@ -1,11 +1,9 @@
 """What the policy and the registry know of a host: which share of a finite thing is its own (`appliance/shares`)."""
 
-import ipaddress
 from collections.abc import Callable
-from functools import lru_cache
 
 from appliance.policy import Policy
-from appliance.policy.model import Address
+from appliance.policy.model import Address, address_of
 from appliance.shares.pool import Standing
 
 
@@ -31,9 +29,6 @@ class HostStanding:
     def of_text(self, host: str) -> Standing:
         """The same of a host as records have it; what is no address is nobody's that could be a stranger."""
         try:
-            return self(_parsed(host))
+            return self(address_of(host))
         except ValueError:
             return Standing.NAMED
-
-
-_parsed = lru_cache(1024)(ipaddress.ip_address)  # every call of a host asks

@@ -1,6 +1,7 @@
 """Who calls RVMaster or a node's outer face, the URI that a node gives for itself, and what is answered."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from appliance.audit_trail import Asker
 from appliance.master.graph.registry import Incarnation
@@ -20,8 +21,7 @@ class ApiUri:
     uri: NodeUri
 
 
-@dataclass(frozen=True, slots=True)
-class Caller:
+class Caller(NamedTuple):
     """Who makes a call: the peer, and the `caller_id` he claims.
 
     `own` marks the appliance's own nodes, which reach RVMaster on a listener of their own. `target` is set on an
@@ -33,6 +33,10 @@ class Caller:
     arrived: int
     own: bool = False
     target: Incarnation | None = None
+
+    def as_named(self, caller_id: str) -> "Caller":
+        """The same, by the name that it claims in this call."""
+        return Caller(self.peer, caller_id, self.arrived, self.own, self.target)
 
     @property
     def asker(self) -> Asker:

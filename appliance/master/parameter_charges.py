@@ -11,19 +11,18 @@ Invariants:
 3. Every place but the root is in the tree, is kept by the journal, and is gone with its key.
 """
 
-import ipaddress
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, cast
 
-from appliance.policy.model import Address
+from appliance.policy.model import Address, address_of
 from appliance.ros.errors import ProtocolError
 from appliance.ros.parameter_tree import Tree, parts_of
 from appliance.ros.xmlrpc import Value
 from appliance.shares.pool import Pool
 
-APPLIANCE: Address = ipaddress.ip_address("127.0.0.1")
+APPLIANCE: Address = address_of("127.0.0.1")
 NAME_WEIGHT = 40
 """About what is written around a member of a namespace, without its name and its value."""
 _VALUE, _TEXT, _ARRAY, _STRUCT = 45, 35, 50, 40  # about what is written around others
@@ -73,20 +72,30 @@ class ParameterCharges:
             place = self._root
             for part in parts_of(key):
                 place = place.below.setdefault(part, _Place())
-            place.owner = ipaddress.ip_address(host)
+            place.owner = address_of(host)
 
-    def held(self, parts: Sequence[str], weight: int) -> Counter[Address]:
+    def held(self, parts: Sequence[str], weight: int) -> Mapping[Address, int]:
         """Who is charged for what is at this key and below, which weighs so much in all."""
         path = self._path(parts)
+        owner = _owner(_region(path, parts))
+        if len(path) <= len(parts):
+            return {owner: weight}
         held: Counter[Address] = Counter()
-        if len(path) > len(parts):
-            for place in path[-1].owned():
-                held[_owner(place)] += place.weight
-        held[_owner(_region(path, parts))] += weight - held.total()
+        for place in path[-1].owned():
+            held[_owner(place)] += place.weight
+        held[owner] += weight - held.total()
         return held
 
     def replaced(self, parts: Sequence[str], before: int, after: int, owner: Address) -> None:
         """What is at this key weighed `before` in all, and now `after` (0: it is gone), which is this owner's."""
+        path = self._path(parts)
+        region = _region(path, parts)
+        if (
+            parts and len(path) <= len(parts) and region.owner == owner
+        ):  # as nearly always: no place begins or ends
+            region.weight += after - before
+            self.pool.charge(owner, after - before)
+            return
         self._release(parts, before)
         if not parts:
             self._root.owner, self._root.weight = owner, after

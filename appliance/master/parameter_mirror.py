@@ -3,7 +3,9 @@
 The mirror changes exactly as ROSMaster's tree does, and only after ROSMaster took the change.
 """
 
+import contextlib
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from typing import cast
 
 from appliance.master.parameter_charges import (
@@ -26,7 +28,8 @@ class ParameterMirror:
 
     `weight` is about the bytes of the whole tree in an answer to `getParam("/")`. It and the depth are bounded: a
     tree that ROSMaster could not tell any more would break it for everybody, and could not be read after a restart.
-    `note(key, value)` hears of each change of one parameter (None: it is gone); `since` are those after `tree`.
+    `note(key, value)` hears of each change of one parameter (None: it is gone); `since` are those after `tree`. What it
+    hears inside `together()` is kept at the end of that.
     """
 
     def __init__(
@@ -37,6 +40,7 @@ class ParameterMirror:
         *,
         depth_limit: int = 100,
         note: Callable[[str, Value], None],
+        together: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext,
         since: Iterable[tuple[str, Value]] = (),
     ) -> None:
         self.tree = tree
@@ -45,6 +49,7 @@ class ParameterMirror:
         self.version = 0  # another after every change
         self._told_of_change = changed
         self._note = note
+        self.together = together
         self._depth_limit = depth_limit
         for key, value in since:
             if value is None:
@@ -74,11 +79,11 @@ class ParameterMirror:
         parts, before = self._place_of(key)
         held = self.charges.held(parts, before)
         after = _with_namespaces(key, len(parts), weight)
-        growth = max(0, after - held[host])
+        growth = max(0, after - held.get(host, 0))
         refusal = pool.take(host, growth) if growth else ""
         if not refusal:
             return Reserved(pool, host, growth, weight)
-        former, most = held.most_common(1)[0]
+        former, most = max(held.items(), key=lambda each: each[1])
         if after > most:
             raise LimitReachedError(f"parameter {key[:80]} is not set: {refusal}")
         return Reserved(pool, former, 0, weight)

@@ -44,7 +44,7 @@ def canonical_network(network: Network) -> Network:
 class HostTable:
     """Networks and groups of one policy; built once, then only asked."""
 
-    __slots__ = ("_lengths", "_networks", "_parents", "_tables", "kept")
+    __slots__ = ("_lengths", "_named", "_networks", "_parents", "_tables", "kept")
 
     def __init__(self) -> None:
         self._parents: list[list[Atom]] = [[]]  # of each atom; atom 0 is EVERYONE
@@ -53,6 +53,7 @@ class HostTable:
         self._tables: dict[int, dict[int, dict[int, Atom]]] = {4: {}, 6: {}}
         self._lengths: dict[int, list[tuple[int, dict[int, Atom]]]] = {4: [], 6: []}
         self.kept: dict[tuple[int, int], frozenset[Atom]] = {}
+        self._named: dict[Address, tuple[Network, str]] = {}
 
     def network(self, network: Network) -> Atom:
         """The atom of a network, made when it is new."""
@@ -105,7 +106,22 @@ class HostTable:
 
     def narrowest(self, address: Address) -> Network:
         """The smallest network of the policy that holds the address; the address alone where none does."""
-        plain = canonical_address(address)
+        return self._named_as(address)[0]
+
+    def alike(self, address: Address) -> str:
+        """The same as text: of all addresses that the policy names as one network."""
+        return self._named_as(address)[1]
+
+    def _named_as(self, address: Address) -> tuple[Network, str]:
+        named = self._named.get(address)
+        if named is None:
+            if len(self._named) >= _KEPT_HOSTS:
+                self._named.clear()
+            network = self._narrowest(canonical_address(address))
+            named = self._named[address] = network, str(network)
+        return named
+
+    def _narrowest(self, plain: Address) -> Network:
         bits, number = _BITS[plain.version], int(plain)
         shift = min(
             (shift for shift, table in self._lengths[plain.version] if number >> shift in table), default=0

@@ -7,9 +7,51 @@
 import enum
 import ipaddress
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+
+class _IPv4(ipaddress.IPv4Address):
+    """With its hash and its text kept: the standard library makes both anew each time, out of other texts."""
+
+    __slots__ = ("_hash", "_text")
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._hash, self._text = super().__hash__(), super().__str__()
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __str__(self) -> str:
+        return self._text
+
+
+class _IPv6(ipaddress.IPv6Address):
+    """As `_IPv4`."""
+
+    __slots__ = ("_hash", "_text")
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._hash, self._text = super().__hash__(), super().__str__()
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __str__(self) -> str:
+        return self._text
+
+
+@lru_cache(4096)
+def address_of(text: str) -> Address:
+    """The address of a host, whose every call looks up what it holds: the same object for the same text.
+
+    It is equal to any other `ipaddress` makes of the text, with the same hash. Raises `ValueError` for no address.
+    """
+    return _IPv6(text) if ":" in text else _IPv4(text)
 
 
 class Category(enum.StrEnum):

@@ -207,6 +207,10 @@ class Policy:
         """By what the policy names an address: itself, or the smallest network whose every address it means as well."""
         return self.hosts.narrowest(address)
 
+    def alike(self, address: Address) -> str:
+        """The same as text, which is looked up with at every call."""
+        return self.hosts.alike(address)
+
     def has_section(self, category: Category) -> bool:
         """Whether the file has the section that decides this category."""
         return category in self._present

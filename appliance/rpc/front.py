@@ -20,7 +20,7 @@ from typing import Any
 
 import httptools
 
-from appliance.policy.model import Address
+from appliance.policy.model import Address, address_of
 from appliance.rpc.visitors import Stage, Visitors
 
 # A head of many short fields is as long as the bytes it came in.
@@ -172,7 +172,7 @@ class Front(asyncio.Protocol, ABC):
 
 def plain_address(text: str) -> Address:
     """The address without scope, an IPv4 address in IPv6 clothes as the IPv4 address it is."""
-    address = ipaddress.ip_address(text.partition("%")[0])
+    address = address_of(text.partition("%")[0])
     if isinstance(address, ipaddress.IPv6Address) and address.ipv4_mapped is not None:
-        return address.ipv4_mapped
+        return address_of(str(address.ipv4_mapped))
     return address

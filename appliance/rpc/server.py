@@ -265,9 +265,8 @@ class _Connection(Front):
                 self._release(self._held)
             self._body, self._held = bytearray(), 0
             return
-        if not self._body_is_held():
-            return
-        too_much = self.visitors.hold(self.peer.host, _REQUEST_BYTES + len(self._url))
+        size = len(self._body) - self._held + _REQUEST_BYTES + len(self._url)
+        too_much = self.visitors.hold(self.peer.host, size)
         if too_much:
             self.reject(b"503 Service Unavailable", f"sent a request while {too_much}")
             return
@@ -319,17 +318,17 @@ class _Connection(Front):
     def _go_on(self) -> None:
         """The answer is sent: the next request, if it is there, or wait for one."""
         self.allow(self.limits.idle_seconds)
+        closing = self.transport.is_closing()
+        finished = not (self._pending or self.in_request or closing)
+        self.visitors.file(self, Stage.IDLE if finished else Stage.UNFINISHED)
         if self._pending:
             self._serve_next()
-        elif not self.transport.is_closing():
-            if not self.in_request:
-                self.visitors.file(self, Stage.IDLE)
+        elif not closing:
             self.transport.resume_reading()
 
     def _answered_at_once(self, request: HttpRequest, *, keep: bool) -> bool:
         """Answer without a task, while nobody waits for a turn: this takes none from anybody."""
-        turns = self.server.turns
-        if turns.waiting or turns.pause(request.peer.text):
+        if self.server.turns.waiting:
             return False
         answer = self.server.at_once(request)
         if answer is None:
@@ -352,16 +351,20 @@ class _Connection(Front):
         finally:
             self._busy = None
             self._release(_held_by(request))
-        if not self.closing:
+        if self.closing:
+            self.visitors.file(self, Stage.UNFINISHED)
+        else:
             self._sent(status, body, keep=keep)
 
     def _sent(self, status: bytes, body: bytes, *, keep: bool) -> None:
         """Send an answer, and go on once it is taken."""
         self._write(status, body, keep=keep)
+        if keep and self._writable:
+            self._go_on()
+            return
+        self.visitors.file(self, Stage.UNFINISHED)  # until its answer is taken
         if not self._writable:
             self._hold_unsent()
-        elif keep:
-            self._go_on()
 
     async def _answer(self, request: HttpRequest) -> tuple[bytes, bytes]:
         turns, host = self.server.turns, request.peer.host
@@ -380,7 +383,6 @@ class _Connection(Front):
             return b"500 Internal Server Error", b""
         finally:
             turns.leave(host)
-            self.visitors.file(self, Stage.UNFINISHED)  # until its answer is taken
 
     def _hold_unsent(self) -> None:
         unsent = self.transport.get_write_buffer_size()

@@ -16,7 +16,7 @@ import asyncio
 import math
 import time
 from collections.abc import Callable
-from enum import Enum
+from enum import StrEnum
 from typing import Generic, Protocol
 
 from appliance.shares.pool import Bounds, Holder, Pool, Standing
@@ -24,7 +24,7 @@ from appliance.shares.queue import Queue
 from appliance.shares.table import RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_FAREWELLS
 
 
-class Stage(Enum):
+class Stage(StrEnum):
     """Where a connection is in its requests."""
 
     IDLE = "idle"

@@ -94,22 +94,22 @@ class Pool(Generic[Holder]):
 
     def _refusal(self, host: Holder, amount: int, standing: Standing, mine: int) -> str:
         bounds, what = self.bounds, self.what
+        strangers, named, registered = self._by_standing
         if mine + amount > bounds.host:
             return f"{host} has {mine} {what}; the share of one host is {bounds.host}"
-        strangers = self._by_standing[Standing.STRANGER]
         if standing is Standing.STRANGER and strangers + amount > bounds.strangers:
             return (
                 f"addresses that no rule of the policy names have {strangers} {what}; "
                 f"their share together is {bounds.strangers}"
             )
-        others = strangers + self._by_standing[Standing.NAMED]
+        others = strangers + named
         if standing is not Standing.REGISTERED and others + amount > bounds.whole - bounds.kept:
             return (
                 f"hosts without a registration have {others} {what}; "
                 f"{bounds.kept} of {bounds.whole} are kept for those with one"
             )
-        if self.total + amount > bounds.whole:
-            return f"all hosts together have {self.total} {what}; the limit is {bounds.whole}"
+        if others + registered + amount > bounds.whole:
+            return f"all hosts together have {others + registered} {what}; the limit is {bounds.whole}"
         return ""
 
     def take(self, host: Holder, amount: int = 1) -> str:
@@ -117,20 +117,20 @@ class Pool(Generic[Holder]):
         standing, mine = self._look_up(host)
         reason = self._refusal(host, amount, standing, mine)
         if not reason:
-            self._set(host, standing, mine + amount)
+            self._set(host, standing, mine, mine + amount)
         return reason
 
     def charge(self, host: Holder, amount: int = 1) -> None:
         """Count what `host` has, without asking: what it has already, or what cannot be refused any more."""
         standing, mine = self._look_up(host)
-        self._set(host, standing, mine + amount)
+        self._set(host, standing, mine, mine + amount)
 
     def give_back(self, host: Holder, amount: int = 1) -> None:
         """`host` has so much less. Raises ValueError when that is more than it has."""
         standing, mine = self._look_up(host)
         if amount > mine:
             raise ValueError(f"{host} gives back {amount} {self.what} and has {mine}")
-        self._set(host, standing, mine - amount)
+        self._set(host, standing, mine, mine - amount)
 
     def held(self, host: Holder) -> int:
         """What `host` has."""
@@ -154,15 +154,17 @@ class Pool(Generic[Holder]):
         standing = self._standing(host)
         counted_as, amount = self._held.get(host, _NOTHING)
         if amount and counted_as is not standing:
-            self._set(host, standing, amount)
+            self._by_standing[counted_as] -= amount
+            self._set(host, standing, 0, amount)
         return standing, amount
 
-    def _set(self, host: Holder, standing: Standing, amount: int) -> None:
-        counted_as, before = self._held.pop(host, _NOTHING)
-        self._by_standing[counted_as] -= before
+    def _set(self, host: Holder, standing: Standing, before: int, amount: int) -> None:
+        """The host has `amount`, and had `before`, both counted under this standing."""
+        self._by_standing[standing] += amount - before
         if amount:
             self._held[host] = standing, amount
-            self._by_standing[standing] += amount
+        elif before:
+            del self._held[host]
 
 
 _NOTHING = (Standing.STRANGER, 0)

@@ -48,7 +48,9 @@ class Queue(Generic[Holder, Member]):
         return iter(list(self._line_of))
 
     def _file(self, member: Member, host: Holder, since: float, standing: Standing) -> None:
-        self.remove(member)
+        before = self._line_of.get(member)
+        if before is not None:
+            del before[member]
         line = self._lines[standing]
         line[member] = host, since
         self._line_of[member] = line

@@ -54,12 +54,12 @@ class WriteAhead:
             position += _LENGTH.size + length
         return statements
 
-    def append(self, statement: Statement) -> None:
-        """Keep a statement. Raises `OSError` when the disk is full."""
-        body = self._encoder.encode(statement)
-        data = _LENGTH.pack(len(body)) + body
+    def append(self, statements: Sequence[Statement]) -> None:
+        """Keep statements, by one write. Raises `OSError` when the disk is full."""
+        bodies = [self._encoder.encode(statement) for statement in statements]
+        data = b"".join([_LENGTH.pack(len(body)) + body for body in bodies])
         with self._lock:
-            self._waiting += 1
+            self._waiting += len(statements)
             written = os.write(self._descriptor, data)
             if written < len(data):
                 os.ftruncate(self._descriptor, os.fstat(self._descriptor).st_size - written)

@@ -9,7 +9,7 @@ import contextlib
 import queue
 import sqlite3
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,6 +27,11 @@ class _Queued(NamedTuple):
     sql: str
     parameters: Parameters
     ahead: bool
+
+
+class _Gathered(NamedTuple):
+    thread: int
+    statements: list[_Queued]
 
 
 class StoreError(Exception):
@@ -55,6 +60,7 @@ class Database:
             raise StoreError(f"{path}: {error}; {_advice(error)}") from error
         except (OSError, msgspec.MsgspecError) as error:
             raise StoreError(f"{path.with_suffix('.ahead')}: {error}") from error
+        self._gathered: _Gathered | None = None
         self._queue: queue.SimpleQueue[_Queued | Callable[[], None] | None] = queue.SimpleQueue()
         self._closing = threading.Event()
         self._hurry = threading.Event()
@@ -79,12 +85,36 @@ class Database:
 
     def submit(self, sql: str, parameters: Parameters = (), *, ahead: bool = True) -> None:
         """Queue one statement; when this returns it outlasts the process (unless not `ahead`: for large values)."""
+        statement = _Queued(sql, parameters, ahead)
+        gathered = self._gathered
+        if gathered is not None and gathered.thread == threading.get_ident():
+            gathered.statements.append(statement)
+        else:
+            self._keep([statement])
+
+    @contextlib.contextmanager
+    def together(self) -> Iterator[None]:
+        """What this thread submits inside is kept by one write, at the end: only then it outlasts the process."""
+        if self._gathered is not None:
+            yield
+            return
+        gathered = self._gathered = _Gathered(threading.get_ident(), [])
+        try:
+            yield
+        finally:
+            self._gathered = None
+            if gathered.statements:
+                self._keep(gathered.statements)
+
+    def _keep(self, statements: list[_Queued]) -> None:
+        ahead = [(one.sql, one.parameters) for one in statements if one.ahead]
         if ahead:
             try:
-                self._ahead.append((sql, parameters))
+                self._ahead.append(ahead)
             except OSError as error:
                 self._failed(f"{self._path.with_suffix('.ahead')}: {error}")
-        self._queue.put(_Queued(sql, parameters, ahead))
+        for statement in statements:
+            self._queue.put(statement)
 
     def put(self, table: str, *row: Parameter, ahead: bool = True) -> None:
         """Queue a row of a table, in the place of the one that has its key; see `submit`."""

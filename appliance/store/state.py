@@ -1,6 +1,7 @@
 """The tables of control's state file: registry, parameters, policy revisions, tokens, hosts, settings."""
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -129,6 +130,10 @@ class StateStore:
         """Wait until everything saved so far is in the file."""
         await self.database.settled()
 
+    def together(self) -> AbstractContextManager[None]:
+        """What is saved inside outlasts the process when this has ended, by one write."""
+        return self.database.together()
+
     def close(self) -> None:
         """Write what is left and close."""
         self.database.close()
@@ -137,15 +142,17 @@ class StateStore:
 
     def save_incarnation(self, row: IncarnationRow) -> None:
         """Keep an incarnation, or its new `life`."""
-        self.database.put("incarnation", *row[:-1])
-        self.database.delete("relay_port", key=row.key)
-        for relay, port in enumerate(row.more_relay_ports, start=1):
-            self.database.put("relay_port", row.key, relay, port)
+        with self.together():
+            self.database.put("incarnation", *row[:-1])
+            self.database.delete("relay_port", key=row.key)
+            for relay, port in enumerate(row.more_relay_ports, start=1):
+                self.database.put("relay_port", row.key, relay, port)
 
     def forget_incarnation(self, key: str) -> None:
         """Drop an incarnation and its registrations."""
-        for table in ("incarnation", "relay_port", "registration", "permission"):
-            self.database.delete(table, key=key)
+        with self.together():
+            for table in ("incarnation", "relay_port", "registration", "permission"):
+                self.database.delete(table, key=key)
 
     def save_registration(self, row: RegistrationRow) -> None:
         """Keep a registration."""

@@ -9,7 +9,7 @@ to; a URI is parsed; anything else is a `PeerError` that names the parameter, as
 
 import enum
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, TypeVar, cast, overload
 
 from appliance.master.caller import ApiUri, Caller
@@ -181,7 +181,7 @@ class Identity(enum.Enum):
     NOBODY = "nobody"  # the call has no caller_id
 
 
-class Verb(enum.Enum):
+class Verb(enum.StrEnum):
     """What a call does with what it is about."""
 
     REGISTER = "register"  # a node has it from then on
@@ -250,6 +250,8 @@ class Call(Generic[S]):
     in_run: bool = False
     resource: int | None = field(init=False)  # which parameter names what it is about
     api: int | None = field(init=False)  # which is the caller's own URI
+    policy_name: str = field(init=False)  # the name that the policy knows it by
+    category: Category = field(init=False)  # what kind of thing it is decided and recorded as
 
     def __post_init__(self) -> None:
         parameters = self.method.parameters
@@ -257,21 +259,13 @@ class Call(Generic[S]):
         own = [place for place, parameter in enumerate(parameters) if parameter.name == "caller_api"]
         object.__setattr__(self, "resource", places[0] if places else None)
         object.__setattr__(self, "api", own[0] if own else None)
-
-    @property
-    def category(self) -> Category:
-        """What kind of thing it is decided and recorded as."""
-        return category_of(self.policy_name)
+        object.__setattr__(self, "policy_name", self.command or self.name)
+        object.__setattr__(self, "category", category_of(self.policy_name))
 
     @property
     def touches(self) -> Category | None:
         """Whether it reads or writes the ROS parameter that it is about."""
         return touch_of(self.policy_name)
-
-    @property
-    def policy_name(self) -> str:
-        """The name that the policy knows it by."""
-        return self.command or self.name
 
     def attempt(self, caller: Caller, params: Sequence[Value]) -> "Attempt":
         """The call with canonical arguments, and the caller with the name that it claims. Raises `PeerError`."""
@@ -288,7 +282,7 @@ class Call(Generic[S]):
         elif caller_id or self.verb not in {Verb.READ, Verb.CONNECT}:
             check_tool_id(caller_id)
         arguments = canonicalise(self.method.parameters, caller_id, params[1:])
-        return Attempt(replace(caller, caller_id=caller_id), self, arguments)
+        return Attempt(caller.as_named(caller_id), self, arguments)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,6 @@ What goes wrong on the way is an answer of the right shape for the caller, and a
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import structlog
@@ -41,6 +40,7 @@ from appliance.rpc.client import CallFailedError
 from appliance.shares.pool import Standing
 
 _log = structlog.get_logger()
+_REGISTERS = (Verb.REGISTER, Verb.UNREGISTER)
 _FAILURES = (NoPortError, LimitReachedError, PeerError, EncodingError, CallFailedError)
 
 
@@ -102,16 +102,26 @@ class Execution:
         if self._parameters.weight_of_answer(attempt) >= self._large:
             await visit.bulk.take()
         call, probe = attempt.call, None
-        registers = call.verb in {Verb.REGISTER, Verb.UNREGISTER}
+        registers, writes = call.verb in _REGISTERS, call.verb is Verb.WRITE
         outcome = self._decide(attempt)
-        if isinstance(outcome, Contest):
+        if isinstance(outcome, Contest):  # of two that register
             probe = await self._liveness.probe(outcome.holder)
-        elif not outcome.allowed or not (registers or call.verb is Verb.WRITE):
+        elif not outcome.allowed or not (registers or writes):
             return await self._carry_out(visit, attempt, outcome)
-        name = self._claims.alone(attempt.caller.caller_id) if registers else contextlib.nullcontext(False)
-        async with name as named_later, self._turn([attempt]) as later:
-            if named_later or later or isinstance(outcome, Contest):
+        elif writes:
+            return await self._in_turn(visit, attempt, outcome)
+        async with self._claims.alone(attempt.caller.caller_id) as later:
+            if later or isinstance(outcome, Contest):
                 outcome = self._settled(attempt, probe)
+            if call.kind is Kind.PARAMETER:
+                return await self._in_turn(visit, attempt, outcome)
+            return await self._carry_out(visit, attempt, outcome)
+
+    async def _in_turn(self, visit: Visit, attempt: Attempt, outcome: Decision) -> Value:
+        """Carry out what writes a parameter, or hears of its writes, when nothing else writes it."""
+        async with self._turn([attempt]) as later:
+            if later:
+                outcome = self._settled(attempt)
             return await self._carry_out(visit, attempt, outcome)
 
     async def answer_run(self, visit: Visit, run: Sequence[Attempt]) -> list[Value]:
@@ -259,7 +269,7 @@ class Execution:
         raise error
 
     def _unknown(self, caller: Caller, method: str, params: Sequence[Value]) -> Answer:
-        caller = replace(caller, caller_id=claimed_name(params))
+        caller = caller.as_named(claimed_name(params))
         decision = Decision(False, None, f"{method[:200]!r} is not a call that is served here")
         record = self._trail.decided(caller.asker, method, Category.COMMAND.value, method[:200], decision)
         return [0, self._told(decision, record), 0]

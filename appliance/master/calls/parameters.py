@@ -145,18 +145,20 @@ class ParameterCalls:
             for _write, reserved in waiting:
                 if reserved is not None:
                     reserved.release()
-        for (write, reserved), outcome in zip(waiting, outcomes, strict=True):
-            if isinstance(outcome, Exception):
-                continue
-            if reserved is not None and _is_set(outcome, write):
-                self.mirror.set(write.key, write.value, reserved)
-                self.enactor.carry_out(
-                    self.graph.parameter_set(write.key, write.value, write.caller.caller_id)
-                )
-            elif reserved is None and outcome[0] == 1:
-                self.mirror.delete(write.key)
-                self.enactor.carry_out(self.graph.parameter_deleted(write.key))
+        with self.mirror.together():
+            for (write, reserved), outcome in zip(waiting, outcomes, strict=True):
+                if not isinstance(outcome, Exception):
+                    self._written(write, reserved, outcome)
         return outcomes
+
+    def _written(self, write: Write, reserved: Reserved | None, outcome: Answer) -> None:
+        """ROSMaster answered so."""
+        if reserved is not None and _is_set(outcome, write):
+            self.mirror.set(write.key, write.value, reserved)
+            self.enactor.carry_out(self.graph.parameter_set(write.key, write.value, write.caller.caller_id))
+        elif reserved is None and outcome[0] == 1:
+            self.mirror.delete(write.key)
+            self.enactor.carry_out(self.graph.parameter_deleted(write.key))
 
     async def _make(self, calls: list[Wanted]) -> list[Answer | Exception]:
         """The outcomes of the calls, made as one if they are several."""

@@ -8,8 +8,9 @@ any other, but is neither parsed, nor decided, nor written anew where nothing ca
 2. An answer holds while everything is the same that decision, record and answer are made of: host and words, the policy
    and its revision, who holds the claimed name, the appliance's address that the host is told, and the registry, or the
    value of the parameter.
-3. What can refuse a call whatever it asks (an audit log that cannot be written, a disk that is nearly full) is asked
-   each time; and where the answer waits for its record, nothing is answered from here.
+3. What can refuse a call whatever it asks, or have it wait (an audit log that cannot be written, a disk that is nearly
+   full, records that the host owes for) is asked each time; and where the answer waits for its record, nothing is
+   answered from here.
 4. What is remembered is bounded: so many questions, so many bytes.
 """
 
@@ -101,7 +102,10 @@ class Repetitions:
         if question is None:
             return None
         trail = self._trail
-        if trail.strict or trail.obstacle or trail.shut_out(peer.text) or not self._holds(question, peer):
+        host = peer.text
+        if trail.strict or trail.obstacle or trail.shut_out(host) or trail.owing(host):
+            return None
+        if not self._holds(question, peer):
             return None
         for part in question.parts:
             trail.decided_again(part.same, request.arrived)

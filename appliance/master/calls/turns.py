@@ -14,9 +14,8 @@ decision is made when it is the writer's turn.
 """
 
 import asyncio
-import contextlib
-from collections.abc import AsyncIterator, Collection
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Collection
 
 
 class WriteTurns:
@@ -89,31 +88,56 @@ def _meet(mine: tuple[str, ...], others: tuple[str, ...]) -> bool:
     return any(one.startswith(others) for one in mine) or any(other.startswith(mine) for other in others)
 
 
-@dataclass(slots=True)
-class _Claim:
-    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-    users: int = 0
-
-
 class Claims:
-    """One lock per name that is in use at the moment; nothing is kept of other names."""
+    """The names that are in use at the moment, each with those who wait for it; nothing is kept of other names."""
 
     def __init__(self) -> None:
-        self._claims: dict[str, _Claim] = {}
+        self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
 
     def __len__(self) -> int:
-        return len(self._claims)
+        return len(self._waiting)
 
-    @contextlib.asynccontextmanager
-    async def alone(self, name: str) -> AsyncIterator[bool]:
-        """Be the only one who registers under this name, first come, first served; whether it had to wait."""
-        claim = self._claims.setdefault(name, _Claim())
-        claim.users += 1
-        waited = claim.users > 1
+    def alone(self, name: str) -> "Claim":
+        """To be the only one who registers under this name, first come, first served: `async with`."""
+        return Claim(self._waiting, name)
+
+
+class Claim:
+    """One registering call: entered when those before it under its name have ended."""
+
+    __slots__ = ("_name", "_waiting")
+
+    def __init__(self, waiting: dict[str, deque[asyncio.Future[None]]], name: str) -> None:
+        self._waiting = waiting
+        self._name = name
+
+    async def __aenter__(self) -> bool:
+        """Whether it had to wait."""
+        before = self._waiting.get(self._name)
+        if before is None:
+            self._waiting[self._name] = deque()
+            return False
+        turn = asyncio.get_running_loop().create_future()
+        before.append(turn)
         try:
-            async with claim.lock:
-                yield waited
-        finally:
-            claim.users -= 1
-            if not claim.users:
-                del self._claims[name]
+            await turn
+        except asyncio.CancelledError:
+            if turn.cancelled():
+                before.remove(turn)
+            else:  # it was its turn already
+                self._end()
+            raise
+        return True
+
+    async def __aexit__(self, *_error: object) -> None:
+        self._end()
+
+    def _end(self) -> None:
+        """The next one is let in; one that was cancelled and has not run since is no more there."""
+        waiting = self._waiting[self._name]
+        turn = next((one for one in waiting if not one.done()), None)
+        if turn is None:
+            del self._waiting[self._name]
+        else:
+            waiting.remove(turn)
+            turn.set_result(None)

@@ -7,7 +7,6 @@ from the call that set them, never from what ROSMaster's notification threads sa
 ROSMaster is rebuilt), out of date or misread by ROSMaster never reaches a node.
 """
 
-import ipaddress
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
@@ -32,7 +31,7 @@ from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.policy import Policy
 from appliance.policy.limits import Part
-from appliance.policy.model import Address, Decision
+from appliance.policy.model import Address, Decision, address_of
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import weigh
 from appliance.specifications.allocation import SERVICE, TOPIC
@@ -235,7 +234,7 @@ class Graph:
                 ):
                     effects.append(Place(node, registration.kind, registration.resource, registration.detail))
             for row in self._grants.of(node.key):
-                reader = ((Part.SUBSCRIBER, ipaddress.ip_address(row.host)),)
+                reader = ((Part.SUBSCRIBER, address_of(row.host)),)
                 if row.kind == TOPIC and _differ(before, now, row.resource, reader):
                     effects.append(PlaceGrant(row))
         return effects

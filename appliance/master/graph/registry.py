@@ -249,7 +249,7 @@ class Registry:
 
     def nodes_of(self, host: Address) -> int:
         """How many incarnations of a host are known (for the limit per host)."""
-        return self._nodes_of[host]
+        return self._nodes_of.get(host, 0)
 
     def spare_of(self, host: Address) -> Incarnation | None:
         """The incarnation of a host that makes room first: one that has nothing, else the one that was lost first."""
@@ -273,7 +273,7 @@ class Registry:
 
     def registrations_of(self, host: Address) -> int:
         """How many registrations a host has (for the limit per host)."""
-        return self._registrations_of[host]
+        return self._registrations_of.get(host, 0)
 
     def in_order(self) -> Iterator[tuple[Incarnation, Registration]]:
         """Every registration of live incarnations, in the order they were made."""

@@ -4,7 +4,6 @@ What is no longer allowed is taken back, and remembered: what is allowed again (
 confirmed in time) is put back, because a ROS 1 node never registers twice.
 """
 
-import ipaddress
 from collections.abc import Callable, Iterable
 
 from appliance.master.graph.effects import Effect, Effects, PutBack, Record, TakeBack, UsePorts
@@ -14,7 +13,7 @@ from appliance.master.graph.own_node import OWN, ROSOUT
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
 from appliance.policy import Policy
 from appliance.policy.live import Live, live_by, may_keep
-from appliance.policy.model import Address, Decision
+from appliance.policy.model import Address, Decision, address_of
 from appliance.ros.parameter_tree import Tree
 from appliance.specifications.allocation import TOPIC
 from appliance.store.state import PermissionRow
@@ -164,7 +163,7 @@ class Revocation:
 
     def _granted(self, row: PermissionRow) -> Live:
         call = "requestTopic" if row.kind == TOPIC else "lookupService"
-        return Live(ipaddress.ip_address(row.host), row.caller_id, call, row.resource)
+        return Live(address_of(row.host), row.caller_id, call, row.resource)
 
 
 def revoked(effects: Iterable[Effect]) -> int:

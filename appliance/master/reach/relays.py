@@ -6,7 +6,6 @@ stated to the relay that carries it (`allocation`), a node to every relay that c
 """
 
 import asyncio
-import ipaddress
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -23,6 +22,7 @@ from appliance.master.reach.places import Places
 from appliance.master.reach.topic_looks import TopicLooks
 from appliance.policy import Policy
 from appliance.policy.limits import Part, Rate
+from appliance.policy.model import address_of
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Resource
@@ -391,7 +391,7 @@ class RelayControl:
 
 
 def _grant(policy: Policy, row: PermissionRow) -> messages.GrantInstalled:
-    limit = policy.limit(Part.SUBSCRIBER, row.resource, ipaddress.ip_address(row.host))
+    limit = policy.limit(Part.SUBSCRIBER, row.resource, address_of(row.host))
     return messages.GrantInstalled(row.key, row.resource, row.host, row.caller_id, _flow(limit))
 
 

@@ -4,7 +4,6 @@ What the store was told of the registry comes back after a restart (`restore`).
 """
 
 import asyncio
-import ipaddress
 from collections.abc import Iterable, Sequence
 from typing import assert_never
 
@@ -47,6 +46,7 @@ from appliance.master.reach.faces import Faces
 from appliance.master.reach.places import Places
 from appliance.master.reach.relays import RelayControl
 from appliance.master.upkeep.entries import Entries
+from appliance.policy.model import address_of
 from appliance.ros.uris import parse_node_uri
 from appliance.rpc.client import CallFailedError
 from appliance.store.state import IncarnationRow, RegistrationRow, StateStore
@@ -207,7 +207,7 @@ def restore(registry: Registry, store: StateStore) -> int:
         row.key: Incarnation(
             key=row.key,
             name=row.name,
-            host=ipaddress.ip_address(row.host),
+            host=address_of(row.host),
             api=parse_node_uri(row.api),
             api_text=row.api,
             told=row.told,

@@ -1,13 +1,14 @@
 """XML-RPC as ROS 1 speaks it, without I/O: requests and answers from bytes, under limits, and to bytes.
 
-Nothing that was received is sent on as bytes: it is parsed into values (`reader`), decided on, and written
-afresh (`writer`).
+Nothing that was received is sent on as bytes: it is parsed into values (`reader`, and `usual` for what is short and
+plain), decided on, and written afresh (`writer`).
 """
 
 from dataclasses import dataclass
 
 from appliance.ros.errors import LimitExceededError, PeerError, ProtocolError
 from appliance.ros.xmlrpc.reader import Document
+from appliance.ros.xmlrpc.usual import usual_answer, usual_call
 from appliance.ros.xmlrpc.values import DEFAULT_LIMITS, Limits, Value
 from appliance.ros.xmlrpc.writer import build_call, build_fault, build_response
 
@@ -44,6 +45,9 @@ class FaultReceived(PeerError):  # noqa: N818 - named as the event it is: the an
 
 def parse_call(body: bytes, limits: Limits = DEFAULT_LIMITS) -> MethodCall:
     """Parse a request; raises `ProtocolError` or `LimitExceededError`."""
+    usual = usual_call(body, limits)
+    if usual is not None:
+        return MethodCall(usual[0], tuple(usual[1]))
     document = Document(body, limits, "methodCall")
     params = document.values
     if document.method == "system.multicall" and params:
@@ -57,6 +61,9 @@ def parse_call(body: bytes, limits: Limits = DEFAULT_LIMITS) -> MethodCall:
 
 def parse_response(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Value:
     """Parse an answer; raises `FaultReceived` if it is a fault, `ProtocolError` or `LimitExceededError`."""
+    usual = usual_answer(body, limits)
+    if usual is not None:
+        return usual
     document = Document(body, limits, "methodResponse")
     if len(document.values) != 1:
         raise ProtocolError(f"answer with {len(document.values)} values; it has one")

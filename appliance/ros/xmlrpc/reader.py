@@ -33,6 +33,7 @@ _HEAD = re.compile(
 )
 _ENCODINGS = frozenset({b"utf-8", b"us-ascii", b"iso-8859-1"})
 _SPACE = " \t\r\n"
+_LINE_FEED = ["\n"]
 
 _SCALARS = ("i4", "int", "boolean", "double", "string", "dateTime.iso8601", "base64", "nil",
             "ex:i1", "ex:i2", "ex:i8", "ex:float", "ex:nil")  # fmt: skip
@@ -137,7 +138,7 @@ class Document:
         if follow is None or (attributes and self._state != "document"):  # the root's: see _HEAD
             raise self._error(f"<{tag[:40]}> {'with attributes' if follow else f'inside {self._place()}'}")
         if self._text:
-            self._refuse_text()
+            self._pass_space()
         self._follow.append(follow)
         self._state = tag
         if tag == "value":
@@ -154,7 +155,7 @@ class Document:
             if self._state == "value":  # without a type
                 self._value = self._string()
             elif self._text:
-                self._refuse_text()
+                self._pass_space()
             container = self._stack[-1]
             if type(container) is list:
                 container.append(self._value)
@@ -162,10 +163,9 @@ class Document:
                 container[self._keys.pop()] = self._value  # type: ignore[call-overload]  # it is the dict
         elif (read := _READ.get(tag)) is not None:
             self._value = read(self)
-        elif self._text:
-            self._refuse_text()
-            self._close(tag)
         else:
+            if self._text:
+                self._pass_space()
             self._close(tag)
         self._state = self._follow.pop()
 
@@ -252,10 +252,12 @@ class Document:
     def _place(self) -> str:
         return self._state if self._state != "full" else "an element that is complete"
 
-    def _refuse_text(self) -> None:
-        text = "".join(self._text).strip(_SPACE)
-        if text:
-            raise self._error(f"text {text[:40]!a} between elements")
+    def _pass_space(self) -> None:
+        """Between elements there is nothing else; ROS clients write a line feed."""
+        if self._text != _LINE_FEED:
+            text = "".join(self._text).strip(_SPACE)
+            if text:
+                raise self._error(f"text {text[:40]!a} between elements")
         self._text.clear()
 
     def _refuse_instruction(self, target: str, _data: str) -> None:

@@ -66,14 +66,13 @@ def _text(string: str) -> str:
 def _write(value: Value, out: list[str], depth: int) -> None:
     if depth > _MAX_WRITE_DEPTH:
         raise EncodingError(f"value nested deeper than {_MAX_WRITE_DEPTH}")
+    if type(value) is str:
+        out.append(f"<value><string>{_text(value)}</string></value>\n")
+        return
     writer = _WRITERS.get(type(value))
     if writer is None:
         raise EncodingError(f"value of type {type(value).__name__}: XML-RPC has no notation for it")
     writer(value, out, depth)
-
-
-def _write_string(value: str, out: list[str], _depth: int) -> None:
-    out.append(f"<value><string>{_text(value)}</string></value>\n")
 
 
 def _write_boolean(value: bool, out: list[str], _depth: int) -> None:
@@ -126,7 +125,6 @@ def _write_nil(_value: None, _out: list[str], _depth: int) -> None:
 
 
 _WRITERS: Mapping[type, Callable[[Any, list[str], int], None]] = {
-    str: _write_string,
     bool: _write_boolean,
     int: _write_integer,
     float: _write_double,

@@ -129,7 +129,7 @@ def test_the_file_of_statements_on_their_way_is_empty_once_all_are_in(
 def test_a_statement_torn_by_the_crash_is_left_out(tmp_path: Path) -> None:
     """Half a statement at the end was never answered for: the whole ones before it are carried out."""
     ahead = WriteAhead(tmp_path / "state.ahead")
-    ahead.append(("INSERT OR REPLACE INTO thing VALUES ('whole', 1)", ()))
+    ahead.append([("INSERT OR REPLACE INTO thing VALUES ('whole', 1)", ())])
     ahead.close()
     with (tmp_path / "state.ahead").open("ab") as file:
         file.write(b"\x00\x00\x01\x00 torn")

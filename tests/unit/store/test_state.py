@@ -3,7 +3,7 @@
 import os
 import signal
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -65,9 +65,9 @@ def test_what_a_killed_process_left_is_carried_out_again_from_any_statement_on(
     statements: list[Statement] = []
     append = WriteAhead.append
 
-    def observed(ahead: WriteAhead, statement: Statement) -> None:
-        statements.append(statement)
-        append(ahead, statement)
+    def observed(ahead: WriteAhead, together: Sequence[Statement]) -> None:
+        statements.extend(together)
+        append(ahead, together)
 
     monkeypatch.setattr(WriteAhead, "append", observed)
     node = incarnation("k1")._replace(more_relay_ports=(19003, 19004))
@@ -89,7 +89,7 @@ def test_what_a_killed_process_left_is_carried_out_again_from_any_statement_on(
     for begin in range(len(statements)):
         ahead = WriteAhead(tmp_path / "state.ahead")
         for statement in statements[begin:]:
-            ahead.append(statement)
+            ahead.append([statement])
         ahead.close()
         again = reopened(tmp_path)
         assert again.load_registry() == ([node], [registration])

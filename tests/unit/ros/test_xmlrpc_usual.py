@@ -1,0 +1,103 @@
+"""Short, plain documents are read by a pattern: as the walk through their elements reads them, or not at all."""
+
+import time
+import xmlrpc.client
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from appliance.ros.errors import PeerError
+from appliance.ros.xmlrpc import Limits, Value, build_response, parse_call
+from appliance.ros.xmlrpc.reader import Document
+from appliance.ros.xmlrpc.usual import usual_answer, usual_call
+from tests.support.examples import examples
+
+NAMES = st.one_of(
+    st.text("/abc_09 :.~;\"'", max_size=12), st.text(max_size=5), st.sampled_from(["&", "]]>", "a\rb"])
+)
+SCALARS: st.SearchStrategy[Value] = st.one_of(NAMES, st.integers(-(2**31), 2**31 - 1), st.booleans())
+ROSCPP = (
+    b'<?xml version="1.0"?>\r\n<methodCall><methodName>registerPublisher</methodName>\r\n<params>'
+    b"<param><value>/talker</value></param><param><value><i4>-7</i4></value></param></params></methodCall>\r\n"
+)
+
+
+def walked(body: bytes, root: str, limits: Limits) -> tuple[str, list[Value]] | None:
+    """What the walk makes of a document; None where it refuses it."""
+    try:
+        document = Document(body, limits, root)
+    except PeerError:
+        return None
+    return document.method, document.values
+
+
+def dumped(values: list[Value], method: str | None) -> bytes:
+    """A call, or an answer, as Python's clients write it."""
+    if method is not None:
+        return xmlrpc.client.dumps(tuple(values), method).encode("utf-8", "surrogatepass")
+    return xmlrpc.client.dumps((values,), methodresponse=True).encode("utf-8", "surrogatepass")
+
+
+LIST = b"<value><array><data></data></array></value>"
+LISTS: st.SearchStrategy[Value] = st.lists(SCALARS, max_size=3)
+
+
+@given(values=st.lists(st.one_of(SCALARS, LISTS, st.lists(LISTS, max_size=2)), max_size=4), data=st.data())
+@settings(max_examples=examples(1000))
+def test_what_the_pattern_reads_the_walk_reads_alike(values: list[Value], data: st.DataObject) -> None:
+    """Whole or damaged, a call or an answer has the same values both ways, or the pattern leaves it to the walk."""
+    asked = data.draw(st.booleans())
+    body = bytearray(
+        data.draw(st.sampled_from([dumped(values, "registerService" if asked else None), ROSCPP]))
+    )
+    for _ in range(data.draw(st.integers(0, 3))):
+        at = data.draw(st.integers(0, len(body) - 1))
+        piece = data.draw(
+            st.sampled_from([b"", b"<", b">", b"&", b"\r", b"]]>", b"/", b" ", b"<value>", b"\x00", b"9"])
+        )
+        body[at : at + data.draw(st.integers(0, 2))] = piece
+    limits = Limits(
+        elements=data.draw(st.sampled_from([3, 10**6])), string=data.draw(st.sampled_from([5, 10**6]))
+    )
+    call = usual_call(bytes(body), limits)
+    assert call is None or call == walked(bytes(body), "methodCall", limits)
+    answer = usual_answer(bytes(body), limits)
+    assert answer is None or ("", [answer]) == walked(bytes(body), "methodResponse", limits)
+
+
+@pytest.mark.parametrize("quote", [b"'", b'"'])
+def test_calls_of_ros_clients_and_answers_of_rosmaster_are_usual(quote: bytes) -> None:
+    """The pattern knows what registrations look like, whoever writes them, and what rosmaster answers."""
+    told: list[Value] = ["/talker", "/chatter", "std_msgs/String", "http://10.0.0.5:40001/"]
+    python = dumped(told, "registerPublisher").replace(b"version='1.0'", b"version=%b1.0%b" % (quote, quote))
+    assert usual_call(python, Limits()) == ("registerPublisher", told)
+    assert usual_call(ROSCPP, Limits()) == ("registerPublisher", ["/talker", -7])
+    last: list[Value] = [0, "", ["http://10.0.0.5:40001/", "http://10.0.0.5:40002/"], []]
+    for value in last:
+        answer: list[Value] = [1, "Registered [/talker] as publisher of [/chatter]", value]
+        assert usual_answer(dumped(answer, None), Limits()) == answer
+        assert usual_answer(build_response(answer), Limits()) == answer
+    several: list[Value] = [
+        [[1, f"parameter /a/{place} set", value]] for place, value in enumerate(last * 16)
+    ]
+    assert usual_answer(dumped(several, None), Limits()) == several
+
+
+@pytest.mark.parametrize("piece", [b" ", b"\n", b"<value>a</value>", b"<value>a</value> \n", b"1"])
+@pytest.mark.parametrize("before", [b"", b"<value>", b"<value><int>", LIST, LIST[:20]])
+def test_a_document_that_is_none_costs_no_more_than_its_length(piece: bytes, before: bytes) -> None:
+    """What does not fit the pattern in its last byte is left to the walk at once: nothing is tried over and over."""
+    whole = dumped(["a"], None).partition(b"<value>")[0] + before + piece * (31_000 // len(piece)) + b"<"
+    begun = time.process_time()
+    assert usual_answer(whole, Limits()) is None
+    call = whole.replace(b"<methodResponse>", b"<methodCall><methodName>m</methodName>")
+    assert usual_call(call, Limits()) is None
+    assert time.process_time() - begun < 0.2  # a quadratic pattern takes four times as long
+
+
+def test_one_value_too_many_is_refused_however_short() -> None:
+    """The limits hold for what is short, too."""
+    body = dumped(["a"] * 4, "m")
+    with pytest.raises(PeerError, match="more than 3 values"):
+        parse_call(body, Limits(elements=3))
