@@ -189,7 +189,10 @@ class Meter:
 
     def called(self, call: str, seconds: float) -> None:
         """A call of the table was answered (`call` must not be a stranger's text)."""
-        self.calls.setdefault(call, Histogram()).observe(seconds)
+        histogram = self.calls.get(call)
+        if histogram is None:
+            histogram = self.calls[call] = Histogram()
+        histogram.observe(seconds)
 
 
 def markdown() -> str:

@@ -124,11 +124,15 @@ class Front(asyncio.Protocol, ABC):
 
     def on_url(self, url: bytes) -> None:
         """A piece of the path."""
-        self._count_head(len(url))
+        self._head_bytes += len(url)
+        if self._head_bytes > self.limits.head_bytes and not self.closing:
+            self._reject_head()
 
     def on_header(self, name: bytes, value: bytes) -> None:
         """One field."""
-        self._count_head(len(name) + len(value) + _FIELD_FRAMING)
+        self._head_bytes += len(name) + len(value) + _FIELD_FRAMING
+        if self._head_bytes > self.limits.head_bytes and not self.closing:
+            self._reject_head()
 
     def on_headers_complete(self) -> None:
         """The head is there."""
@@ -137,11 +141,6 @@ class Front(asyncio.Protocol, ABC):
     def on_message_complete(self) -> None:
         """The request is there."""
         self.in_request = False
-
-    def _count_head(self, size: int) -> None:
-        self._head_bytes += size
-        if self._head_bytes > self.limits.head_bytes and not self.closing:
-            self._reject_head()
 
     def _reject_head(self) -> None:
         self.reject(b"431 Request Header Fields Too Large", "sent a request head beyond the limit")

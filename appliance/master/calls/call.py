@@ -273,7 +273,8 @@ class Call(Generic[S]):
             return Attempt(caller, self, canonicalise(self.method.parameters, "", params))
         if not params:
             raise ProtocolError("missing required caller_id parameter")
-        check_arity(self.method.parameters, params[1:])
+        given = params[1:]
+        check_arity(self.method.parameters, given)
         caller_id = params[0]
         if not isinstance(caller_id, str):
             raise ProtocolError("caller_id must be a string")
@@ -281,7 +282,7 @@ class Call(Generic[S]):
             check_caller_id(caller_id)
         elif caller_id or self.verb not in {Verb.READ, Verb.CONNECT}:
             check_tool_id(caller_id)
-        arguments = canonicalise(self.method.parameters, caller_id, params[1:])
+        arguments = canonicalise(self.method.parameters, caller_id, given)
         return Attempt(caller.as_named(caller_id), self, arguments)
 
 

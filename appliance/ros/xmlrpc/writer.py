@@ -22,6 +22,9 @@ def build_call(method: str, params: Sequence[Value]) -> bytes:
     """Write a request; raises `EncodingError` for what XML-RPC has no notation for."""
     out = ["<?xml version='1.0'?>\n<methodCall>\n<methodName>", _text(method), "</methodName>\n<params>\n"]
     for value in params:
+        if type(value) is str:
+            out.append(f"<param>\n<value><string>{_text(value)}</string></value>\n</param>\n")
+            continue
         out.append("<param>\n")
         _write(value, out, 0)
         out.append("</param>\n")

@@ -5,12 +5,13 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
 
-from appliance.store.ahead import WriteAhead
+from appliance.store.ahead import Statement, WriteAhead
 from appliance.store.database import Database, StoreError
 
 KILLED = """
@@ -21,6 +22,10 @@ database = Database(Path(sys.argv[1]) / "state.db", sys.argv[2], failed=print)
 for number in range(5000):
     database.submit("INSERT OR REPLACE INTO thing VALUES ('last', ?)", (number,))
     database.submit("INSERT OR REPLACE INTO thing VALUES (?, 1)", ("row " + str(number),))
+with database.together():
+    for number in range(100):
+        with database.together():
+            database.submit("INSERT OR REPLACE INTO thing VALUES (?, 1)", ("together " + str(number),))
 os.kill(os.getpid(), signal.SIGKILL)
 """
 SCHEMA = "CREATE TABLE IF NOT EXISTS thing (name TEXT PRIMARY KEY, size INTEGER)"
@@ -107,9 +112,37 @@ def test_what_a_killed_process_had_queued_is_there_after_the_next_start(tmp_path
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), SCHEMA], check=False, timeout=60)
     assert killed.returncode == -signal.SIGKILL
     again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
-    assert again.query("SELECT count(*) FROM thing") == [(5001,)]
+    assert again.query("SELECT count(*) FROM thing") == [(5101,)]
     assert again.query("SELECT size FROM thing WHERE name = ?", ("last",)) == [(4999,)]
     again.close()
+
+
+def test_what_is_submitted_together_is_kept_by_one_write_and_holds_up_no_other_thread(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In its order, at the end of the block, also where that fails; what another thread submits is kept at once."""
+    kept: list[list[str]] = []
+    append = WriteAhead.append
+
+    def observed(ahead: WriteAhead, statements: Sequence[Statement]) -> None:
+        kept.append([str(parameters[0]) for _sql, parameters in statements])
+        append(ahead, statements)
+
+    def submit(name: str) -> None:
+        database.submit("INSERT INTO thing VALUES (?, 1)", (name,))
+
+    monkeypatch.setattr(WriteAhead, "append", observed)
+    with pytest.raises(ValueError, match="amid it"), database.together():
+        submit("first")
+        other = threading.Thread(target=submit, args=("other",))
+        other.start()
+        other.join()
+        assert kept == [["other"]]
+        submit("second")
+        raise ValueError("amid it")
+    submit("third")
+    assert kept == [["other"], ["first", "second"], ["third"]]
+    assert len(database.query("SELECT name FROM thing")) == 4
 
 
 def test_the_file_of_statements_on_their_way_is_empty_once_all_are_in(

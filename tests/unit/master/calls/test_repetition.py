@@ -6,8 +6,10 @@ from typing import Any
 
 import pytest
 
+from appliance.master.calls.repetition import Repetitions
 from appliance.master.graph.registry import Kind
 from appliance.ros.xmlrpc import Value
+from appliance.rpc.server import HttpRequest
 from tests.support.control_parts import OPEN, POLICY, ControlParts
 
 pytestmark = pytest.mark.anyio
@@ -94,6 +96,26 @@ async def test_what_refuses_a_call_whatever_it_asks(obstacle: str, monkeypatch: 
     else:
         monkeypatch.setattr(world.records, "obstacle", "the log cannot be written")
     assert (await world.ask("getSystemState", "/ear"))[0] == 0  # type: ignore[index]  # an answer is a list
+
+
+async def test_a_host_that_owes_for_its_records_waits_with_what_is_remembered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It is answered when it is its turn, which comes when the records are paid; then at once again."""
+    at_once: list[bool] = []
+    real = Repetitions.answer
+
+    def observed(repetitions: Repetitions, request: HttpRequest) -> bytes | None:
+        answer = real(repetitions, request)
+        at_once.append(answer is not None)
+        return answer
+
+    monkeypatch.setattr(Repetitions, "answer", observed)
+    world = await begun()
+    for debt in ("", "", "", "10.0.0.5 has too many bytes of audit records to pay off", ""):
+        world.records.debt = debt
+        await world.ask("getSystemState", "/ear")
+    assert at_once[-5:] == [False, False, True, False, True]
 
 
 @pytest.mark.parametrize("seed", range(10))
