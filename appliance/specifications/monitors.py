@@ -391,6 +391,7 @@ class Monitors:
             self._say_switched(name, word, who, f"{name} is {word}")
         self._store.save_setting(_SWITCHES, json.dumps(self._switches))
         await self._store.settled()
+        await self._stating.carried_out()
         return changed
 
     def _say_switched(self, name: str, word: str, who: str, text: str) -> None:
@@ -434,6 +435,7 @@ class Monitors:
                     f"{', '.join(away)} not resumed: the relay process is away; resume when it is there again"
                 )
                 raise SpecificationsRefusedError([text])
+            await self._stating.carried_out()
             return held
 
     # --- what the relay says ---

@@ -13,6 +13,9 @@ class Relays(Protocol):
     def send(self, message: Message, relay: int) -> bool:
         """Tell a relay; False when it is not there."""
 
+    async def carried_out(self) -> None:
+        """Wait until every relay has carried out what it was told."""
+
     def carried_now(self) -> set[Resource]:
         """Topics and services of nodes that live."""
 

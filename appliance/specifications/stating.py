@@ -115,6 +115,10 @@ class Stating:
         """Tell the relay that has a monitor; False when it is not there."""
         return self._relays.send(message, self.relay_of(monitor))
 
+    async def carried_out(self) -> None:
+        """Wait until the relays have done what they were told: what comes after the answer is judged by it."""
+        await self._relays.carried_out()
+
     def resumed(self, monitor: str) -> None:
         """A monitor holds its topics no longer."""
         for names in self._held.values():

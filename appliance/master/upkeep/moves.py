@@ -28,6 +28,10 @@ class Moving:
         """Tell a relay; False when it is not there."""
         return self._relay.send(message, relay)
 
+    async def carried_out(self) -> None:
+        """Wait until every relay has carried out what it was told."""
+        await self._relay.carried_out()
+
     def carried_now(self) -> set[Resource]:
         """Topics and services of nodes that live."""
         return self._relay.carried_now()

@@ -38,6 +38,8 @@ class Desk:
         self.findings: list[str] = []
         self.began: list[str] = []
         self.away = False
+        self.carried_out = asyncio.Event()
+        self.carried_out.set()
 
     def monitors(
         self,
@@ -89,6 +91,10 @@ class Taking:
                 )
             asyncio.get_running_loop().call_soon(self.monitors.received, answer, relay)
         return True
+
+    async def carried_out(self) -> None:
+        """When the desk says so."""
+        await self.desk.carried_out.wait()
 
     def carried_now(self) -> set[Resource]:
         """Nothing is carried."""
@@ -282,6 +288,24 @@ async def test_a_bad_specification_changes_nothing(desk: Desk) -> None:
     await desk.store.settled()
     with pytest.raises(SpecificationsRefusedError):
         desk.monitors()
+
+
+async def test_a_switch_is_answered_when_the_relay_has_carried_it_out(desk: Desk) -> None:
+    """What is sent after the answer is judged by it: told is not done, nor when monitors are resumed."""
+    monitors = desk.monitors()
+    monitors.received(messages.SpecificationsTaken(1, [], ["a"], monitors.statement(0).statement))
+    for order in (monitors.switch(["a"], False, who="eve"), monitors.resume(["a"], who="eve")):
+        desk.carried_out.clear()
+        told = len(desk.sent)
+        task = asyncio.ensure_future(order)
+        while len(desk.sent) == told:
+            await asyncio.sleep(0)
+        await desk.store.settled()
+        for _ in range(5):
+            await asyncio.sleep(0)
+        assert not task.done()
+        desk.carried_out.set()
+        assert await task == ["a"]
 
 
 async def test_switches_are_kept_and_recorded(desk: Desk) -> None:

@@ -71,6 +71,9 @@ class Fleet:
             asyncio.get_running_loop().call_soon(self.stating.received, answer, relay)
         return True
 
+    async def carried_out(self) -> None:
+        """As `Relays`."""
+
     def carried_now(self) -> set[Resource]:
         """As `Relays`."""
         return self.carried
