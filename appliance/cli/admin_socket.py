@@ -21,10 +21,11 @@ class NotRunningError(Exception):
 
 
 class AdminSocket:
-    """The appliance that runs with a state directory."""
+    """The appliance that runs with a state directory; an answer may take so many seconds."""
 
-    def __init__(self, state: Path) -> None:
+    def __init__(self, state: Path, seconds: float = SECONDS) -> None:
         self.state = state
+        self._seconds = seconds
 
     def audit(self) -> "FileLog":
         """The audit log's file, which can be read without a running appliance."""
@@ -42,7 +43,7 @@ class AdminSocket:
             )
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
-                sock.settimeout(SECONDS)
+                sock.settimeout(self._seconds)
                 sock.connect(str(path))
                 sock.sendall(line + b"\n")
                 answer = _read_line(sock)
@@ -57,7 +58,9 @@ class AdminSocket:
                 f"{self.state}: the appliance that used this state directory has ended"
             ) from None
         except TimeoutError:
-            raise NotRunningError(f"{path}: the appliance did not answer within {SECONDS:g} s") from None
+            raise NotRunningError(
+                f"{path}: the appliance did not answer within {self._seconds:g} s"
+            ) from None
         except OSError as error:
             raise NotRunningError(f"{path}: {error.strerror or error}") from error
         try:

@@ -6,15 +6,12 @@ of what the command `rosrv` takes.
 """
 
 import os
-import socket
 import sys
 from pathlib import Path
 
-import msgspec
-
-from appliance.channel.admin import AdminAnswer, StatusWanted, decode
-from appliance.channel.answers.status import Status
+from appliance.channel.admin import StatusWanted
 from appliance.channel.serving import unserved
+from appliance.cli.admin_socket import AdminSocket, NotRunningError
 
 _STATE = "/var/lib/rosrv"  # the default of the configuration's key `state`
 _SECONDS = 4.0
@@ -24,22 +21,12 @@ def main() -> None:
     """Say what is wrong, if anything, and end with 1 then."""
     state = Path(os.environ.get("ROSRV_STATE", _STATE))
     try:
-        answer = ask(state / "admin.sock")
+        answer = AdminSocket(state, _SECONDS).ask(StatusWanted())
         reason = unserved(answer.given()) if answer.ok else answer.error
-    except (OSError, msgspec.MsgspecError) as error:
+    except NotRunningError as error:
         reason = f"the appliance does not answer: {error}"
     if reason is not None:
         sys.exit(reason)
-
-
-def ask(path: Path) -> AdminAnswer[Status]:
-    """The appliance's status. Raises `OSError` and `msgspec.MsgspecError`."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
-        sock.settimeout(_SECONDS)
-        sock.connect(str(path))
-        sock.sendall(msgspec.json.encode(StatusWanted()) + b"\n")
-        with sock.makefile("rb") as answer:
-            return decode(answer.readline(), StatusWanted())
 
 
 if __name__ == "__main__":
