@@ -8,7 +8,6 @@ import base64
 import datetime
 import hashlib
 import ipaddress
-import os
 import socket
 import ssl
 from collections.abc import Iterable
@@ -18,6 +17,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from appliance.whole_files import write_whole
 
 CERTIFICATE = "certificate.pem"
 KEY = "key.pem"
@@ -72,8 +73,8 @@ def _make(certificate_path: Path, key_path: Path, names: Iterable[str], now: dat
     secret = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    _write(key_path, secret, 0o600)
-    _write(certificate_path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
+    write_whole(key_path, secret, 0o600)
+    write_whole(certificate_path, certificate.public_bytes(serialization.Encoding.PEM), 0o644)
 
 
 def pin_of(home: Path) -> str:
@@ -99,13 +100,3 @@ def _general_name(name: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(name))
     except ValueError:
         return x509.DNSName(name[:_HOST_NAME_LIMIT])
-
-
-def _write(path: Path, data: bytes, mode: int) -> None:
-    making = path.with_name(path.name + ".new")
-    descriptor = os.open(making, os.O_CREAT | os.O_TRUNC | os.O_WRONLY | os.O_NOFOLLOW, mode)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    making.replace(path)

@@ -7,7 +7,6 @@ Invariants:
    bounded number at a time.
 """
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_public_key
 
 from appliance.audit.writer import ChainWriter
+from appliance.whole_files import write_whole
 
 Signer = Callable[[int, bytes], None]
 RemovalSigner = Callable[[int, bytes, bytes], None]
@@ -127,11 +127,4 @@ class Signatures:
 def _pin_key(path: Path, public_key: bytes) -> None:
     key = Ed25519PublicKey.from_public_bytes(public_key)
     text = key.public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
-    making = path.with_name(path.name + ".new")
-    descriptor = os.open(making, os.O_CREAT | os.O_TRUNC | os.O_WRONLY, 0o644)
-    with os.fdopen(descriptor, "wb") as file:
-        os.fchmod(descriptor, 0o644)  # a public key; the folder says who comes by
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    making.rename(path)
+    write_whole(path, text, 0o644)

@@ -3,10 +3,11 @@
 It is written after the receiver has what it says; what was sent since is sent again after a crash.
 """
 
-import os
 from pathlib import Path
 
 import msgspec
+
+from appliance.whole_files import write_whole
 
 
 class Position(msgspec.Struct, frozen=True):
@@ -33,10 +34,4 @@ def load_position(path: Path) -> Position | None:
 
 def save_position(path: Path, position: Position) -> None:
     """Keep it, on the disk. Raises `OSError`."""
-    making = path.with_name(path.name + ".new")
-    descriptor = os.open(making, os.O_CREAT | os.O_TRUNC | os.O_WRONLY | os.O_CLOEXEC, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(msgspec.json.encode(position))
-        file.flush()
-        os.fsync(file.fileno())
-    making.rename(path)
+    write_whole(path, msgspec.json.encode(position), 0o600)

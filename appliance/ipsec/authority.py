@@ -29,8 +29,9 @@ from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from appliance.ipsec.authority_key import Kind, load_key, make_key, write_key
-from appliance.ipsec.files import SignerKeyError, write_whole
+from appliance.ipsec.files import SignerKeyError
 from appliance.ipsec.proof import RequestRefusedError, require_proof
+from appliance.whole_files import write_whole
 
 KEY_FILE = "ca.key"
 CERTIFICATE_FILE = "ca.pem"

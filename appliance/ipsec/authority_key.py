@@ -18,7 +18,8 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
-from appliance.ipsec.files import SignerKeyError, require_private, write_whole
+from appliance.ipsec.files import SignerKeyError, require_private
+from appliance.whole_files import write_whole
 
 Kind = Literal["ecdsa", "ed25519"]
 Key = ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from appliance.ipsec.files import write_whole
+from appliance.whole_files import write_whole
 
 MOST_LOGS = 64
 _HASH = 32

@@ -1,6 +1,5 @@
-"""Key files: written whole and durably, and refused when others may read them."""
+"""Key files: refused when others may read them."""
 
-import os
 import stat
 from pathlib import Path
 
@@ -17,15 +16,3 @@ def require_private(path: Path) -> None:
             f"{path}: others may read this private key (mode {mode & 0o777:o});"
             " treat it as stolen, or set its mode to 600 if you know better"
         )
-
-
-def write_whole(path: Path, data: bytes, mode: int) -> None:
-    """Replace a file as a whole, on the disk when this returns."""
-    making = path.with_name(path.name + ".new")
-    making.unlink(missing_ok=True)
-    descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    making.rename(path)

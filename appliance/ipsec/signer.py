@@ -34,9 +34,10 @@ from appliance.config import load_resolved
 from appliance.ipsec.authority import Authority
 from appliance.ipsec.authority_key import Kind, read_passphrase
 from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints
-from appliance.ipsec.files import SignerKeyError, require_private, write_whole
+from appliance.ipsec.files import SignerKeyError, require_private
 from appliance.ipsec.proof import RequestRefusedError
 from appliance.ipsec.removals import Kept, RemovalRefusedError, Removals
+from appliance.whole_files import write_whole
 
 KEY_FILE = "audit.key"
 PUBLIC_KEY_FILE = "audit.pub"

@@ -60,6 +60,7 @@ from appliance.network.firewall.rules import (
 from appliance.network.forwarding import Forwarding
 from appliance.network.listeners import listening_ports, udp_ports_in_use
 from appliance.network.namespaces import Namespace, NetworkError, require_privileges
+from appliance.whole_files import write_whole
 
 INSIDE = "eth0"
 _CANDIDATES = 64
@@ -298,9 +299,7 @@ class Isolation:
             "link": self.settings.link,
             "settings": self._forwarding.record(),
         }
-        partial = self._record.with_suffix(".partial")
-        partial.write_text(json.dumps(record), encoding="utf-8")
-        partial.replace(self._record)
+        write_whole(self._record, json.dumps(record).encode(), 0o644)
 
     def _clear_leftovers(self) -> None:
         """Undo what the record says, if there is one."""

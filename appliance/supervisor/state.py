@@ -21,6 +21,7 @@ from pathlib import Path
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import Role
 from appliance.supervisor.users import account_of
+from appliance.whole_files import write_whole
 
 ADMIN_SOCKET = "admin.sock"
 _LOCK = "lock"
@@ -97,10 +98,7 @@ class StateDirectory:
 
     def write_config(self, text: str) -> None:
         """Write what the children read."""
-        new = self.config.with_suffix(".new")
-        new.write_text(text)
-        new.chmod(0o644)
-        new.replace(self.config)
+        write_whole(self.config, text.encode(), 0o644)
 
     def open_admin_socket(self) -> socket.socket:
         """The listening socket that the other verbs connect to; one left by an earlier life is replaced."""

@@ -1,0 +1,33 @@
+"""Tests of `appliance.whole_files`."""
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from appliance.whole_files import write_whole
+
+
+def test_a_file_is_replaced_with_the_mode_that_is_said(tmp_path: Path) -> None:
+    """Whatever the mask is, and whatever an earlier life left half written; nothing stays beside it."""
+    path = tmp_path / "key.pem"
+    path.write_text("before")
+    (tmp_path / "key.pem.new").write_text("half")
+    mask = os.umask(0o077)
+    try:
+        write_whole(path, b"after", 0o644)
+    finally:
+        os.umask(mask)
+    assert (path.read_bytes(), stat.S_IMODE(path.stat().st_mode)) == (b"after", 0o644)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_cannot_be_written_leaves_the_file_before(tmp_path: Path) -> None:
+    """The disk refuses: the file is as it was."""
+    path = tmp_path / "position"
+    path.write_text("before")
+    (tmp_path / "position.new").mkdir()
+    with pytest.raises(OSError, match=r"position\.new"):
+        write_whole(path, b"after", 0o600)
+    assert path.read_text() == "before"
