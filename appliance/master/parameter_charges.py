@@ -168,7 +168,10 @@ class ParameterCharges:
 
 def _region(path: list[_Place], parts: Sequence[str]) -> _Place:
     """The nearest place above a key; the root is in its own."""
-    return next((place for place in reversed(path[: len(parts)]) if place.owner is not None), path[0])
+    for place in reversed(path[: len(parts)]):
+        if place.owner is not None:
+            return place
+    return path[0]
 
 
 def _owner(place: _Place) -> Address:

@@ -173,8 +173,9 @@ class Reserved:
 
     def release(self) -> None:
         """It is set, and charged as what it is; or it could not be."""
-        self._pool.give_back(self.owner, self._amount)
-        self._amount = 0
+        if self._amount:
+            self._pool.give_back(self.owner, self._amount)
+            self._amount = 0
 
 
 def _with_namespaces(key: str, first: int, weight: int) -> int:

@@ -288,21 +288,24 @@ class Call(Generic[S]):
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """A call that was understood: who makes it, its row, and its arguments, canonical and as the row has them."""
+    """A call that was understood: who makes it, its row, and its arguments, canonical and as the row has them.
+
+    `resource` is the topic, service or ROS parameter that it is about, empty when it is about none; `request` what it
+    is decided and recorded as.
+    """
 
     caller: Caller
     call: Call[Any]
     arguments: tuple[object, ...]
+    resource: str = field(init=False)
+    request: Request = field(init=False)
 
-    @property
-    def resource(self) -> str:
-        """The topic, service or ROS parameter that it is about; empty when it is about none."""
-        return "" if self.call.resource is None else str(self.arguments[self.call.resource])
-
-    @property
-    def request(self) -> Request:
-        """What it is decided and recorded as."""
-        return request_of(self.call.policy_name, self.caller.peer.host, self.caller.caller_id, self.resource)
+    def __post_init__(self) -> None:
+        caller, call = self.caller, self.call
+        resource = "" if call.resource is None else str(self.arguments[call.resource])
+        request = request_of(call.policy_name, caller.peer.host, caller.caller_id, resource)
+        object.__setattr__(self, "resource", resource)
+        object.__setattr__(self, "request", request)
 
     @property
     def api(self) -> ApiUri | None:

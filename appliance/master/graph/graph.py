@@ -291,6 +291,8 @@ class Graph:
 
     def _tell_parameters(self, key: str, value: Value, caller_id: str | None) -> Effects:
         effects: Effects = []
+        if not self._registry.tells_parameters:
+            return effects
         calls: dict[str, NodeCall] = {}
         for update in updates_of(key, value, self._registry.subscribed_below(key)):
             for subscriber in self._registry.registered(Kind.PARAMETER, update.subscribed):

@@ -239,6 +239,11 @@ class Registry:
         """Every topic and its type; also of topics that nobody has any more, as ROSMaster remembers them."""
         return self._types.items()
 
+    @property
+    def tells_parameters(self) -> bool:
+        """Whether live incarnations subscribed to any parameter."""
+        return bool(self._subscribed_keys)
+
     def subscribed_below(self, key: str) -> list[str]:
         """The keys of parameters below `key` that live incarnations subscribed to, sorted."""
         keys, above = self._subscribed_keys, key.rstrip("/")
