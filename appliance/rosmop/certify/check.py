@@ -9,6 +9,7 @@ What is not certified is said with the reason: bounds of time and grammars (thei
 would take too long.
 """
 
+import itertools
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -66,6 +67,7 @@ def certify(logic: str, formula: str, events: Sequence[str], tables: Tables | No
             False, False, f"{_NO_AUTOMATON.get(logic, 'it has no automaton')}: tested, not proved"
         )
     try:
+        _look_at_form(logic, events, tables)
         pairs = check(formula, events, tables)
     except _WrongError as error:
         return Certificate(False, True, str(error))
@@ -74,6 +76,23 @@ def certify(logic: str, formula: str, events: Sequence[str], tables: Tables | No
     except TooMuchError:
         return Certificate(False, False, "there is too much to look at: tested, not proved")
     return Certificate(True, False, f"proved: its automaton is what is written ({pairs} cases followed)")
+
+
+def _look_at_form(logic: str, events: Sequence[str], tables: Tables) -> None:
+    """What is no state is one to Python where it is negative, and another to the module; time is for `tfsm` alone."""
+    limits = [one for one in tables.timeouts if one is not None]
+    if len(tables.verdicts) != len(tables.table) or (
+        tables.timeouts and len(tables.timeouts) != len(tables.table)
+    ):
+        raise _WrongError("it has not as many verdicts, or limits of time, as states")
+    if limits and logic != "tfsm":
+        raise _WrongError("it has limits of time, and its logic has none")
+    for state, row in enumerate(tables.table):
+        if len(row) != len(events):
+            raise _WrongError(f"state {state} has {len(row)} ways on, and there are {len(events)} events")
+    reached = itertools.chain((tables.initial,), *tables.table, (target for _, target in limits))
+    if not all(map(range(len(tables.table)).__contains__, reached)):
+        raise _WrongError("it leads to a state that it has not")
 
 
 _NO_AUTOMATON = {
@@ -111,10 +130,7 @@ def _follow(
 
     for pair in waiting:
         before, state = pair
-        row = tables.table[state]
-        if len(row) != len(events):
-            raise _WrongError(f"state {state} has {len(row)} ways on, and there are {len(events)} events")
-        for event, target in zip(events, row, strict=True):
+        for event, target in zip(events, tables.table[state], strict=True):
             after = step(before, event)
             wanted = told(before, after, event)
             if tables.verdicts[target] != wanted:

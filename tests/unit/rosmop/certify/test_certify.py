@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
@@ -175,6 +176,26 @@ def broken(random: Random, tables: Tables) -> Tables:
         case _:
             verdicts[state] = ()
     return Tables(tables.initial, table, verdicts, timeouts)
+
+
+@pytest.mark.parametrize("logic", LOGICS)
+def test_what_is_no_automaton_is_refused(logic: str) -> None:
+    """Python takes a negative state for one from the end; the module of the relay would look beside its table."""
+    compiled = next(iter(properties(logic, 5, 5)))
+    made = tables_of(compiled)
+    states = len(made.table)
+    others = [
+        replace(made, initial=made.initial - states),
+        replace(made, initial=states),
+        replace(made, table=[[target - states for target in row] for row in made.table]),
+        replace(made, table=[*made.table[:-1], [states] * len(made.table[0])]),
+        replace(made, table=[[*row, 0] for row in made.table]),
+        replace(made, verdicts=[*made.verdicts, ()]),
+        replace(made, timeouts=[*([None] * states), (1, 0)]),
+        replace(made, timeouts=[(1, states if logic == "tfsm" else 0)] * states),
+    ]
+    for other in others:
+        assert certify(compiled.logic, compiled.formula, compiled.events, other).wrong, other
 
 
 @pytest.mark.parametrize("logic", LOGICS)
