@@ -1,6 +1,7 @@
 """`/v1/monitors`: look at the monitors, the specifications they are made of, and what they did."""
 
 import asyncio
+from pathlib import Path as FilePath
 from typing import Annotated, Any
 
 from fastapi import Path, Query, Response
@@ -12,12 +13,12 @@ from appliance.api.monitor_judgement import Compiler, events_of, picture_of, pro
 from appliance.api.monitor_models import Happened, History, Monitor
 from appliance.api.policy_models import OneRevision
 from appliance.api.problems import ProblemError
-from appliance.api.roles import VIEWER, Viewer, ask
+from appliance.api.roles import Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes, Tagged, file, tagged
 from appliance.api.services import Services
-from appliance.audit.output import Entry, rfc3339
+from appliance.audit.output import Entry, rfc3339, without_contents
 from appliance.audit.query import Filter
-from appliance.audit.search import Page, search
+from appliance.audit.search import search
 from appliance.channel.admin import MonitorRevisions, MonitorRevisionWanted, MonitorsWanted
 from appliance.channel.answers.monitors import MonitorRevisionList, Monitors, MonitorState, RevisionTexts
 
@@ -103,9 +104,10 @@ def routes(services: Services) -> Routes:
             raise ProblemError(404, "unknown", f"{name} has no property whose monitor is a finite automaton")
         return Response(drawn, media_type="image/svg+xml")
 
-    @router.get("/{name}/history", dependencies=[VIEWER])
+    @router.get("/{name}/history")
     async def monitor_history(
         name: OneName,
+        bearer: Viewer,
         cursor: Annotated[str | None, Query(max_length=18, description="of the page before")] = None,
         limit: Annotated[int, Query(ge=1, le=500)] = 50,
     ) -> History:
@@ -113,12 +115,26 @@ def routes(services: Services) -> Routes:
 
         A monitor that is no longer there has its history, too.
         """
-        wanted = Filter(category="monitor", text=name)
-        page: Page = await looking.desk.read(search, looking.desk.path, wanted, cursor, limit)
-        happened = [_happened(entry) for entry in page.entries if _of(entry, name)]
-        return History(name, happened, page.cursor)
+        found: list[Entry] = await looking.desk.read(records_of, looking.desk.path, name, cursor, limit + 1)
+        happened = [
+            _happened(entry if reads_contents(bearer) else without_contents(entry)) for entry in found[:limit]
+        ]
+        return History(name, happened, str(found[limit - 1].sequence) if len(found) > limit else None)
 
     return router
+
+
+def records_of(path: FilePath, name: str, cursor: str | None, count: int) -> list[Entry]:
+    """The last records about a monitor. That others have the word in them does not show in how many there are."""
+    found: list[Entry] = []
+    more: str | None = cursor
+    while len(found) < count:
+        page = search(path, Filter(category="monitor", text=name), more, count)
+        found += [entry for entry in page.entries if _of(entry, name)]
+        more = page.cursor
+        if more is None:
+            break
+    return found[:count]
 
 
 def _of(entry: Entry, name: str) -> bool:

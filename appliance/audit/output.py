@@ -6,6 +6,8 @@ marks.
 """
 
 import json
+import re
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
@@ -23,8 +25,9 @@ _OF_THE_RECORD = (
 )  # fmt: skip
 
 
-_CONTENTS = ("before", "after", "before_fields", "after_fields", "conditions", "values", "why")
+_CONTENTS = ("before", "after", "before_fields", "after_fields", "conditions", "values", "why", "binding")
 """What messages said, in the detail of a monitor's record: as bytes, as fields, and what was compared of them."""
+_BOUND = re.compile(r"(property \d+ of \S+ \(\w+\)|: \d+ \w+) with \w+ = .*", re.DOTALL)
 
 
 class Entry(NamedTuple):
@@ -47,11 +50,30 @@ def rfc3339(time: int) -> str:
 def without_contents(entry: Entry) -> Entry:
     """The record without what messages said, which `detail.withheld` names then: for who may not read messages."""
     detail = entry.record.detail
-    withheld = [name for name in _CONTENTS if name in detail and "monitor" in detail]
+    if "monitor" not in detail:
+        return entry
+    texts = {"reason": entry.record.reason, "handler": str(detail.get("handler", ""))}
+    plain = {name: without_binding(text, detail) for name, text in texts.items()}
+    withheld = [name for name in _CONTENTS if name in detail]
+    withheld += [name for name in texts if plain[name] != texts[name]]
     if not withheld:
         return entry
     kept = {name: value for name, value in detail.items() if name not in withheld}
-    return Entry(entry.sequence, msgspec.structs.replace(entry.record, detail=kept | {"withheld": withheld}))
+    if "handler" in detail:
+        kept["handler"] = plain["handler"]
+    record = msgspec.structs.replace(
+        entry.record, reason=plain["reason"], detail=kept | {"withheld": withheld}
+    )
+    return Entry(entry.sequence, record)
+
+
+def without_binding(text: str, detail: Mapping[str, Any]) -> str:
+    """What a monitor's record says of a verdict, without the values of parameters, which messages said."""
+    found = _BOUND.search(text)
+    if found is None:
+        return text
+    category = f": {detail['category']}" if found[1].startswith("property") and "category" in detail else ""
+    return text[: found.end(1)] + category
 
 
 def as_object(entry: Entry) -> dict[str, Any]:

@@ -11,10 +11,11 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import msgspec
 
+from appliance.audit.output import without_binding
 from appliance.audit.record import Severity
 from appliance.channel.answers.recordings import (
     EventKind,
@@ -54,6 +55,7 @@ class _Said(msgspec.Struct):
     caller_id: str | None = None
     resource: str | None = None
     reason: str = ""
+    detail: dict[str, Any] = {}
 
 
 class _Columns:
@@ -164,7 +166,7 @@ def _events(reader: BagReader, since: int, until: int) -> Iterator[RecordedEvent
                 host=said.host,
                 caller_id=said.caller_id,
                 resource=said.resource,
-                reason=said.reason,
+                reason=without_binding(said.reason, said.detail),
             )
 
 

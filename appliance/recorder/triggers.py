@@ -7,6 +7,7 @@ missed while control dies and comes back.
 from collections import deque
 from collections.abc import Collection, Iterable
 
+from appliance.audit.output import without_binding
 from appliance.audit.record import Record, Severity
 from appliance.channel.answers.recordings import Recording, Trigger, TriggerKind
 
@@ -34,7 +35,8 @@ def trigger_of(record: Record, wanted: Collection[TriggerKind]) -> Trigger | Non
     """The record as a trigger of one of the kinds that are wanted; None when it is none."""
     for what in kinds_of(record.event, record.decision, record.severity):
         if what in wanted:
-            text = f"{record.event}: {record.reason}" if record.reason else record.event
+            reason = without_binding(record.reason, record.detail)
+            text = f"{record.event}: {reason}" if reason else record.event
             return Trigger(record.time, what, record.id, text[:_LONGEST_TEXT])
     return None
 

@@ -2,6 +2,7 @@
 
 from appliance.api.access import Role
 from appliance.api.audit import page_of
+from appliance.api.monitors import records_of
 from appliance.audit.query import Filter
 from tests.support.audit import decision, settle
 from tests.unit.api.test_streams import bearer
@@ -36,3 +37,20 @@ def test_a_viewers_page_tells_nothing_of_what_is_withheld(make_log: MakeLog) -> 
     assert page_of(log.path, hidden_only, None, 1, bearer("v"), newest_first=True) == empty
     reader = bearer("o", Role.OPERATOR)
     assert len(page_of(log.path, hidden_only, None, 1, reader, newest_first=True)["records"]) == 1
+
+
+def test_a_monitors_history_tells_nothing_of_records_that_have_its_name_in_a_message(
+    make_log: MakeLog,
+) -> None:
+    """The name is whatever somebody writes there: that there is no such monitor is all that he learns."""
+    log = make_log()
+    for number in range(600):
+        detail = {"monitor": "m" if number % 300 else "gun", "before_fields": {"data": "gun password"}}
+        log.record(decision(log, event="message dropped", category="monitor", detail=detail))
+    settle(log)
+    assert records_of(log.path, "password", None, 2) == []
+    assert [entry.record.detail["monitor"] for entry in records_of(log.path, "gun", None, 5)] == ["gun"] * 2
+    [last] = records_of(log.path, "gun", None, 1)
+    [first] = records_of(log.path, "gun", str(last.sequence), 5)
+    assert first.sequence < last.sequence
+    assert len(records_of(log.path, "m", None, 51)) == 51

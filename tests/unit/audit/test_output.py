@@ -2,6 +2,7 @@
 
 import json
 
+import msgspec
 import pytest
 
 from appliance.audit.output import Entry, as_json, as_object, printable, rfc3339, without_contents
@@ -85,6 +86,22 @@ def test_who_may_not_read_messages_gets_a_monitors_record_without_them() -> None
     shown = without_contents(Entry(1, dropped)).record
     assert shown.detail == {"monitor": "m", "at": ["m.rv:3"], "withheld": list(said)}
     assert "message" in " ".join(lines_of(shown))
+    texts = {
+        "property 1 of goals (fsm) with id = a: secret, n = 7: twice": "property 1 of goals (fsm): twice",
+        "on trial: property 2 of goals (ere) with id = \n: fail": "on trial: property 2 of goals (ere): twice",
+        "3 more in the same second: 0 twice with id = a: secret": "3 more in the same second: 0 twice",
+        "property 1 of gun (fsm): unsafe": "property 1 of gun (fsm): unsafe",
+    }
+    for reason, plain in texts.items():
+        detail = {"monitor": "goals", "category": "twice", "binding": {"id": "a: secret"}, "handler": reason}
+        verdict = Record(id="0" * 20, time=0, event="monitor verdict", reason=reason, detail=detail)
+        shown = without_contents(Entry(1, verdict)).record
+        assert (shown.reason, shown.detail["handler"]) == (plain, plain)
+        assert "secret" not in str(shown)
+        shown = without_contents(
+            Entry(1, msgspec.structs.replace(verdict, detail={"monitor": "goals"}))
+        ).record
+        assert "secret" not in str(shown)
     ordered = Entry(
         2, Record(id="0" * 20, time=0, event="recording ordered", detail={"before": 60.0, "who": "eve"})
     )

@@ -37,6 +37,15 @@ def test_records_are_triggers_of_the_kind_that_is_wanted(record: Record, what: s
     assert trigger_of(record, [kind for kind in KINDS if kind not in {what, "alarm"}]) is None
 
 
+def test_a_trigger_has_nothing_that_a_message_said() -> None:
+    """Who may look at recordings sees no messages, so the slice of a verdict is in the audit record alone."""
+    detail = {"monitor": "goals", "category": "twice", "binding": {"id": "secret"}}
+    reason = "property 1 of goals (fsm) with id = secret: twice"
+    trigger = trigger_of(Record(id="1", time=5, event="monitor verdict", reason=reason, detail=detail), KINDS)
+    assert trigger is not None
+    assert trigger.text == "monitor verdict: property 1 of goals (fsm): twice"
+
+
 def test_all_kinds_but_orders_can_be_configured() -> None:
     """The words of the configuration are those of the recordings."""
     configurable = get_args(get_args(RecorderRules.model_fields["triggers"].annotation)[0])
