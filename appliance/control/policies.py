@@ -189,10 +189,6 @@ class Policies:
         self._trail.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
         return True
 
-    def revisions(self) -> list[RevisionRow]:
-        """All kept revisions, the newest first."""
-        return self.store.revisions()
-
     def revision_row(self, revision: int | None) -> RevisionRow | None:
         """A kept revision (None: the one in force); None when it is not kept."""
         if revision is None or revision == self.revision:

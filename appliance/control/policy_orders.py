@@ -61,7 +61,7 @@ class PolicyOrders:
 
     async def revisions(self, _request: admin.PolicyRevisions) -> answers.PolicyRevisionList:
         """The kept revisions."""
-        rows = self._policies.revisions()
+        rows = self._store.revisions()
         return answers.PolicyRevisionList([answers.PolicyRevision(**self._revision(row)) for row in rows])
 
     async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:

@@ -116,17 +116,11 @@ def folded(scope: Scope, operands: tuple[Value, ...], make: Callable[..., Value]
 # Each kind of expression
 
 
-def _number(scope: Scope, node: tree.Number) -> Value:
-    return literal_number(scope, node)
-
-
-def _text(scope: Scope, node: tree.Text) -> Value:
-    del scope
+def _text(_scope: Scope, node: tree.Text) -> Value:
     return constant_value(node.position, kinds.STRING, node.value)
 
 
-def _character(scope: Scope, node: tree.Character) -> Value:
-    del scope
+def _character(_scope: Scope, node: tree.Character) -> Value:
     return constant_value(node.position, kinds.CHAR, node.value)
 
 
@@ -339,15 +333,14 @@ def _limit(scope: Scope, node: tree.Limit) -> Value:
     return constant_value(node.position, kind, found)
 
 
-def _elements(scope: Scope, node: tree.Expression) -> Value:
-    del scope
+def _elements(_scope: Scope, node: tree.Expression) -> Value:
     raise SpecificationError.at(
         node.position, "`{…}` has no type here; write `std::vector<type>{…}` or assign it to a variable"
     )
 
 
 _KINDS: Mapping[type[tree.Expression], Callable[[Scope, Any], Value]] = {
-    tree.Number: _number,
+    tree.Number: literal_number,
     tree.Text: _text,
     tree.Character: _character,
     tree.Name: _name,

@@ -170,12 +170,10 @@ class Printer:
         lines.add(f"for {node.name} in {self.text(node.values)}:")
         self._block(lines, node.body)
 
-    def _break(self, lines: Lines, node: form.Break) -> None:
-        del node
+    def _break(self, lines: Lines, _node: form.Break) -> None:
         lines.add("break")
 
-    def _continue(self, lines: Lines, node: form.Continue) -> None:
-        del node
+    def _continue(self, lines: Lines, _node: form.Continue) -> None:
         lines.add("continue")
 
     def _select(self, lines: Lines, node: form.Select) -> None:
@@ -207,8 +205,7 @@ class Printer:
         self._acts += 1
         lines.add(f"{'' if node.anyway else 'if m is not None: '}m.dropped, m.cause = True, {node.site}")
 
-    def _reset(self, lines: Lines, node: form.Reset) -> None:
-        del node
+    def _reset(self, lines: Lines, _node: form.Reset) -> None:
         lines.add(f"{self._context}.turn.reset = True")
 
     def _publish(self, lines: Lines, node: form.Publish) -> None:
@@ -515,8 +512,7 @@ class Printer:
     def _throttle(self, node: form.Throttle) -> str:
         return f"{self._context}.throttle({self.text(node.seconds)}, {node.site})"
 
-    def _now(self, node: form.Now) -> str:
-        del node
+    def _now(self, _node: form.Now) -> str:
         return f"{self._context}.turn.now"
 
     def _whole(self, node: form.Whole) -> str:

@@ -371,12 +371,10 @@ class _Body:
         code = first + place + self._set(at) + count + self._set(left, I64)
         return code + self._times(left, each + following, node.body)
 
-    def _break(self, node: form.Break) -> bytes:
-        del node
+    def _break(self, _node: form.Break) -> bytes:
         return b"\x0c" + unsigned(self._depth - self._loops[-1] + 1)
 
-    def _continue(self, node: form.Continue) -> bytes:
-        del node
+    def _continue(self, _node: form.Continue) -> bytes:
         return b"\x0c" + unsigned(self._depth - self._loops[-1])
 
     def _select(self, node: form.Select) -> bytes:
@@ -423,13 +421,11 @@ class _Body:
         spent = size + constant(I64, BYTES_PER_INSTRUCTION) + b"\x80"
         return self._when(many, self._elsewhere) + self._spend(spent)
 
-    def _pending(self, node: form.Pending) -> bytes:
+    def _pending(self, _node: form.Pending) -> bytes:
         """Only `Whole` asks for it."""
-        del node
         return b""
 
-    def _drop(self, node: form.Drop) -> bytes:
-        del node
+    def _drop(self, _node: form.Drop) -> bytes:
         self._drops = True
         return constant(I32, 1) + self._set("dropped")
 
@@ -817,8 +813,7 @@ class _Body:
         ]
         return b"".join(values)
 
-    def _now(self, node: form.Now) -> bytes:
-        del node
+    def _now(self, _node: form.Now) -> bytes:
         return self._cell(0x29, NOW)
 
     def _throttle(self, node: form.Throttle) -> bytes:

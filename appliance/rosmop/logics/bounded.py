@@ -600,8 +600,3 @@ _CATEGORIES: dict[tuple[bool, bool], Categories] = {
     (False, True): VERDICTS[1:],
     (True, True): VERDICTS,
 }
-
-
-def compile_bounded(source: Source, formula: Formula) -> CompiledProperty:
-    """The monitor of a formula with bounded operators about the future."""
-    return BoundedProperty(source, formula)

@@ -38,9 +38,8 @@ class GrammarProperty(CompiledProperty):
         super().__init__(source, CATEGORIES)
         self.recogniser = recogniser
 
-    def start(self, time_ns: int) -> Run:
+    def start(self, _time_ns: int) -> Run:
         """A fresh run; the time plays no part."""
-        del time_ns
         return GrammarRun(self.recogniser)
 
 
@@ -54,9 +53,8 @@ class GrammarRun(UntimedRun):
         self._step = recogniser.step
         self.frame: Frame | None = recogniser.initial
 
-    def step(self, event: int, time_ns: int) -> Categories:
+    def step(self, event: int, _time_ns: int) -> Categories:
         """Take the event; the time plays no part. Raises RunFaultError, and is unchanged then."""
-        del time_ns
         if self.frame is None:
             return FAIL
         after = self._step(self.frame, event)

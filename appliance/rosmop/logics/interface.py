@@ -132,9 +132,8 @@ class FiniteProperty(CompiledProperty):
         super().__init__(source, categories)
         self.automaton = automaton
 
-    def start(self, time_ns: int) -> Run:
+    def start(self, _time_ns: int) -> Run:
         """A fresh run; the time plays no part."""
-        del time_ns
         return FiniteRun(self.automaton)
 
     def categories_after(self, event: int) -> frozenset[str]:
@@ -167,9 +166,8 @@ class FiniteRun(UntimedRun):
         self._automaton = automaton
         self.state = automaton.initial
 
-    def step(self, event: int, time_ns: int) -> Categories:
+    def step(self, event: int, _time_ns: int) -> Categories:
         """Take the event; the time plays no part."""
-        del time_ns
         self.state = self._automaton.table[self.state][event]
         return self._automaton.verdicts[self.state]
 

@@ -7,7 +7,7 @@ only, at the times at which they were received. The category is ``validation`` w
 ``violation`` where not; it is told once that is certain, at the latest when the bounds have passed.
 """
 
-from appliance.rosmop.logics.bounded import compile_bounded
+from appliance.rosmop.logics.bounded import BoundedProperty
 from appliance.rosmop.logics.formula import NOT, Level, Syntax, boolean_levels, nodes, read_formula
 from appliance.rosmop.logics.interface import CompiledProperty, Source
 from appliance.rosmop.logics.past import compile_past
@@ -44,4 +44,4 @@ def compile_mtl(source: Source) -> CompiledProperty:
                 f"`{node.operator}` has no upper bound, so its verdict might never come; write"
                 f" `{node.operator}[0,10s]` with the time that there is, or `ltl` for what may come at any time",
             )
-    return compile_bounded(source, formula) if future else compile_past(source, formula)
+    return BoundedProperty(source, formula) if future else compile_past(source, formula)

@@ -114,12 +114,10 @@ class Pattern:
     def _no(self, mode: Mode, event: int, late: bool) -> Mode:
         return "violated" if event == self.second and not late else mode
 
-    def _some(self, mode: Mode, event: int, late: bool) -> Mode:
-        del late
+    def _some(self, mode: Mode, event: int, _late: bool) -> Mode:
         return "stirred" if event == self.second else mode
 
-    def _causes(self, mode: Mode, event: int, late: bool) -> Mode:
-        del late
+    def _causes(self, mode: Mode, event: int, _late: bool) -> Mode:
         if event == self.first:
             return "stirred"
         return "quiet" if event == self.second else mode

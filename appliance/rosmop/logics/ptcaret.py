@@ -73,9 +73,8 @@ class CaretProperty(CompiledProperty):
         places = [source.events.index(name) if name in source.events else -1 for name in (BEGIN, END)]
         self.begin, self.end = places
 
-    def start(self, time_ns: int) -> Run:
+    def start(self, _time_ns: int) -> Run:
         """A run with no open call; the time plays no part."""
-        del time_ns
         return CaretRun(self)
 
 
@@ -96,9 +95,8 @@ class CaretRun(UntimedRun):
         made._stack = self._stack.copy()
         return made
 
-    def step(self, event: int, time_ns: int) -> Categories:
+    def step(self, event: int, _time_ns: int) -> Categories:
         """Take the event; the time plays no part. Raises RunFaultError, and is unchanged then."""
-        del time_ns
         if event == self._begin:
             if len(self._stack) >= MAX_DEPTH:
                 raise RunFaultError(f"more than {MAX_DEPTH} calls are open: an `end` is missing")

@@ -52,14 +52,12 @@ class RewritingProperty(CompiledProperty):
         for rule in rules:
             self.by_first[rule.left[0]] = (*self.by_first.get(rule.left[0], ()), rule)
 
-    def start(self, time_ns: int) -> Run:
+    def start(self, _time_ns: int) -> Run:
         """A run with an empty string; the time plays no part."""
-        del time_ns
         return RewritingRun(self)
 
-    def categories_after(self, event: int) -> frozenset[str]:
+    def categories_after(self, _event: int) -> frozenset[str]:
         """The verdicts that are written; any event can lead to them."""
-        del event
         return frozenset(rule.verdict for rule in self.rules if rule.verdict)
 
 
@@ -74,9 +72,8 @@ class RewritingRun(UntimedRun):
         self.string: list[int] = []
         self.verdict: Categories = ()
 
-    def step(self, event: int, time_ns: int) -> Categories:
+    def step(self, event: int, _time_ns: int) -> Categories:
         """Append the event and rewrite; the time plays no part. Raises RunFaultError, and is unchanged then."""
-        del time_ns
         if not self.verdict:
             self.string, self.verdict = self._rewritten([*self.string, event])
         return self.verdict

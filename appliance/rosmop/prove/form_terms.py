@@ -153,8 +153,7 @@ class Meaning:
         self._block(node.no, no)
         state.join(test, yes, no)
 
-    def _repeat(self, node: form.Statement | form.Expression, state: State) -> None:
-        del node, state
+    def _repeat(self, _node: form.Statement | form.Expression, _state: State) -> None:
         raise NotProvedError("not loop-free")
 
     _loop = _for_each = _skip = _accumulate = _repeat
@@ -197,13 +196,11 @@ class Meaning:
         self._leave_to_python(state, z3.UGT(size, UNMEASURED))
         self._spend(z3.UDiv(size, integer(BYTES_PER_INSTRUCTION, 64)), state)
 
-    def _drop(self, node: form.Drop, state: State) -> None:
-        del node
+    def _drop(self, _node: form.Drop, state: State) -> None:
         state.slots[_DROPPED] = z3.BoolVal(True)
 
-    def _acts(self, node: form.Statement | form.Expression, state: State) -> None:
+    def _acts(self, _node: form.Statement | form.Expression, state: State) -> None:
         """What comes out of it, or is told, is for Python."""
-        del node
         self._leave_to_python(state, z3.BoolVal(True))
 
     _publish = _log = _acts
@@ -359,8 +356,7 @@ class Meaning:
             raise UnknownError(type(node).__name__)
         return method(self, node, state)
 
-    def _literal(self, node: form.Literal, state: State) -> Any:
-        del state
+    def _literal(self, node: form.Literal, _state: State) -> Any:
         if node.value is None:
             return None
         if isinstance(node.value, bytes | str):
@@ -542,8 +538,7 @@ class Meaning:
     def _discard(self, node: form.Discard, state: State) -> None:
         self._value(node.value, state)
 
-    def _now(self, node: form.Now, state: State) -> Any:
-        del node, state
+    def _now(self, _node: form.Now, _state: State) -> Any:
         return self._beginning.now
 
     def _throttle(self, node: form.Throttle, state: State) -> Any:
