@@ -233,6 +233,7 @@ def test_grant_this_leads_to_the_editor(
         "--event", "decision", "--deny", resource="/guarded", caller_id="/eager"
     )
     page = opened().go(f"audit/{record['id']}")
+    expect(page.get_by_text("would be allowed by: /guarded = 10.9.9.9 robot")).to_be_visible()
     page.get_by_role("button", name="Grant this").click()
     expect(page.get_by_role("region", name="What would grant it")).to_contain_text(
         "+/guarded = 10.9.9.9 robot"
