@@ -846,7 +846,9 @@ def test_grant_of_another_host(field: Field) -> None:
     answer = knock(field, protocol[2], header(callerid="/borrowed", topic="/chatter", **STRING))
     assert b"hello" not in answer
     assert b"callerid=/voice" not in answer
-    field.recorded(event="connection refused", host="10.77.0.66", caller_id="/borrowed")
+    record = field.recorded(event="connection refused", host="10.77.0.66", caller_id="/borrowed")
+    why = field.appliance.rosrv("audit", "why", record["id"]).stdout.splitlines()
+    assert any(line.startswith("would be allowed by: /chatter = ") for line in why), why
 
 
 # --- who must not be seen ---
