@@ -140,7 +140,7 @@ def used_at(block: int) -> int:
 class Stream:
     """What one connection to a publisher leaves in the ring, until it is closed."""
 
-    __slots__ = ("_chain", "_end", "_number", "_place", "_ring", "_stream", "block", "written")
+    __slots__ = ("_chain", "_end", "_number", "_place", "_ring", "_stream", "_used", "block", "written")
 
     def __init__(self, ring: "RingWriter", stream: int, chain: _Chain) -> None:
         self._ring = ring
@@ -150,6 +150,7 @@ class Stream:
         self.block = -1
         self.written = 0  # when
         self._place = self._end = 0  # in the memory
+        self._used = 0  # the word
 
     def write(self, frames: memoryview, messages: int, first: int) -> None:
         """Leave these frames, `first` the number of the first one."""
@@ -161,7 +162,7 @@ class Stream:
         if end <= self._end:
             RECORD.pack_into(ring.memory, place, MARK, messages, size, now, first)
             ring.memory[place + RECORD.size : end] = frames
-            ring.words[used_at(self.block)] = end - self._end + ring.block
+            ring.words[self._used] = end - self._end + ring.block
             self._place = end
         elif size > ring.longest:
             ring.count(MISSED, messages)
@@ -182,7 +183,7 @@ class Stream:
         left = len(head) + len(frames)
         if left > _LONG * ring.block and self._place + _PAD.size <= self._end:
             _PAD.pack_into(ring.memory, self._place, PAD)
-            ring.words[used_at(self.block)] = ring.block
+            ring.words[self._used] = ring.block
             self._place = self._end
         for part in (head, frames):
             done = 0
@@ -190,18 +191,23 @@ class Stream:
                 if self._place == self._end:
                     begins = 0 if part is head and not done else left
                     self._next(begins if begins < ring.block else NONE_BEGINS)
-                count = min(len(part) - done, self._end - self._place)
-                ring.memory[self._place : self._place + count] = part[done : done + count]
-                self._place += count
-                ring.words[used_at(self.block)] = self._place - self._end + ring.block
+                place = self._place
+                count = min(len(part) - done, self._end - place)
+                ring.memory[place : place + count] = part[done : done + count]
+                self._place = place + count
+                ring.words[self._used] = place + count - self._end + ring.block
                 done += count
                 left -= count
 
     def _next(self, begins: int) -> None:
-        self.block = self._ring.take(self._stream, self._number, DATA, begins, self._chain)
+        ring = self._ring
+        block = self.block = ring.take(
+            self._stream, self._number, DATA, begins, self._chain, now=self.written
+        )
         self._number += 1
-        self._place = self._ring.geometry.data + self.block * self._ring.block
-        self._end = self._place + self._ring.block
+        self._used = used_at(block)
+        self._place = ring.data + block * ring.block
+        self._end = self._place + ring.block
 
 
 class RingWriter:
@@ -221,7 +227,7 @@ class RingWriter:
         clock: Callable[[], int] = time.time_ns,
     ) -> None:
         self.geometry = geometry(len(memory))
-        self.block = self.geometry.block
+        self.block, self.data = self.geometry.block, self.geometry.data
         self.memory = memory
         self.words = words_of(memory)
         self.clock = clock
@@ -262,7 +268,7 @@ class RingWriter:
         chain = self._chains[self._last_stream] = _Chain(shares, (topic, host))
         for number in range(needed):
             part = text[number * self.block : (number + 1) * self.block]
-            block = self.take(self._last_stream, number, HEADER, 0, chain)
+            block = self.take(self._last_stream, number, HEADER, 0, chain, now=self.clock())
             place = self.geometry.data + block * self.block
             self.memory[place : place + len(part)] = part
             self.words[used_at(block)] = len(part)
@@ -273,10 +279,10 @@ class RingWriter:
         """Count what is not there."""
         self.words[counter] = (self.words[counter] + by) % (1 << 64)
 
-    def take(self, stream: int, number: int, kind: int, begins: int, chain: _Chain) -> int:
+    def take(self, stream: int, number: int, kind: int, begins: int, chain: _Chain, *, now: int) -> int:
         """A block for a stream: a free one, or the oldest of its topic or host if that has its share, or of all."""
         if not self._free:
-            self._give_up(chain)
+            self._give_up(chain, now - self._keep)
         block = self._free.pop()
         self._birth += 1
         row = _COUNTERS + block * _ROW.size
@@ -287,7 +293,7 @@ class RingWriter:
             self._headers += 1
         else:
             chain.data += 1
-            self._order[block] = stream, self.clock()
+            self._order[block] = stream, now
             for share in chain.shares:
                 share.blocks[block] = None
                 if len(share.blocks) > share.most:
@@ -300,25 +306,26 @@ class RingWriter:
         if not chain.data:
             self._forget(stream, chain)
 
-    def _give_up(self, chain: _Chain) -> None:
-        oldest = self._oldest()
-        if self._order[oldest][1] + self._keep >= self.clock() or self._in_use(oldest):
+    def _give_up(self, chain: _Chain, old: int) -> None:
+        """Make a block free; what is from before `old` is too old."""
+        oldest = self._oldest(old)
+        if self._order[oldest][1] >= old or self._in_use(oldest, old):
             full = (share for share in chain.shares if len(share.blocks) >= share.most)
             share = next(full, None) or next(iter(self._beyond), None)
             oldest = oldest if share is None else next(iter(share.blocks))
         self._push_out(oldest)
 
-    def _in_use(self, block: int) -> bool:
+    def _in_use(self, block: int, old: int) -> bool:
         """Whether a stream fills this block, and has done so lately: one that says little has all it said there."""
         writer = self._chains[self._order[block][0]].writer
-        return writer is not None and writer.block == block and writer.written + self._keep >= self.clock()
+        return writer is not None and writer.block == block and writer.written >= old
 
-    def _oldest(self) -> int:
+    def _oldest(self, old: int) -> int:
         """The oldest block; those that are being filled count as new."""
         for _ in range(len(self._order)):
             block = next(iter(self._order))
-            if not self._in_use(block):
-                break
+            if not self._in_use(block, old):
+                return block
             self._order.move_to_end(block)
         return next(iter(self._order))
 

@@ -11,9 +11,11 @@ from typing import Any
 import msgspec
 import pytest
 from rosbags.rosbag1 import Reader
+from rosbags.rosbag2.storage_mcap import McapReader
 
 from appliance.channel import messages
 from appliance.channel.answers.recordings import Recording, Trigger
+from appliance.recorder.mcap import as_mcap
 from tests.unit.recorder.test_recorder import BEGAN, SECOND, Scene
 
 _CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.chmod")
@@ -96,9 +98,18 @@ def test_killed_at_each_operation_with_files(tmp_path: Path, memory: str) -> Non
             assert msgspec.json.decode((place / "recording.json").read_bytes(), type=Recording) == found
             assert hashlib.sha256((place / "recording.bag").read_bytes()).hexdigest() == found.sha256
             with Reader(place / "recording.bag") as reader:
-                assert sum(topic.messages for topic in found.topics) == sum(
-                    connection.topic == "/chatter" for connection, _time, _data in reader.messages()
-                )
+                rows = [(one.topic, time, bytes(data)) for one, time, data in reader.messages()]
+            assert sum(topic.messages for topic in found.topics) == [row[0] for row in rows].count("/chatter")
+            (folder / "a.mcap").write_bytes(
+                b"".join(as_mcap(place / "recording.bag")).replace(b"ros1", b"ros2")
+            )
+            mcap = McapReader(folder / "a.mcap")
+            mcap.open()
+            found_there = [
+                (one.topic, time, bytes(data)) for one, time, data in mcap.messages(mcap.connections)
+            ]
+            mcap.close()
+            assert sorted(found_there) == sorted(rows)
         kept.add(len(stated))
         removed.add(len(gone))
         scene.later(0, *(messages.RecordingNoted(name) for name in names | gone))
