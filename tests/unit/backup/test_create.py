@@ -81,6 +81,16 @@ def test_there_and_back(state: Path, tmp_path: Path) -> None:
     assert [one.name for one in tmp_path.iterdir() if one.name.startswith(".rosrv-backup")] == []
 
 
+def test_no_ros_is_needed(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where rosmaster is not installed a backup is taken and put back; recordings of messages are in none."""
+    monkeypatch.setattr(shutil, "which", lambda _program: None)
+    (state / "recordings").mkdir()
+    (state / "recordings" / "recording.bag").write_text("what messages said")
+    names = back_up(state, tmp_path / "backup.tar.gz")
+    assert sorted(names) == sorted(restore(tmp_path / "backup.tar.gz", tmp_path / "other"))
+    assert not any(name.startswith("recordings/") for name in names)
+
+
 def test_nothing_is_written_over(state: Path, tmp_path: Path) -> None:
     """An existing file, and a state directory that has something in it, stay as they are."""
     file = tmp_path / "backup.tar.gz"
