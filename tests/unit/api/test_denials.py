@@ -141,7 +141,7 @@ def test_a_name_that_another_host_has() -> None:
     for options, line in {
         "": AT_ONCE,
         "[Options]\ntell = rule\n": "takeover = granted",
-        "[Options]\ntakeover = same-host  # theirs\n": "takeover = granted  # theirs",
+        "[Options]\ntakeover = same-host  # theirs\n": "takeover = granted",
     }.items():
         found = why(denied("decision", held), all_may + options)
         assert allowing(found) == [line]

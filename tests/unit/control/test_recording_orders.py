@@ -156,8 +156,10 @@ def test_what_is_closed_is_recorded_noted_and_listed() -> None:
         recorder.send(messages.RevisionsWanted())
         await told(scene, lambda: len(heard) == 4)
         assert heard[3] == messages.RevisionsStated(4, 2)  # what is on no disk is told again
-        with pytest.raises(UnknownThingError, match="no recording"):
+        with pytest.raises(RecorderAwayError, match="not on record: no space left"):
             await scene.orders.fetch(admin.RecordingFetch(KEPT.id), "eve")
+        with pytest.raises(UnknownThingError, match="no recording"):
+            await scene.orders.fetch(admin.RecordingFetch("other"), "eve")
         recorder.close()
 
     played(story)

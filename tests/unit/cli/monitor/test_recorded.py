@@ -170,6 +170,7 @@ def test_what_is_removed_while_it_is_replayed_is_read_to_its_end(kept: Kept) -> 
     assert drops == [("m", 18), ("m", 19), ("a", 28), ("a", 29)]
     shutil.rmtree(kept.folder / "recordings" / ("a" * 20))
     kept.memory = None
+    kept.removes = False
     kept.trouble = "unknown"
     gone = replay(kept, "--since", at(20), "--until", at(29))
     assert (gone.exit_code, "is not there any more" in gone.output) == (2, True), gone.output
