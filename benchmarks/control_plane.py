@@ -197,6 +197,14 @@ def processor_seconds(pids: list[int]) -> float:
     return ticks / os.sysconf("SC_CLK_TCK")
 
 
+def await_rest(pids: list[int]) -> None:
+    """Wait until these have started and do nothing any more, at most 30 seconds."""
+    deadline, before = time.monotonic() + 30, -1.0
+    while time.monotonic() < deadline and (used := processor_seconds(pids)) != before:
+        before = used
+        select.select([], [], [], 0.5)
+
+
 def descendants(pid: int) -> list[int]:
     """A process and all that it started."""
     found = [pid]
@@ -275,6 +283,7 @@ def masters() -> Iterator[tuple[Master, Master]]:
             assert appliance.stdout is not None
             ready = json.loads(appliance.stdout.readline())
             await_port(port)
+            await_rest(descendants(appliance.pid))
             yield (
                 Master(port, [rosmaster.pid]),
                 Master(int(ready["master"].rpartition(":")[2]), descendants(appliance.pid)),
