@@ -1,0 +1,115 @@
+"""What messages said is for those who may read it: every path of REST, as each role sees it."""
+
+import itertools
+import json
+import re
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.support.appliance import Appliance
+from tests.support.nodes import RosSession, has_ros
+from tests.support.requirements import needs
+from tests.support.rest import Rest
+from tests.support.waiting import eventually
+
+WORD = "zq7word"
+MONITORS = """
+drops() { event e(std::string text) /a std_msgs/String '{data:text}' { if (text.size() > 2) { return; } } }
+changes() { event e(std::string &text) /b std_msgs/String '{data:text}' { text = text + "!"; } }
+faults() { event e(std::string text) /c std_msgs/String '{data:text}' { std::string t = text.substr(100); } }
+tells(std::string text) {
+    creation event e(std::string text) /d std_msgs/String '{data:text}' { }
+    event f(std::string text) /e std_msgs/String '{data:text}' { }
+    ere: e f* @match { DROP; } @fail { __RESET; }
+}
+publishes() { event e(std::string text) /f std_msgs/String '{data:text}' {
+    std_msgs::String s; s.data = text; PUBLISH(/g, std_msgs/String, s); } }
+"""
+
+
+@pytest.fixture
+def appliance() -> Iterator[Appliance]:
+    """An appliance with monitors that do all that monitors do, and a recorder."""
+    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
+    with tempfile.TemporaryDirectory(prefix="rosrv-contents-") as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        (folder / "monitors").mkdir()
+        (folder / "monitors" / "all.rv").write_text(MONITORS)
+        (folder / "appliance.yaml").write_text(
+            "recorder: {enabled: true, memory: 16MiB, before: 5, after: 1, longest: 8, disk: 512MiB,"
+            " triggers: [drop, change, verdict, fault]}\naudit: {reserve_bytes: 1MiB}\n"
+        )
+        options = (
+            "--config", str(folder / "appliance.yaml"), "--monitors", str(folder / "monitors"), "--api", "127.0.0.1:0"
+        )  # fmt: skip
+        with Appliance(options=options) as appliance:
+            yield appliance
+
+
+def test_no_path_shows_a_viewer_what_messages_said(appliance: Appliance, tmp_path: Path) -> None:
+    """Nor an operator the messages of a recording, which investigators see; nor does a log line or a metric."""
+    tokens: dict[str, Rest] = {}
+    for role in ("viewer", "operator", "investigator"):
+        made = appliance.rosrv("token", "add", f"the-{role}", "--role", role, "--json").stdout
+        tokens[role] = appliance.rest(json.loads(made)["token"])
+    with RosSession(appliance.master_uri, tmp_path) as ros:
+        for topic in "abcdefg":
+            ros.listener("roscpp", f"/{topic}")
+        for topic in "abcdef":
+            ros.talker("roscpp", f"/{topic}", "--text", WORD)
+        for event in (
+            "message dropped",
+            "message changed",
+            "monitor fault",
+            "monitor verdict",
+            "monitor published",
+        ):
+            appliance.recorded("--event", event)
+        appliance.rosrv("monitor", "enable", "drops", "tells", "--trial")
+        appliance.recorded("--event", "trial observed")
+        listed = eventually(
+            lambda: tokens["viewer"].get("/v1/recordings").json["recordings"], appliance.story
+        )
+    named = {
+        (one["event"], one["detail"].get("monitor")): one["id"] for one in appliance.audit("--limit", "500")
+    }
+    values = {
+        "name": ["drops", "changes", "faults", "tells", "publishes"], "recording_id": [listed[0]["id"]],
+        "revision": ["1"], "record_id": [*named.values()],
+    }  # fmt: skip
+    places = {role: [*places_with(WORD, rest, values)] for role, rest in tokens.items()}
+    assert places["viewer"] == []
+    messages = {f"/v1/recordings/{listed[0]['id']}/{what}" for what in ("bag", "messages", "evidence")}
+    assert {f"/v1/audit/{named['monitor verdict', 'tells']}", "/v1/audit"} <= {*places["operator"]} - messages
+    assert not messages & {*places["operator"]}
+    assert messages - {*places["investigator"]} <= {
+        f"/v1/recordings/{listed[0]['id']}/evidence"
+    }  # it is packed
+    assert WORD not in appliance.story()
+
+
+def places_with(word: str, rest: Rest, values: dict[str, list[str]]) -> Iterator[str]:
+    """The paths whose answer has it, of all that can be asked with GET, and the streams."""
+    asked = {
+        "/v1/audit": "?limit=500", "/v1/evidence": "?since=1h", "/v1/monitors": "?texts=true",
+        "messages": "?at=1970-01-01", "/v1/audit/stream": "?after=1",
+    }  # fmt: skip
+    for path, methods in rest.get("/v1/openapi.json").json["paths"].items():
+        if "get" not in methods or path == "/v1/messages":  # that one's frames are for operators alone
+            continue
+        needed = re.search(r"\{(\w+)", path)
+        for value in values[needed[1]] if needed else [""]:
+            place = re.sub(r"\{[^}]*\}", value, path)
+            query = asked.get(path, asked.get(path.rpartition("/")[2], ""))
+            if path.endswith(("/stream", "/live")):
+                events = rest.events(place + query)
+                body = json.dumps([*itertools.islice(events, 100 if query else 3)]).encode()
+                events.close()
+            else:
+                body = rest.get(place + query).body
+            if word.encode() in body:
+                yield place
