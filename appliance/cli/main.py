@@ -255,8 +255,10 @@ def _without_old_flags(arguments: list[str]) -> list[str]:
 
 
 def _asking_for_help(arguments: list[str]) -> list[str]:
-    """`rosrv help policy check` is `rosrv policy check --help`."""
-    return [*arguments[1:], "--help"] if arguments[:1] == ["help"] else arguments
+    """`rosrv help policy check` is `rosrv policy check --help`, and so is `rosrv policy help check`."""
+    if "help" not in arguments[:2]:
+        return arguments
+    return [*(word for word in arguments[:2] if word != "help"), *arguments[2:], "--help"]
 
 
 if __name__ == "__main__":

@@ -43,7 +43,9 @@ def learn_policy(
     """
     learned = learn(_observations(appliance, since), networks_of(robot))
     if not learned.requests:
-        typer.echo("rosrv: no request that passed is in the audit log (since then)", err=True)
+        begun = f" since {since}" if since is not None else ""
+        hint = "run the robot with `audit-only = all` below [Options] first"
+        typer.echo(f"rosrv: no request that passed is in the audit log{begun}: {hint}", err=True)
         raise typer.Exit(1)
     _check(learned, robot)
     if output is not None:

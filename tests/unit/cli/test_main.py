@@ -86,7 +86,10 @@ def test_the_version_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     assert facts["in_use"] is None
 
 
-@pytest.mark.parametrize("words", [("policy", "reload", "-h"), ("help", "policy", "reload")])
+@pytest.mark.parametrize(
+    "words",
+    [("policy", "reload", "-h"), ("help", "policy", "reload"), ("policy", "help", "reload")],
+)
 def test_help_is_found_in_every_usual_way(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
 ) -> None:
