@@ -1,16 +1,21 @@
-"""Makes the console's pictures in docs/pictures anew: `python -m tests.system.console.pictures`.
+"""Makes the console's pictures in docs/pictures anew: `python -m tests.system.console.pictures`, as root.
 
-An appliance with a robot of a hundred nodes, in whose name an operator's machine tries to command the arm; a browser of
-1280 by 800 pixels, in light colours.
+An appliance with a robot of a hundred nodes, in whose name an operator's machine tries to command the arm; and the
+demonstration, whose attacker is at work. A browser of 1280 by 800 pixels, in light colours.
 """
 
 import base64
+import os
+import re
+import signal
+import subprocess
 import tempfile
 from pathlib import Path
 
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from tests.support.appliance import Appliance
+from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import need_program
 from tests.support.robot import Robot
 from tests.system.console.conftest import CONFIG, REPOSITORY, launch
@@ -32,6 +37,24 @@ default = *
 default = *
 """
 _STRANGERS = ("/operator/bridge", "/camera/bridge")
+# As it is where somebody has installed it, whose paths are in the pictures.
+_DEMO = (
+    "unshare", "--mount", "sh", "-ec",
+    'mount -t tmpfs tmpfs /opt; mkdir /opt/rosrv; mount --bind "$1" /opt/rosrv; cd /opt/rosrv;'
+    " exec env PYTHONPATH=/opt/rosrv .venv/bin/rosrv demo --hold", "sh", str(REPOSITORY),
+)  # fmt: skip
+_DEMO_SECONDS = 400.0
+_ENROL = """async (name) => {
+  const headers = new Headers({ "If-Match": "*", "Content-Type": "application/json" });
+  headers.set("Authorization", `Bearer ${sessionStorage.getItem("rosrv.token")}`);
+  const body = JSON.stringify({ name, endpoint: "192.0.2.2", how: "kit" });
+  return (await fetch("/v1/hosts", { method: "POST", headers, body })).status;
+}"""
+_ATTACK = """
+import sys, xmlrpc.client
+with xmlrpc.client.ServerProxy(sys.argv[1]) as master:
+    print(master.registerPublisher("/tablet", "/landshark_control/trigger", "*", "http://10.77.0.66:40404/"))
+"""
 
 
 def main() -> None:
@@ -52,7 +75,63 @@ def main() -> None:
                 _one_topic(reader)
             with Reader(browser, place, token, width=390, height=844) as narrow:
                 _narrow(narrow)
+        with Process(ThisMachine(), _DEMO, env=dict(os.environ), label="demo") as demo:
+            _demonstration(browser, demo)
+            demo.stop(with_signal=signal.SIGTERM, timeout=60)
         browser.close()
+
+
+def _demonstration(browser: Browser, demo: Process) -> None:
+    """The demonstration's robot, once all of it was shown: an incident, and what else there is to look at."""
+    demo.wait_for_text("Be the attacker:", timeout=_DEMO_SECONDS)
+    said = "\n".join(str(event.get("text")) for event in demo.events)
+    ((attacker, master),) = re.findall(
+        r"Be the attacker: +(ip netns exec \S+) env ROS_MASTER_URI=(\S+)", said
+    )
+    there = ["nsenter", "--mount", f"--target={demo.pid}", *attacker.split()]
+    subprocess.run([*there, "python3", "-c", _ATTACK, master], check=True)
+    ((place, token),) = re.findall(r"console: +(\S+?)/? .*?token for it: +(\S+)", said, re.DOTALL)
+    with Reader(browser, place, token, width=1280, height=800) as reader:
+        _incident(reader)
+        _others(reader)
+
+
+def _incident(reader: Reader) -> None:
+    """docs/review-an-incident.md, up to the tighter policy on trial."""
+    page = reader.go("now")
+    refused = page.get_by_role("region", name="Refused lately")
+    expect(refused.get_by_role("listitem").first).to_contain_text("/landshark_control/trigger")
+    _take(page, "incident-now")
+    refused.get_by_role("link", name=re.compile("landshark_control")).first.click()
+    expect(page.locator(".excerpt-line.here")).to_be_visible()
+    page.get_by_text("Why", exact=True).scroll_into_view_if_needed()
+    _take(page, "incident-record")
+    page.get_by_role("link", name="Explain in the policy").click()
+    expect(page.locator("[data-explained]").first).to_be_visible()
+    _take(page, "incident-explain")
+    policy = (REPOSITORY / "examples/landshark/landshark-demo.ini").read_text()
+    reader.write(re.sub(r"^/?tablet.*\n| tablet\b(?! shows)", "", policy, flags=re.MULTILINE))
+    page.get_by_role("button", name="Load", exact=True).click()
+    page.get_by_label("Comment").fill("incident: the tablet tried to fire")
+    page.get_by_label("If you lock yourself out").select_option("300")
+    _take(page, "incident-load")
+    page.get_by_role("button", name="Not yet").click()
+    reader.write(policy.replace("/rosout               = vehicle ocu", "/rosout               = vehicle oku"))
+    page.get_by_role("tab", name="Check").click()
+    expect(page.locator(".finding").first).to_be_visible()
+    _take(page, "console-policy")
+
+
+def _others(reader: Reader) -> None:
+    page = reader.go("monitors/safeTrigger", heading="safeTrigger")
+    expect(page.locator("[data-editor] .cm-content").first).to_contain_text("safeTrigger")
+    _take(page, "console-monitor")
+    for name in ("ocu-1", "ocu-2", "tablet-3"):
+        assert page.evaluate(_ENROL, name) == 201
+    page = reader.go("hosts")
+    expect(page.get_by_role("row", name="tablet-3")).to_be_visible()
+    expect(page.get_by_role("row", name="10.77.0.10")).to_be_visible()
+    _take(page, "console-hosts")
 
 
 def _robot(reader: Reader) -> None:
@@ -94,6 +173,8 @@ def _narrow(reader: Reader) -> None:
         expect(
             page.locator({"now": ".event", "graph": ".box.many", "audit": "tbody tr"}[view]).first
         ).to_be_visible()
+        if view == "graph":
+            expect(page.locator("g.attempt")).to_have_count(len(_STRANGERS))
         shots.append(page.screenshot(animations="disabled"))
     images = "".join(
         f'<img src="data:image/png;base64,{base64.b64encode(shot).decode()}" style="border:1px solid #8894a3">'
@@ -108,6 +189,7 @@ def _narrow(reader: Reader) -> None:
 
 
 def _take(page: Page, name: str) -> None:
+    page.mouse.move(0, 0)  # nothing is under the pointer
     page.screenshot(path=_PICTURES / f"{name}.png", animations="disabled")
 
 

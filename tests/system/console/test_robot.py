@@ -19,6 +19,22 @@ _ALL_IN_FRAME = """() => {
     frame.left <= box.left && box.right <= frame.right && frame.top <= box.top && box.bottom <= frame.bottom);
 }"""
 
+# Of each line of what was refused: the boxes that it runs behind, but for those of its ends.
+_BEHIND = """() => {
+  const boxes = [...document.querySelectorAll(".box")].map((one) => [one.dataset.key, one.querySelector(".shape")]);
+  return [...document.querySelectorAll("g.attempt path.line")].map((line) => {
+    const found = new Set();
+    for (let step = 0; step <= 200; step += 1) {
+      const at = line.getPointAtLength((line.getTotalLength() * step) / 200).matrixTransform(line.getScreenCTM());
+      for (const [key, shape] of boxes) {
+        const { left, right, top, bottom } = shape.getBoundingClientRect();
+        if (at.x > left && at.x < right && at.y > top && at.y < bottom) found.add(key);
+      }
+    }
+    return [...found];
+  });
+}"""
+
 
 @pytest.fixture(scope="module")
 def robot(appliance: Appliance) -> Iterator[Robot]:
@@ -107,6 +123,23 @@ def test_numbers_agree(opened: Callable[..., Reader], appliance: Appliance) -> N
     expect(card).to_contain_text("200 topics, 0 services")
     status: dict[str, Any] = appliance.status()
     assert (status["nodes"], status["topics"], status["services"]) == (100, 200, 0)
+
+
+def test_a_refusal_runs_behind_no_box(
+    appliance: Appliance, robot: Robot, opened: Callable[..., Reader]
+) -> None:
+    """Backwards, too, it goes around what stands between its ends: else it would seem to be another's."""
+    policy = appliance.policy_file.read_text()
+    appliance.reload(policy.replace("[Publishers]\n", "[Publishers]\n/arm/command = 127.0.0.11\n"))
+    for node in ("/operator/bridge", "/camera/bridge"):
+        assert (
+            robot.call(node, "registerPublisher", "/arm/command", "std_msgs/Float64", robot.api(node))[0] != 1
+        )
+    page = opened(width=WIDE[0], height=WIDE[1]).go("graph")
+    expect(page.locator("g.attempt")).to_have_count(3)
+    page.wait_for_function(_ALL_IN_FRAME)
+    assert not [keys for keys in page.evaluate(_BEHIND) if keys]
+    appliance.reload(policy)
 
 
 def _graph(reader: Reader) -> Page:

@@ -108,7 +108,7 @@ function Line(/** @type {any} */ { line, spots, chosen, near, choose, narrow }) 
   const from = spots.get(line.from);
   const to = spots.get(line.to);
   if (!from || !to) return null;
-  const path = narrow ? between(from, to) : curve(from, to);
+  const path = narrow ? between(from, to) : curve(from, to, spots);
   const own = chosen === line.key;
   const touched = near === null || own || line.from === chosen || line.to === chosen;
   const kind = line.kind === "denied" ? (line.would ? "would" : "denied") : line.mediated ? "mediated" : "flow";
@@ -125,16 +125,17 @@ function Line(/** @type {any} */ { line, spots, chosen, near, choose, narrow }) 
     <path class="reach" d=${path} />${shape}<title>${said}</title></g>`;
 }
 
-/** From the right side of one box to the left of the other; backwards in a wide bow below. */
-function curve(/** @type {any} */ from, /** @type {any} */ to) {
+/** From the right side of one box to the left of the other; backwards around all boxes on its way, below them. */
+function curve(/** @type {any} */ from, /** @type {any} */ to, /** @type {Map<string, any>} */ spots) {
   const x1 = from.x + from.w / 2;
   const x2 = to.x - to.w / 2 - 2;
   if (x2 > x1 - 20) {
     const bend = Math.max(24, (x2 - x1) / 2);
     return `M${x1} ${from.y}C${x1 + bend} ${from.y} ${x2 - bend} ${to.y} ${x2} ${to.y}`;
   }
-  const low = Math.max(from.y + from.h / 2, to.y + to.h / 2) + 26 + Math.abs(x1 - x2) * 0.04;
-  return `M${x1} ${from.y}C${x1 + 56} ${from.y} ${x1 + 48} ${low} ${(x1 + x2) / 2} ${low}S${x2 - 56} ${to.y} ${x2} ${to.y}`;
+  const passed = [...spots.values()].filter((spot) => spot.x + spot.w / 2 > x2 && spot.x - spot.w / 2 < x1);
+  const low = Math.max(...passed.map((spot) => spot.y + spot.h / 2)) + 14 + Math.abs(x1 - x2) * 0.03;
+  return `M${x1} ${from.y}h8q16 0 16 16V${low - 16}q0 16 -16 16H${x2 - 8}q-16 0 -16 -16V${to.y + 16}q0 -16 16 -16h8`;
 }
 
 /** In two columns: out of the inner side of a box into the space between them, and into the inner side of the other. */
