@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from appliance.master.graph.registry import Kind
-from tests.support.control_parts import OPEN, POLICY, ControlParts
+from tests.support.control_parts import HOST, OPEN, POLICY, ControlParts
 
 pytestmark = pytest.mark.anyio
 NO_SECRET = POLICY.format("/secret=\n", "/secret=\n")
@@ -27,6 +27,37 @@ async def test_a_registration_that_waited_over_a_reload_is_decided_again() -> No
     assert [one.resources(Kind.PUBLICATION) for one in world.registry.all()] == [[]]
     assert ("revoked", "/secret") in world.records.events
     assert world.hidden.has(Kind.PUBLICATION, "/secret") == []
+
+
+async def test_the_next_call_is_decided_by_what_is_so_then() -> None:
+    """The same words from the same address: a policy, a holder of the name, a node's new life, each counts at once."""
+    world = await ControlParts.begun()
+
+    async def registered(uri: str = URI, host: str = "10.0.0.5") -> bool:
+        answer = await world.ask("registerPublisher", "/n", "/secret", "std_msgs/String", uri, host=host)
+        assert isinstance(answer, list)
+        return answer[0] == 1
+
+    async def told(key: str) -> bool:
+        answer = await world.ask("setParam", "/n", key, 1)
+        assert isinstance(answer, list)
+        return answer[0] == 1
+
+    for policy, allowed in ((OPEN, True), (NO_SECRET, False), (OPEN, True), (NO_SECRET, False), (OPEN, True)):
+        world.reload(policy)
+        assert [await registered(), await registered()] == [allowed] * 2
+    alike = "[Groups]\nsome = 10.0.0.0/24\n"
+    assert world.current.alike(HOST) == "10.0.0.5/32"
+    world.reload(alike + OPEN.replace("[Nodes]\n", "[Nodes]\n/some=some\n"))
+    assert world.current.alike(HOST) == "10.0.0.0/24"
+    world.reload(OPEN.replace("[Commands]\n", "[Commands]\nsetParam=10.0.0.9\n"))
+    assert not await told("/a")
+    world.reload(OPEN)
+    assert await told("/a")
+    new_life = URI.replace("4001", "4002")
+    assert await registered(new_life)
+    assert not await registered(URI)  # the life before is over
+    assert await registered(new_life)
 
 
 async def test_a_service_that_is_looked_up_over_a_reload_is_not_granted() -> None:
