@@ -1,5 +1,6 @@
 """`rosrv evidence export|verify|verifier`: what happened in one file that proves itself elsewhere."""
 
+import errno
 import os
 import sys
 import time
@@ -57,14 +58,17 @@ def export_evidence(
             raise usage_error("give a recording, or --since (and --until)")
         now = time.time_ns()
         span = Span(parse_moment(since or "0s", now), parse_moment(until or "0s", now))
-        size = 0
-        descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        size, part = 0, output.with_name(f"{output.name}.part")
+        if os.path.lexists(output):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(output))
+        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             with os.fdopen(descriptor, "wb") as file:
                 for piece in _bundle(appliance, recording or span):
                     size += file.write(piece)
+            part.rename(output)
         except BaseException as error:
-            output.unlink()
+            part.unlink()
             if isinstance(error, BundleError | ProblemError):
                 fail(str(error), 1)
             raise

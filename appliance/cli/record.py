@@ -322,12 +322,14 @@ def _private(path: Path) -> int:
 
 def _convert(bag: Path, target: Path) -> None:
     """Write the bag as MCAP. Raises `OSError`; ends the program with 1 where a message type makes no sense."""
-    with os.fdopen(_private(target), "wb") as file:
+    made = target.with_name(f"{target.name}.new")
+    with os.fdopen(_private(made), "wb") as file:
         try:
             file.writelines(as_mcap(bag))
             file.flush()
+            made.rename(target)
         except BaseException as error:
-            target.unlink()
+            made.unlink()
             if not isinstance(error, ValueError):
                 raise
             typer.echo(f"rosrv: it cannot be made MCAP, fetch the bag: {printable(str(error))}", err=True)
