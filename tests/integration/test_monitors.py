@@ -543,7 +543,7 @@ def test_what_a_monitor_does_explains_itself_on_the_command_line_as_over_rest(
     ros.talker("rospy", "/chatter", name="voice").wait_for_count(3, event="sent")
     rest = appliance.rest()
     for event, at in (
-        ("message changed", "judge.rv:3:5"),
+        ("message changed", "judge.rv:5:40"),
         ("monitor published", "judge.rv:5:"),
         ("monitor verdict", "judge.rv:7:"),
         ("monitor fault", "judge.rv:8:"),
