@@ -551,7 +551,9 @@ def test_what_a_monitor_does_explains_itself_on_the_command_line_as_over_rest(
     ):
         full = next(one for one in appliance.recorded(event=event) if "count" not in one["detail"])
         lines = appliance.rosrv("audit", "why", full["id"]).stdout.splitlines()
-        assert rest.get(f"/v1/audit/{full['id']}/why").json["lines"] == lines
+        why = rest.get(f"/v1/audit/{full['id']}/why").json
+        assert [*why["lines"], *filter(None, [why["refusal"]])] == lines
+        assert ("rosrv monitor disable" in why["refusal"]) is (event == "message dropped")
         assert lines[0] == full["reason"]
         assert any(line.startswith("by: message number ") and "/voice on 127.0.0.1" in line for line in lines)
         assert any(line.startswith(f"at: {at}") for line in lines), (event, lines)
