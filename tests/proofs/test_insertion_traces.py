@@ -31,7 +31,7 @@ STEPS = {
     ("decision", "requestTopic"): "decided_call",
     ("connection opened", "topic"): "opened",
     ("connection closed", "topic"): "closed",
-    ("revoked", "subscription"): "revoked",
+    ("revoked", "registerSubscriber"): "revoked",
 }
 Trace = list[Step]
 
