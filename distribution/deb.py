@@ -45,6 +45,8 @@ def build(architecture: Architecture, *, moment: int) -> Path:
     source.mkdir(parents=True)
     _gather(source, architecture, work, moment)
     _debian_folder(source / "debian", moment)
+    for path in source.rglob("*"):  # dpkg takes down what is later, but leaves what is earlier
+        os.utime(path, (moment, moment), follow_symlinks=False)
     environment = {"SOURCE_DATE_EPOCH": str(moment), "DEB_BUILD_OPTIONS": "nocheck", "LC_ALL": "C.UTF-8"}
     subprocess.run(
         # Nothing is compiled, so nothing of the other architecture is needed (-d).

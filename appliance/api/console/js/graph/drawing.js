@@ -125,7 +125,8 @@ function Line(/** @type {any} */ { line, spots, chosen, near, choose, narrow }) 
     <path class="reach" d=${path} />${shape}<title>${said}</title></g>`;
 }
 
-/** From the right side of one box to the left of the other; backwards around all boxes on its way, below them. */
+/** From the right side of one box to the left of the other; backwards around all boxes on its way, below them, and
+ * beside other lines: the longer it is, the further out. */
 function curve(/** @type {any} */ from, /** @type {any} */ to, /** @type {Map<string, any>} */ spots) {
   const x1 = from.x + from.w / 2;
   const x2 = to.x - to.w / 2 - 2;
@@ -135,7 +136,8 @@ function curve(/** @type {any} */ from, /** @type {any} */ to, /** @type {Map<st
   }
   const passed = [...spots.values()].filter((spot) => spot.x + spot.w / 2 > x2 && spot.x - spot.w / 2 < x1);
   const low = Math.max(...passed.map((spot) => spot.y + spot.h / 2)) + 14 + Math.abs(x1 - x2) * 0.03;
-  return `M${x1} ${from.y}h8q16 0 16 16V${low - 16}q0 16 -16 16H${x2 - 8}q-16 0 -16 -16V${to.y + 16}q0 -16 16 -16h8`;
+  const aside = Math.min(24, 4 + Math.abs(x1 - x2) * 0.01);
+  return `M${x1} ${from.y}h${aside}q16 0 16 16V${low - 16}q0 16 -16 16H${x2 - aside}q-16 0 -16 -16V${to.y + 16}q0 -16 16 -16h${aside}`;
 }
 
 /** In two columns: out of the inner side of a box into the space between them, and into the inner side of the other. */
