@@ -9,6 +9,7 @@ the master by ROS_MASTER_URI and of its own address by ROS_IP, nothing else.
 """
 
 import fcntl
+import functools
 import os
 import re
 import shutil
@@ -33,7 +34,7 @@ _IN_ITS_OWN_WAY = re.compile(
 
 
 class RosSession:
-    """The nodes and tools of one test; ends all of them, at once: a rospy node takes a second to end."""
+    """The nodes and tools of one test; ends all of them, at once."""
 
     def __init__(self, master_uri: str, home: Path, host: Host | None = None) -> None:
         self.master_uri, self.home = master_uri, home
@@ -150,6 +151,7 @@ class RosSession:
         assert not deaf, "did not end when interrupted:\n" + "\n".join(deaf)
 
 
+@functools.cache
 def roscpp_program(name: str) -> Path:
     """The compiled node; compiled on first use and again when its source changes."""
     source, header = HERE / "roscpp_nodes" / f"{name}.cpp", HERE / "roscpp_nodes" / "report.hpp"

@@ -5,7 +5,7 @@ import sys
 import actionlib
 import rospy
 from actionlib.msg import TestAction, TestFeedback, TestGoal, TestResult
-from report import report
+from report import init_node, report
 
 GOAL = 3
 
@@ -41,7 +41,7 @@ def ask():
 def main():
     """Be one end."""
     end = rospy.myargv()[1]
-    rospy.init_node(f"action_{end}")
+    init_node(f"action_{end}")
     {"server": serve, "client": ask}[end]()
 
 

@@ -10,7 +10,7 @@ import sys
 import threading
 
 import rospy
-from report import report
+from report import init_node, report
 from std_msgs.msg import String
 
 
@@ -63,7 +63,7 @@ def main():
     arguments.add_argument("topic")
     arguments.add_argument("--slow", type=float, default=0.0)
     options = arguments.parse_args(rospy.myargv()[1:])
-    rospy.init_node("counting_listener")
+    init_node("counting_listener")
     count = Count(options.slow)
     rospy.Subscriber(options.topic, String, count.heard, tcp_nodelay=True)
     threading.Thread(target=count.tell, daemon=True).start()

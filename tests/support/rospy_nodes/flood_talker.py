@@ -8,7 +8,7 @@ import sys
 import threading
 
 import rospy
-from report import report
+from report import init_node, report
 from std_msgs.msg import String
 
 
@@ -19,7 +19,7 @@ def main():
     arguments.add_argument("--rate", type=float, default=1000)
     arguments.add_argument("--bytes", type=int, default=2000)
     options = arguments.parse_args(rospy.myargv()[1:])
-    rospy.init_node("flood_talker")
+    init_node("flood_talker")
     publisher = rospy.Publisher(options.topic, String, queue_size=None, tcp_nodelay=True)
     ended = threading.Event()
     threading.Thread(target=lambda: (sys.stdin.readline(), ended.set()), daemon=True).start()

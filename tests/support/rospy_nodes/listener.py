@@ -3,7 +3,7 @@
 import argparse
 
 import rospy
-from report import report
+from report import init_node, report
 from std_msgs.msg import String
 
 
@@ -17,7 +17,7 @@ def main():
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     options = arguments.parse_args(rospy.myargv()[1:])
-    rospy.init_node("listener")
+    init_node("listener")
     rospy.Subscriber(options.topic, String, heard)
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     rospy.spin()

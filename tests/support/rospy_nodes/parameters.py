@@ -8,7 +8,7 @@ import json
 import sys
 
 import rospy
-from report import report
+from report import init_node, report
 from rospy.impl.paramserver import get_param_server_cache
 
 DO = {
@@ -24,7 +24,7 @@ DO = {
 
 def main():
     """Do what each line says."""
-    rospy.init_node("parameters")
+    init_node("parameters")
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     watched = get_param_server_cache()
     watched.set_notifier(lambda key, value: report("changed", key=key, value=value))

@@ -7,7 +7,7 @@ import argparse
 import sys
 
 import rospy
-from report import report
+from report import init_node, report
 from std_srvs.srv import SetBool, Trigger
 
 
@@ -18,7 +18,7 @@ def main():
     arguments.add_argument("--persistent", action="store_true")
     arguments.add_argument("--trigger", action="store_true")
     options = arguments.parse_args(rospy.myargv()[1:])
-    rospy.init_node("service_client")
+    init_node("service_client")
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     kind = Trigger if options.trigger else SetBool
     call = rospy.ServiceProxy(options.service, kind, persistent=options.persistent)

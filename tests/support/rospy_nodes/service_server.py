@@ -3,7 +3,7 @@
 import argparse
 
 import rospy
-from report import report
+from report import init_node, report
 from std_srvs.srv import SetBool, SetBoolResponse
 
 
@@ -18,7 +18,7 @@ def main():
     arguments = argparse.ArgumentParser()
     arguments.add_argument("service")
     options = arguments.parse_args(rospy.myargv()[1:])
-    rospy.init_node("service_server")
+    init_node("service_server")
     rospy.Service(options.service, SetBool, answer)
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     rospy.spin()

@@ -4,7 +4,7 @@ import argparse
 import sys
 
 import rospy
-from report import report
+from report import init_node, report
 from std_msgs.msg import String
 
 
@@ -29,7 +29,7 @@ def main():
     arguments.add_argument("--rate", type=float, default=10)
     arguments.add_argument("--count", type=int, default=0)
     options = arguments.parse_args(rospy.myargv()[1:])
-    rospy.init_node("talker")
+    init_node("talker")
     publisher = rospy.Publisher(options.topic, String, Watch(), latch=options.latch, queue_size=100)
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     rate = rospy.Rate(options.rate)

@@ -9,12 +9,12 @@ sys.path.insert(0, str(Path(__file__).parents[3] / "support" / "rospy_nodes"))
 import actionlib
 import rospy
 from actionlib.msg import TestAction, TestGoal
-from report import report
+from report import init_node, report
 
 
 def main():
     """Ask, report, end."""
-    rospy.init_node("action_client")
+    init_node("action_client")
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     client = actionlib.SimpleActionClient("count", TestAction)
     client.wait_for_server()

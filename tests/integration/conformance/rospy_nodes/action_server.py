@@ -8,12 +8,12 @@ sys.path.insert(0, str(Path(__file__).parents[3] / "support" / "rospy_nodes"))
 import actionlib
 import rospy
 from actionlib.msg import TestAction, TestFeedback, TestResult
-from report import report
+from report import init_node, report
 
 
 def main():
     """Serve until told to end; a goal over 100 goes on until it is cancelled."""
-    rospy.init_node("action_server")
+    init_node("action_server")
 
     def work(goal):
         for number in range(goal.goal):

@@ -12,7 +12,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[3] / "support" / "rospy_nodes"))
 
 import rospy
-from report import report
+from report import init_node, report
 from std_msgs.msg import String
 
 
@@ -69,7 +69,7 @@ class Orders:
 
 def main():
     """Do what each line says."""
-    rospy.init_node("orders")
+    init_node("orders")
     orders = Orders()
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     for line in sys.stdin:
