@@ -1,5 +1,6 @@
 """Real processes, killed, stopped and starved: what the supervisor promises about them."""
 
+import contextlib
 import json
 import os
 import select
@@ -46,18 +47,31 @@ class Running:
             self.pid(role)
         return self
 
-    def until_confined(self) -> "Running":
-        """Wait until everything runs and each process has given up what it must not have: nodes may connect before."""
-        self.until_ready()
-        for role in ALL:
-            pid = self.pid(role)
-            # The filter of system calls is the last that it takes upon itself.
-            eventually(partial(_is_filtered, pid), f"{role} is confined")
-        return self
-
     def pid(self, role: str, *, restarts: int = 0) -> int:
         """The process id of a role's life after this many restarts."""
         return int(self.process.wait_for(event="process started", role=role, restarts=restarts)["pid"])
+
+    def restarts(self, role: str) -> int:
+        """How often a role was started again until now."""
+        return len(self.process.seen(event="process started", role=role)) - 1
+
+    def next_pid(self, role: str, pid: int) -> int:
+        """The process id of the life of a role that follows this one."""
+        lives = [event["pid"] for event in self.process.seen(event="process started", role=role)]
+        return self.pid(role, restarts=lives.index(pid) + 1)
+
+    def living(self, role: str) -> int:
+        """The process id of a role's present life, once it is at work and has given up what it must not have."""
+        pid = self.pid(role, restarts=self.restarts(role))
+        # The filter of system calls is the last that it takes upon itself.
+        eventually(partial(_is_filtered, pid), f"{role} is confined")
+        if role in {"control", "relay"}:
+            self.process.wait_for(actor=role, pid=pid)
+        if role == "rosout":
+            events = self.process.events
+            began = next(at for at, event in enumerate(events) if event.get("pid") == pid)
+            self.process.wait_for_text("subscribed to /rosout", since=began)
+        return pid
 
     def echo(self) -> int:
         """Connect to the socket that control keeps: the process id of the control that answers."""
@@ -97,14 +111,21 @@ def _wait(descriptor: int, seconds: float) -> bool:
     return bool(select.select([descriptor], [], [], seconds)[0])
 
 
-@pytest.fixture
-def state() -> Iterator[Path]:
+@contextlib.contextmanager
+def state_directory() -> Iterator[Path]:
     """A state directory that the users of the roles can reach."""
     needs(ROSMASTER.exists() and ROSOUT.exists(), "rosmaster and rosout (run `make setup`)")
     directory = Path(tempfile.mkdtemp(prefix="rosrv-supervisor-"))
     directory.chmod(0o755)
     yield directory / "state"
     shutil.rmtree(directory)
+
+
+@pytest.fixture
+def state() -> Iterator[Path]:
+    """One of a test."""
+    with state_directory() as state:
+        yield state
 
 
 @pytest.fixture
@@ -122,38 +143,48 @@ def start(state: Path) -> Iterator[Any]:
         running.until_childless()
 
 
+@pytest.fixture(scope="module")
+def common() -> Iterator[Running]:
+    """A supervisor that the tests of this file share which leave all its processes at work."""
+    with state_directory() as state:
+        running = Running(state)
+        yield running.until_ready()
+        running.process.stop(with_signal=signal.SIGTERM)
+        running.until_childless()
+
+
 @pytest.mark.parametrize("role", ALL)
-def test_a_killed_process_is_back_within_a_second(start: Any, role: str) -> None:
-    """Whatever dies is started again within a second, and control is told the new process."""
-    running = start().until_ready()
+def test_a_killed_process_is_back_within_a_second(common: Running, role: str) -> None:
+    """Whatever dies is started again within a second of its first death, and control is told the new process."""
+    old, restarts = common.living(role), common.restarts(role)
     killed = time.monotonic()
-    os.kill(running.pid(role), signal.SIGKILL)
-    new = running.pid(role, restarts=1)
-    assert time.monotonic() - killed < allowed(1)
-    running.process.wait_for(lambda event: event.get("processes", {}).get(role) == [new, 1], actor="control")
-    assert running.echo() == running.pid("control", restarts=1 if role == "control" else 0)
+    os.kill(old, signal.SIGKILL)
+    new = common.next_pid(role, old)
+    assert time.monotonic() - killed < allowed(1 + restarts)
+    common.process.wait_for(
+        lambda event: event.get("processes", {}).get(role) == [new, restarts + 1], actor="control"
+    )
+    assert common.echo() == common.living("control")
 
 
 @pytest.mark.parametrize("role", ["control", "rosmaster"])
-def test_a_hanging_process_is_replaced(start: Any, role: str) -> None:
+def test_a_hanging_process_is_replaced(common: Running, role: str) -> None:
     """A process that is there but does not answer is killed after five seconds and started again."""
-    running = start().until_ready()
-    hanging = running.pid(role)
+    hanging = common.living(role)
     os.kill(hanging, signal.SIGSTOP)
     stopped = time.monotonic()
-    running.process.wait_for(event="process does not answer and is killed", pid=hanging)
+    common.process.wait_for(event="process does not answer and is killed", pid=hanging)
     assert 4 < time.monotonic() - stopped < allowed(9)
-    running.pid(role, restarts=1)
+    common.next_pid(role, hanging)
 
 
-def test_a_port_of_control_stays_open_while_control_is_dead(start: Any) -> None:
+def test_a_port_of_control_stays_open_while_control_is_dead(common: Running) -> None:
     """A node that connects while there is no control waits in the queue and is served by the next one."""
-    running = start().until_ready()
-    old = running.pid("control")
+    old = common.living("control")
     os.kill(old, signal.SIGKILL)
-    answered = running.echo()
-    assert answered == running.pid("control", restarts=1) != old
-    restored = running.process.wait_for(actor="control", pid=answered, count=2)
+    answered = common.echo()
+    assert answered == common.next_pid("control", old) != old
+    restored = common.process.wait_for(actor="control", pid=answered, count=2)
     assert restored["restored"] == ["admin", "echo"]
 
 
@@ -168,35 +199,35 @@ def test_every_port_of_a_large_robot_survives_control(start: Any) -> None:
     assert restored["count"] == len(restored["restored"]) == CROWD + 2
 
 
-def test_the_admin_socket_survives_control(start: Any, state: Path) -> None:
+def test_the_admin_socket_survives_control(common: Running) -> None:
     """The socket in the state directory stays one that control listens on, whichever control it is."""
-    running = start().until_ready()
-    os.kill(running.pid("control"), signal.SIGKILL)
+    old = common.living("control")
+    os.kill(old, signal.SIGKILL)
     with socket.socket(socket.AF_UNIX) as connection:
-        connection.connect(str(state / "admin.sock"))
-    running.process.wait_for(actor="control", pid=running.pid("control", restarts=1), count=2)
+        connection.connect(str(common.state / "admin.sock"))
+    common.process.wait_for(actor="control", pid=common.next_pid("control", old), count=2)
 
 
 @pytest.mark.parametrize("role", ["relay", "control"])
-def test_a_restarted_end_gets_a_fresh_link(start: Any, role: str) -> None:
+def test_a_restarted_end_gets_a_fresh_link(common: Running, role: str) -> None:
     """After the death of either end, control and relay can speak to each other again."""
-    running = start().until_ready()
-    running.process.wait_for(actor="relay", link="control", said="StateBegan")
-    mark = running.process.mark()
-    os.kill(running.pid(role), signal.SIGKILL)
-    relay = running.pid("relay", restarts=1 if role == "relay" else 0)
-    running.process.wait_for(actor="relay", pid=relay, link="control", said="StateBegan", since=mark)
+    old, relay = common.living(role), common.living("relay")
+    common.process.wait_for(actor="relay", pid=relay, link="control", said="StateBegan")
+    mark = common.process.mark()
+    os.kill(old, signal.SIGKILL)
+    if role == "relay":
+        relay = common.next_pid(role, old)
+    common.process.wait_for(actor="relay", pid=relay, link="control", said="StateBegan", since=mark)
 
 
 @pytest.mark.parametrize("role", ["relay", "control"])
-def test_a_process_that_says_what_it_may_not_is_replaced(start: Any, role: str) -> None:
+def test_a_process_that_says_what_it_may_not_is_replaced(common: Running, role: str) -> None:
     """A relay cannot have sockets kept, control cannot play supervisor: they are killed for trying."""
-    running = start().until_ready()
-    running.process.wait_for(actor=role)  # it listens to signals before it says anything
-    os.kill(running.pid(role), signal.SIGUSR1)
-    running.process.wait_for(event="process is killed", role=role)
-    running.pid(role, restarts=1)
-    assert running.echo()
+    old = common.living(role)  # it listens to signals before it says anything
+    os.kill(old, signal.SIGUSR1)
+    common.process.wait_for(event="process is killed", role=role, pid=old)
+    common.next_pid(role, old)
+    assert common.echo()
 
 
 def test_nothing_outlives_a_killed_supervisor(start: Any) -> None:
@@ -306,17 +337,15 @@ def test_nothing_is_served_when_others_can_reach_the_hidden_master(start: Any) -
     assert running.process.seen(event="process started", role="control") == []
 
 
-def test_each_process_has_a_user_of_its_own_and_no_privilege(start: Any) -> None:
+def test_each_process_has_a_user_of_its_own_and_no_privilege(common: Running) -> None:
     """As root: the ids of the design, no groups, no capability in any set, no way to gain one."""
     need_root()
-    running = start().until_confined()
-    running.process.wait_for_text("subscribed to /rosout")
     users = {"control": "rosrv", "relay": "rosrv-relay", "signer": "rosrv-signer", "rosmaster": "rosmaster"}
-    ids = {role: _status(running.pid(role))["Uid"].split() for role in users}
+    ids = {role: _status(common.living(role))["Uid"].split() for role in users}
     assert all(len(set(one)) == 1 and one[0] != "0" for one in ids.values())
     assert len({one[0] for one in ids.values()}) == len(users)
     for role in ALL:
-        status = _status(running.pid(role))
+        status = _status(common.living(role))
         assert status["Groups"] == ""
         assert {status[name] for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")} == {"0" * 16}
         assert status["NoNewPrivs"] == "1"
@@ -324,51 +353,46 @@ def test_each_process_has_a_user_of_its_own_and_no_privilege(start: Any) -> None
         assert status["SigBlk"] == "0" * 16  # it ends when it is asked to
 
 
-def test_the_supervisor_keeps_few_capabilities(start: Any) -> None:
+def test_the_supervisor_keeps_few_capabilities(common: Running) -> None:
     """As root: what it has no use for (kernel modules, raw memory, clock …) it cannot do."""
     need_root()
-    running = start().until_ready()
     allowed = sum(1 << number for number in SUPERVISORS.values())
-    status = _status(running.process.pid)
+    status = _status(common.process.pid)
     for name in ("CapEff", "CapPrm", "CapBnd", "CapInh", "CapAmb"):
         assert int(status[name], 16) & ~allowed == 0
 
 
-def test_the_signer_has_no_network(start: Any) -> None:
+def test_the_signer_has_no_network(common: Running) -> None:
     """As root: the signer is alone in a network namespace of its own."""
     need_root()
-    running = start().until_confined()
     own = Path(f"/proc/{os.getpid()}/ns/net").readlink()
-    assert Path(f"/proc/{running.pid('signer')}/ns/net").readlink() != own
-    assert Path(f"/proc/{running.pid('relay')}/ns/net").readlink() == own
+    assert Path(f"/proc/{common.living('signer')}/ns/net").readlink() != own
+    assert Path(f"/proc/{common.living('relay')}/ns/net").readlink() == own
 
 
-def test_each_part_of_the_state_is_its_owners_only(start: Any, state: Path) -> None:
+def test_each_part_of_the_state_is_its_owners_only(common: Running) -> None:
     """Nobody can look around in the state directory, and each part is closed to the other roles."""
-    running = start().until_confined()
-    assert stat.S_IMODE(state.stat().st_mode) == 0o711
+    assert stat.S_IMODE(common.state.stat().st_mode) == 0o711
     for part in ("control", "relay", "signer", "rosmaster"):
-        found = (state / part).stat()
+        found = (common.state / part).stat()
         # The audit log is readable for the api's group, which may pass through control's part and not look around.
         assert stat.S_IMODE(found.st_mode) == (0o2710 if part == "control" and os.geteuid() == 0 else 0o700)
-        assert str(found.st_uid) == _status(running.pid(part))["Uid"].split()[0]
-    assert stat.S_IMODE((state / "admin.sock").stat().st_mode) == 0o600
+        assert str(found.st_uid) == _status(common.living(part))["Uid"].split()[0]
+    assert stat.S_IMODE((common.state / "admin.sock").stat().st_mode) == 0o600
 
 
-def test_a_child_has_only_the_files_it_was_given(start: Any) -> None:
+def test_a_child_has_only_the_files_it_was_given(common: Running) -> None:
     """No descriptor of the supervisor (lock, kept sockets, other lifelines) leaks into a child."""
-    running = start().until_confined()
-    supervisors, relays = (_open_files(pid) for pid in (running.process.pid, running.pid("relay")))
+    supervisors, relays = (_open_files(pid) for pid in (common.process.pid, common.living("relay")))
     assert [
         one for one in supervisors & relays if one.startswith(("socket:", "/")) and one != "/dev/null"
     ] == []
 
 
-def test_the_hidden_master_listens_on_loopback_only(start: Any, state: Path) -> None:
+def test_the_hidden_master_listens_on_loopback_only(common: Running) -> None:
     """ROSMaster's port is not reachable by any other address of the machine."""
-    running = start().until_ready()
-    port = json.loads((state / "run" / "config.json").read_text())["rosmaster_port"]
-    listening = Path(f"/proc/{running.pid('rosmaster')}/net/tcp").read_text().splitlines()
+    port = json.loads((common.state / "run" / "config.json").read_text())["rosmaster_port"]
+    listening = Path(f"/proc/{common.living('rosmaster')}/net/tcp").read_text().splitlines()
     addresses = {row.split()[1] for row in listening[1:] if row.split()[3] == "0A"}
     assert f"0100007F:{port:04X}" in addresses
     assert f"00000000:{port:04X}" not in addresses
