@@ -390,11 +390,16 @@ class Engine:
             yield from [member for member in relayed.members if isinstance(member, Subscriber)]
 
     def _visitor_failed(self, visitor: Visitor, reason: str) -> None:
+        """It is gone. What one asked for without a grant is recorded, although it did not wait for the answer."""
         visitor.close()
         self._forget_visitor(visitor)
         self.ports.left(visitor.host)
+        fields = visitor.fields
+        if fields and not reason and not self._not_all_is_stated():
+            reason = missing(self._table, visitor.key, visitor.host, fields)
         if reason:
-            self._reporter.refused(visitor.key, NOTHING, visitor.host, "", reason)
+            caller_id = fields.get("callerid", "")
+            self._reporter.refused(visitor.key, asked_for(fields), visitor.host, caller_id, reason)
 
     def _introduced(self, visitor: Visitor) -> None:
         if self._link is not None:
@@ -408,7 +413,7 @@ class Engine:
         reason = flaw(fields, rest)
         if not reason:
             reason = missing(self._table, visitor.key, visitor.host, fields)
-            if reason and (patient or self._table.restating or self.middle.preparing):
+            if reason and (patient or self._not_all_is_stated()):
                 visitor.wait(self._limits.grant_seconds, lambda: self._judge(visitor, patient=False))
                 self.waiting.setdefault(visitor.key, set()).add(visitor)
                 return
@@ -420,6 +425,10 @@ class Engine:
             self._subscribe(visitor, sock, kept(fields))
         else:
             self._serve_client(visitor, sock, kept(fields), rest)
+
+    def _not_all_is_stated(self) -> bool:
+        """Whether a grant that is missing may still be stated, however long that takes."""
+        return self._table.restating or self.middle.preparing
 
     def _judge_waiting(self, key: str) -> None:
         """Something new is stated of this incarnation: peers that can be served now are."""

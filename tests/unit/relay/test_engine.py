@@ -128,13 +128,29 @@ def test_nobody_is_refused_while_control_restates(world: World) -> None:
     assert "no grant" in world.gets_header(stranger)["error"]
 
 
-def test_a_peer_that_leaves_while_it_waits_leaves_nothing(world: World) -> None:
-    """Its place is free at once."""
+def test_a_peer_that_leaves_while_it_waits_leaves_its_refusal(world: World) -> None:
+    """Its place is free at once, and who asked for what without a grant is told all the same."""
     peer = world.connect(encode_header(ASK | {"callerid": "/late"}))
     world.until(lambda: world.engine.waiting)
     peer.sock.close()
     world.until(lambda: not world.engine.waiting and not world.engine.visitors)
     assert world.engine.ports.connected.total == 0
+    refused = world.hears(ConnectionRefused)
+    assert (refused.resource, refused.caller_id) == ("/chatter", "/late")
+    assert "no grant" in refused.reason
+
+
+def test_who_leaves_while_control_restates_was_not_refused(world: World) -> None:
+    """Nobody knows yet whether it has a grant."""
+    world.state(StateBegan(2))
+    world.state(NodePlaced("k", "/talker", LOOPBACK), world.port)
+    peer = world.connect(encode_header(ASK | {"callerid": "/late"}))
+    world.until(lambda: world.engine.waiting)
+    peer.sock.close()
+    world.until(lambda: not world.engine.visitors)
+    world.state(StateEnded(2))
+    world.connect(encode_header({"callerid": "/next"}))
+    assert world.hears(ConnectionRefused).caller_id == "/next"
 
 
 @pytest.mark.parametrize(
