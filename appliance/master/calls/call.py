@@ -29,13 +29,12 @@ T = TypeVar("T")
 class Parameter(Generic[T]):
     """One parameter of a call: its name in the ROS documentation, and how its value is made a canonical one.
 
-    `resource`: it names the topic, service or ROS parameter that a call with it is about. `recorded`: the record of a
-    command has it; it is a resolved name, short, and what a reviewer asks for.
+    `recorded`: it is a resolved name, short, and what a reviewer asks for: the record of a command has it, and a call
+    with a kind is about the first of them.
     """
 
     name: str
     canonicalise: Callable[[Value, str], T]
-    resource: bool = False
     recorded: bool = False
 
 
@@ -118,14 +117,14 @@ def _protocols(value: Value, _caller_id: str) -> list[list[Value]]:
     return protocols
 
 
-TOPIC = Parameter("topic", _name, resource=True)
+TOPIC = Parameter("topic", _name, recorded=True)
 TOPIC_TYPE = Parameter("topic_type", _type)
-SERVICE = Parameter("service", _name, resource=True)
+SERVICE = Parameter("service", _name, recorded=True)
 NODE = Parameter("node", _name, recorded=True)
 CALLER_API = Parameter("caller_api", _node_api)
 SERVICE_API = Parameter("service_api", _service_api)
 SUBGRAPH = Parameter("subgraph", _subgraph, recorded=True)
-KEY = Parameter("key", _key, resource=True, recorded=True)
+KEY = Parameter("key", _key, recorded=True)
 SEARCH_KEY = Parameter("key", _search_key, recorded=True)
 VALUE = Parameter("value", _parameter_value)
 MESSAGE = Parameter("msg", _text)
@@ -227,7 +226,7 @@ class Call(Generic[S]):
 
     method      what carries it out, and its parameters; the first line of its docstring is `system.methodHelp`
     verb        what it does, with a thing of this
-    kind        (None: it is about no single topic, service or ROS parameter)
+    kind        (None: it is decided by its name alone, whatever its parameters name)
     denial      the value of a denied answer: of the type the call returns, so that no client library stumbles over it
     identity    what is checked of the caller_id
     command     the name that the policy knows it by, where that is another (`policy/rights` says what it needs)
@@ -255,9 +254,9 @@ class Call(Generic[S]):
 
     def __post_init__(self) -> None:
         parameters = self.method.parameters
-        places = [place for place, parameter in enumerate(parameters) if parameter.resource]
+        places = [place for place, parameter in enumerate(parameters) if parameter.recorded]
         own = [place for place, parameter in enumerate(parameters) if parameter.name == "caller_api"]
-        object.__setattr__(self, "resource", places[0] if places else None)
+        object.__setattr__(self, "resource", None if self.kind is None else places[0])
         object.__setattr__(self, "api", own[0] if own else None)
         object.__setattr__(self, "policy_name", self.command or self.name)
         object.__setattr__(self, "category", category_of(self.policy_name))

@@ -12,8 +12,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.master.caller import ApiUri, Caller
-from appliance.master.calls.call import CALLER_API, KEY, SERVICE_API, Attempt, Call, Identity, Parameter, Verb
+from appliance.master.calls.call import (
+    CALLER_API,
+    KEY,
+    SERVICE_API,
+    TOPIC,
+    Attempt,
+    Call,
+    Identity,
+    Parameter,
+    Verb,
+    method,
+)
 from appliance.master.calls.gate import Contest, Gate, HostLimits
+from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registry import Incarnation, Kind, Registry, new_key
@@ -207,11 +219,18 @@ def test_a_call_that_makes_a_node_binds_its_name() -> None:
 
 
 def test_what_a_call_registers_another_gives_up() -> None:
-    """Each kind of thing has one call that registers it and one that gives it up; both are about a resource."""
+    """Each kind of thing has one call that registers it and one that gives it up."""
     assert {call.kind: call.name for call in ROWS if call.verb is Verb.REGISTER} == GRANTS
     assert {call.name: call.kind for call in ROWS if call.verb is Verb.UNREGISTER} == GIVES_UP
     assert {GIVES_UP[name]: (GRANTS[GIVES_UP[name]], name) for name in GIVES_UP} == CALLS
-    assert all((call.resource is None) == (call.kind is None) for call in ROWS)
+
+
+def test_a_command_records_what_it_names() -> None:
+    """A call without a kind is decided by its name alone, and its record has the topic that its parameter names."""
+    row = Call("countPublishers", method(LookupCalls.lookup_node, TOPIC), Verb.READ)
+    attempt = Attempt(Caller(Peer(HOST, str(HOST), "10.0.0.1"), NAME, 0), row, (THING,))
+    assert (attempt.request.category, attempt.request.resource) == (Category.COMMAND, "countPublishers")
+    assert attempt.about == {"topic": THING}
 
 
 def test_a_service_that_cannot_be_looked_up_cannot_be_called() -> None:
