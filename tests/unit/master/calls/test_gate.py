@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from appliance.master.caller import ApiUri, Caller
-from appliance.master.calls.call import Attempt
+from appliance.master.calls.call import CALLER_API, SERVICE_API, Attempt, Call, Identity
 from appliance.master.calls.gate import Contest, Gate, HostLimits, contested
 from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
@@ -161,6 +161,26 @@ def test_names_of_the_appliance_are_its_own_on_its_own_machine_too(
         itself = here.decide(Attempt(Caller(loopback, "/rosout", 0, own=True), call, given), {})
         assert isinstance(itself, Decision)
         assert itself.allowed is does
+
+
+@pytest.mark.parametrize(
+    "call",
+    [one for one in (*MASTER_CALLS.values(), *NODE_CALLS.values()) if one.identity is not Identity.NOBODY],
+    ids=lambda one: one.name,
+)
+def test_no_call_is_made_in_the_name_of_another_hosts_node(call: Call[Any]) -> None:
+    """Whatever the policy grants; what registers waits for whether the holder is still there."""
+    sections = ("Nodes", "Publishers", "Subscribers", "Services", "Clients", "Commands")
+    text = "".join(f"[{name}]\ndefault = *\n" for name in sections)
+    policy = compile_policy(f"{text}getRVState = *\nshutdownMaster = *\n", file="test.ini")
+    uri = f"http://{OPERATOR}:4000/"
+    own = ApiUri(uri, parse_node_uri(uri))
+    given = tuple(own if one in {CALLER_API, SERVICE_API} else "/thing" for one in call.method.parameters)
+    caller = Caller(Peer(ipaddress.ip_address(OPERATOR), OPERATOR, "10.0.0.1"), "/me", 0)
+    for host, may in ((OPERATOR, True), (ADMIN, False)):
+        here = Gate(lambda: policy, held("/me", host, own=False), HostLimits())
+        decision = here.decide(Attempt(caller, call, given), {})
+        assert (isinstance(decision, Decision) and decision.allowed) is may
 
 
 @pytest.mark.parametrize(("path", "allowed"), [(PUBLISHER_PATH, False), ("/", True)])

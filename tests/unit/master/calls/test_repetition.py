@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from appliance.master.calls.repetition import Repetitions
+from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registry import Kind
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.server import HttpRequest
@@ -33,6 +34,13 @@ QUESTIONS: list[tuple[str, tuple[Value, ...]]] = [
     ),
 ]
 PARTS = {"system.multicall": 2}
+
+
+def test_every_call_that_is_remembered_is_asked_here() -> None:
+    """A row that becomes `mirrored` is a question of these tests, too."""
+    assert {row.name for row in MASTER_CALLS.values() if row.mirrored} == {
+        one for one, _ in QUESTIONS
+    } - PARTS.keys()
 
 
 async def begun() -> ControlParts:
