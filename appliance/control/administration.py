@@ -49,7 +49,7 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     RecorderAwayError: "failed",
     NotSealedError: "failed",
 }
-_Orders = (
+Orders = (
     PolicyOrders | MonitorOrders | Tokens | RecordingOrders | EvidenceOrders
     | Hosts | SelfService | CheckedPorts | Certification
 )  # fmt: skip
@@ -67,7 +67,7 @@ class _Taken(NamedTuple):
 class Administration:
     """Carries out requests; `durable` waits until what was recorded is on disk, or cannot be."""
 
-    def __init__(self, looks: Looks, *orders: _Orders, durable: Callable[[], Awaitable[object]]) -> None:
+    def __init__(self, looks: Looks, *orders: Orders, durable: Callable[[], Awaitable[object]]) -> None:
         self._looks = looks
         self._durable = durable
         self._methods: dict[type, _Taken] = {}
