@@ -14,6 +14,13 @@ class Count(NamedTuple):
     last_drop: int
 
 
+class Told(NamedTuple):
+    """How often there was a verdict, and when last (nanoseconds)."""
+
+    times: int
+    last: int
+
+
 class Counts:
     """What walks at one place have done since it was last taken."""
 
@@ -32,18 +39,25 @@ class Counts:
             if count:
                 self._dropped[number] += count
                 self._last_drop[number] = time
+        for number, count in enumerate(walked.told):
+            if count:
+                self._told[number] = Told(self._told[number].times + count, time)
         return sum(walked.dropped)
 
-    def take(self) -> tuple[list[Count], dict[tuple[str, ...], int]]:
-        """The counts of all events, and of changed messages by the events that changed them; they begin anew."""
+    def take(self) -> tuple[list[Count], dict[tuple[str, ...], int], list[Told]]:
+        """The counts of all events, of changed messages by the events that changed them, and of all verdicts; they
+        begin anew.
+        """
         happened = self.walker.happened()
         counts = [Count(*each) for each in zip(happened, self._dropped, self._last_drop, strict=True)]
         changed = {self.walker.writers(who): count for who, count in self._changed.items()}
+        told = self._told
         self._clear()
-        return counts, changed
+        return counts, changed, told
 
     def _clear(self) -> None:
         self.begun = False
         self._changed: dict[int, int] = {}
         self._dropped = [0] * len(self.walker.events)
         self._last_drop = [0] * len(self.walker.events)
+        self._told = [Told(0, 0)] * len(self.walker.verdicts)

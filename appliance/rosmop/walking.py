@@ -18,11 +18,12 @@ from typing import Any, NamedTuple, Protocol
 
 from appliance.rosmop.compile.program import groups
 from appliance.rosmop.compile.specification import Compiled
-from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, POSITION, SOONER, Feed, FeedModule, module_of
+from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, POSITION, SOONER, TOLD, Feed, FeedModule, module_of
 from appliance.rosmop.ir.module import UNDO, Cells
 from appliance.rosmop.ir.values import Values, struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
+from appliance.rosmop.outcomes import Verdict
 from appliance.rosmop.runtime.context import Context
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.types import kinds
@@ -42,7 +43,7 @@ _LENGTH = struct.Struct("<I")
 _POSITION = struct.Struct("<II")
 _EFFECT = struct.Struct("<qq")
 _LOG = struct.Struct("<II8s")
-_PREPARED = struct.Struct("<qqq")
+_PREPARED = struct.Struct("<4q")
 _TIME = struct.Struct("<q")
 _CLOCK = struct.Struct("<qq")
 _NEVER = (1 << 63) - 1  # comes after every time, so that output is due
@@ -53,25 +54,28 @@ class Walked(NamedTuple):
 
     `position` is where the first message begins that is left; `run` where what goes on unchanged begins (behind the
     last dropped message). `dropped` are counts for each of the walker's events, if any was; `changed` has a set of
-    events (see `Walker.writers`) and how many messages they changed together, for each run of such messages. `sooner`:
-    something is due earlier than it was.
+    events (see `Walker.writers`) and how many messages they changed together, for each run of such messages. `told` are
+    counts for each of the walker's verdicts, if there was any. `sooner`: something is due earlier than it was.
     """
 
     position: int
     run: int
     dropped: Sequence[int]
     changed: Sequence[tuple[int, int]]
+    told: Sequence[int] = ()
     sooner: bool = False
 
 
 class Prepared(NamedTuple):
     """What holds for all walks of a topic until the engine, or anything else, has done something: the sender of
-    the messages; bits of `told` (and whether no message may be changed) and of `enabled`, as the module takes them.
+    the messages; bits of `told` (and whether no message may be changed), `enabled` and `counted`, as the module takes
+    them.
     """
 
     source: int
     told: int
     enabled: int
+    counted: int
 
 
 class Due(Protocol):
@@ -118,9 +122,7 @@ class Home:
             self._enter()
         self.prepared = prepared
         self.machine.refuel(FUEL)
-        _PREPARED.pack_into(
-            self._memory, self._source, prepared.source << 32, prepared.told, prepared.enabled
-        )
+        _PREPARED.pack_into(self._memory, self._source, prepared.source << 32, *prepared[1:])
 
     def _enter(self) -> None:
         states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
@@ -192,8 +194,13 @@ class Walker:
         self._frames = module.frames
         self._effects = module.effects + _EFFECT.size
         self._home = home
+        self.verdicts = tuple(
+            _verdict(monitors[event], place, category) for event, place, category in feed.verdicts
+        )
+        """The verdicts that it may come to, not explained."""
         self._counts = struct.Struct(f"<{len(events)}q")
-        self._drops_before: Sequence[int] = (0,) * len(events)
+        self._later = struct.Struct(f"<{len(events) + len(feed.verdicts)}q")
+        self._before: Sequence[int] = (0,) * (len(events) + len(feed.verdicts))
         self._call = home.machine.function(feed.name)
 
     def writers(self, who: int) -> tuple[str, ...]:
@@ -213,13 +220,15 @@ class Walker:
                 return False
         return True
 
-    def prepare(self, *, loud: bool, told: Sequence[bool], source: int = 0) -> Prepared:
-        """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none.
-        Good until the engine is asked for anything.
+    def prepare(
+        self, *, loud: bool, told: Sequence[bool], counted: Sequence[bool] = (), source: int = 0
+    ) -> Prepared:
+        """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none,
+        `counted` for each verdict whether there may be more. Good until the engine is asked for anything.
         """
         bits = sum(1 << number for number, one in enumerate(told) if one) - (LOUD if loud else 0)
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
-        return Prepared(source, bits, enabled)
+        return Prepared(source, bits, enabled, sum(1 << number for number, one in enumerate(counted) if one))
 
     def walk(  # noqa: PLR0917  called for every batch: keywords would cost a tenth of it
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
@@ -255,7 +264,8 @@ class Walker:
             if answer >= LEFT or position == len(view) or sooner:
                 if sooner:
                     self._home.hasten()
-                return Walked(position, run, self._dropped() if run != begun else (), changed, sooner)
+                dropped, told = self._counted() if run != begun or answer & TOLD else ((), ())
+                return Walked(position, run, dropped, changed, told, sooner)
 
     def take(self, message: Buffer, time_ns: int, source: int = 0) -> Sequence[str] | None:
         """Take a message of which nothing is to be told but which events happened: they. None if it is left.
@@ -280,6 +290,7 @@ class Walker:
         area = self._memory[self._frames : self._frames + BEGINNING]
         changed: list[tuple[int, int]] = []
         dropped: Sequence[int] = ()
+        told: Sequence[int] = ()
         sooner = False
         while position < len(view) and not sooner:
             following = position + 4 + _LENGTH.unpack_from(view, position)[0]
@@ -293,6 +304,7 @@ class Walker:
             if not walked.position:
                 break
             sooner = walked.sooner
+            told = _sums(told, walked.told)
             if walked.changed:
                 view[position + 4 : position + size] = area[4:size]
                 changed += walked.changed
@@ -300,9 +312,9 @@ class Walker:
                 if position > run:
                     pieces.append(view[run:position])
                 run = following
-                dropped = [sum(counts) for counts in zip_longest(dropped, walked.dropped, fillvalue=0)]
+                dropped = _sums(dropped, walked.dropped)
             position = following
-        return Walked(position, run, dropped, changed, sooner)
+        return Walked(position, run, dropped, changed, told, sooner)
 
     def _carry_out(self, count: int, changed: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Note what was changed; from where to where frames were dropped."""
@@ -319,7 +331,7 @@ class Walker:
         """What the module would have answered where it was stopped: the message that it looked at is left."""
         self._home.machine.refuel(FUEL)
         at, effect = _POSITION.unpack_from(self._memory, POSITION)
-        return int(at | (effect + _EFFECT.size - self._effects) // _EFFECT.size << 32 | LEFT)
+        return int(at | (effect + _EFFECT.size - self._effects) // _EFFECT.size << 32 | LEFT | TOLD)
 
     def _undo(self) -> None:
         """Take back what was done to the message that is left."""
@@ -330,11 +342,22 @@ class Walker:
         for at, size, old in [*_LOG.iter_unpack(memory[self._feed.log : end])][::-1]:
             memory[at : at + size] = old[:size]
 
-    def _dropped(self) -> Sequence[int]:
-        """How many messages each event has dropped since this was last asked."""
-        counts = self._counts.unpack_from(self._memory, self._feed.counters + self._counts.size)
-        before, self._drops_before = self._drops_before, counts
-        return [now - then for now, then in zip(counts, before, strict=True)]
+    def _counted(self) -> tuple[Sequence[int], Sequence[int]]:
+        """How many messages each event has dropped, and how often there was each verdict, since this was last asked."""
+        counts = self._later.unpack_from(self._memory, self._feed.counters + self._counts.size)
+        before, self._before = self._before, counts
+        more = [now - then for now, then in zip(counts, before, strict=True)]
+        return more[: len(self.events)], more[len(self.events) :]
+
+
+def _sums(one: Sequence[int], other: Sequence[int]) -> Sequence[int]:
+    return [sum(counts) for counts in zip_longest(one, other, fillvalue=0)]
+
+
+def _verdict(monitor: Monitor, place: int, handler: int) -> Verdict:
+    code = monitor.properties[place].code
+    source = code.property.source
+    return Verdict(monitor.name, monitor.properties[place].index, source.logic, code.order[handler], source)
 
 
 class Walks(NamedTuple):

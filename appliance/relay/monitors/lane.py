@@ -173,6 +173,7 @@ class Lane:
             prepared = self._prepared = walker.prepare(
                 loud=walker.changes and telling.shows(place),
                 told=[not telling.hides_drop(one, place) for one in walker.monitors] if walker.drops else (),
+                counted=[telling.hides_verdict(one, place) for one in walker.verdicts],
                 source=self._source,
             )
         if counts is None or counts.walker is not walker:

@@ -71,6 +71,10 @@ class Telling:
         """Whether the next drop of a monitor at a place is only counted."""
         return self._observations.told("drop", monitor, place)
 
+    def hides_verdict(self, verdict: Verdict, place: Place) -> bool:
+        """Whether the next such verdict at a place is only counted."""
+        return self._observations.told("verdict", verdict.monitor, place, _which(verdict))
+
     def asks(self, verdict: Verdict, source: int) -> bool:
         """Whether a verdict is told in full, and so explained: as many as `_EXPLAINED` in a second are."""
         place = self.senders.place(source) or NOWHERE
@@ -224,7 +228,7 @@ class Telling:
         """Take what lanes have counted: events, and drops and changes beyond the first."""
         for owed in self._owed:
             walker, place = owed.walker, owed.place
-            counts, changed = owed.take()
+            counts, changed, told = owed.take()
             for number, count in enumerate(counts):
                 events, monitor = walker.events[number], walker.monitors[number]
                 self._happened[events] = self._happened.get(events, 0) + count.happened
@@ -232,6 +236,17 @@ class Telling:
                     self._counter(monitor).drops += count.dropped
                     self._observations.add(
                         f"{self._prefix}drop", monitor, place, count.last_drop, count.dropped
+                    )
+            for verdict, (times, last) in zip(walker.verdicts, told, strict=True):
+                if times:
+                    self._counter(verdict.monitor).verdicts += times
+                    self._observations.add(
+                        f"{self._prefix}verdict",
+                        verdict.monitor,
+                        place,
+                        last,
+                        times,
+                        distinction=_which(verdict),
                     )
             for writers, messages in changed.items():
                 self._again[writers, place] = self._again.get((writers, place), 0) + messages

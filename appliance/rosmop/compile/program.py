@@ -100,9 +100,18 @@ def _event(
         compiled, handlers = code.property, set(code.order)
         if isinstance(compiled, FiniteProperty):
             automaton = compiled.automaton
-            quiet = [handlers.isdisjoint(verdict) for verdict in automaton.verdicts]
-            table = tuple(row[index] if quiet[row[index]] else -1 for row in automaton.table)
-            advances.append(form.Advance(properties.index((number, each)), table, index))
+            handled = tuple(
+                form.Handled(
+                    category,
+                    code.handlers[category],
+                    frozenset(state for state, told in enumerate(automaton.verdicts) if category in told),
+                )
+                for category in code.order
+            )
+            table = tuple(row[index] for row in automaton.table)
+            advances.append(
+                form.Advance(properties.index((number, each)), table, index, None, handled, automaton.initial)
+            )
         elif isinstance(compiled, ClockedProperty):
             quiet = [handlers.isdisjoint(verdict) for verdict in compiled.verdicts]
             table, late = (

@@ -8,12 +8,14 @@ Python.
 - A message is either done, with all that follows from it, or left, and then `Feed.undo` says how to take back what was
   begun. After a trap the message that is left begins at the number that stands at `POSITION`.
 - What holds for all messages stands at `Cells.source`: their sender; of which events (bit N for the topic's event N)
-  a drop is left, and with `LOUD` a change is (*told*); bits of the topic's specifications (*enabled*).
+  a drop is left, and with `LOUD` a change is (*told*); bits of the topic's specifications (*enabled*), and of which
+  verdicts (bit N for `Feed.verdicts[N]`) are only counted (*counted*): what comes to another is left.
 - An effect is 16 bytes: a set of events (i64) that changed so many (i64) messages on end, or -1 and from where to
   where (i32, i32) frames were dropped.
 - Where a message brings a property with a clock to a deadline before the time at `Cells.until`, the walk ends behind it
   with `SOONER`.
-- An event that happened is counted at `Feed.counters`, its drops behind those of all.
+- An event that happened is counted at `Feed.counters`, its drops behind those of all, and behind these the verdicts;
+  with `TOLD` there were some.
 """
 
 import struct
@@ -27,10 +29,12 @@ from appliance.rosmop.ir.module import (
     ELSEWHERE,
     HAPPENED,
     NOW,
+    RESET,
     UNDO,
     Cells,
     NotScalarError,
     Writer,
+    Written,
 )
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.ir.wasm import (
@@ -60,8 +64,10 @@ AREA = 512 << 10
 
 LEFT = 1 << 62
 SOONER = 1 << 61
+TOLD = 1 << 60
 LOUD = 1 << 63
 MAX_EVENTS = 63
+MAX_VERDICTS = 63
 MAX_EFFECTS = 4096
 MAX_TABLES = 8 << 20
 """Bytes that the tables of all properties of a set may take."""
@@ -77,17 +83,20 @@ _BR, _BR_IF, _LOOP, _BLOCK = b"\x0c", b"\x0d", b"\x03\x40", b"\x02\x40"
 class Feed:
     """The walk for one topic: the name of its export, which events may drop or change, where events are counted.
 
-    `log` is where the log of patches begins, `undo` the addresses of variables and of what they held before the message
-    that is left. `brief`: it has no loops.
+    `verdicts` have the place of an event, of its step of a property, and of the handler. `log` is where the log of
+    patches begins, `undo` the addresses of variables and of what they held before the message that is left. `brief`:
+    it has no loops. `functions` are the numbers of those of the events in the module.
     """
 
     name: str
     droppers: frozenset[int]
     writers: frozenset[int]
+    verdicts: Sequence[tuple[int, int, int]]
     counters: int
     log: int
     undo: tuple[tuple[int, int], ...]
     brief: bool
+    functions: Sequence[int]
 
 
 @dataclass(frozen=True)
@@ -122,7 +131,7 @@ def module_of(
     for component in components:
         variables = (*component.variables, *component.noted)
         room = component.properties + len(variables)
-        base, source, until = writer.take(8 * room), writer.take(24), writer.take(8)
+        base, source, until = writer.take(8 * room), writer.take(32), writer.take(8)
         cells.append(Cells(base, component.properties, source, frozenset(component.noted), until=until))
         shared |= dict.fromkeys(variables, cells[-1])
     effects = writer.take(16 * (MAX_EFFECTS + 2))
@@ -194,16 +203,20 @@ class _Walk:
         self._cells = cells
         self._events = events
         self._effects = effects
+        self._writer = writer
         self._written = [writer.event(event.function) for event in events]
         self._known_tables = tables
-        self._tables = [[tables.address(each.table) for each in event.advances] for event in events]
-        for event, written in zip(events, self._written, strict=True):
-            if not written.passes and any(max(each.table) < 0 for each in event.advances):
-                raise NotScalarError("a verdict with each message")
+        self._handlers: dict[tuple[int | None, int], tuple[int, Written | None]] = {}
+        self.verdicts: list[tuple[int, int, int]] = []
+        self._tables = [
+            [self._table(number, place) for place in range(len(event.advances))]
+            for number, event in enumerate(events)
+        ]
+        functions = [*self._written, *self._run()]
         self._budgets = sorted({writer.budget(writer.functions[event.function].context) for event in events})
-        self._counters = writer.take(16 * len(events))
+        self._counters = writer.take(16 * len(events) + 8 * len(self.verdicts))
         assigned = sorted(
-            {name for written in self._written for name in written.assigned}.difference(cells.noted)
+            {name for written in functions for name in written.assigned}.difference(cells.noted)
         )
         self._undo = tuple((cells.variables[name][0], writer.take(8)) for name in assigned)
         self._log = writer.take(16 * sum(written.writes for written in self._written))
@@ -225,23 +238,69 @@ class _Walk:
         clocked = sorted(properties.intersection(cells.clocks))
         self._clocks = {number: self._following + 3 + 3 * place for place, number in enumerate(clocked)}
         """The locals of each property with a clock for what stands at `Cells.clocks`, and its number of steps."""
+        self._telling = self._following + 3 + 3 * len(clocked)
+        """The first of the locals of handlers."""
 
     def feed(self, name: str) -> Feed:
         """What is said about it."""
         return Feed(
             name,
-            frozenset(number for number, written in enumerate(self._written) if written.drops),
+            frozenset(number for number in range(len(self._events)) if self._drops(number)),
             frozenset(number for number, written in enumerate(self._written) if written.writes),
+            self.verdicts,
             self._counters,
             self._log,
             self._undo,
-            all(written.brief for written in self._written),
+            all(written.brief for written in (*self._written, *self._run())),
+            [written.number for written in self._written],
         )
+
+    def _run(self) -> list[Written]:
+        """The handlers that run here."""
+        return [written for _, written in self._handlers.values() if written is not None]
+
+    def _drops(self, number: int) -> bool:
+        run = [written for advance in self._events[number].advances for _, written in self._handled(advance)]
+        return any(written.drops for written in (self._written[number], *run))
+
+    def _table(self, number: int, place: int) -> int | None:
+        """Where the table of a step stands (-1: that handler does not run here), None where it does nothing."""
+        advance = self._events[number].advances[place]
+        left: set[int] = set()
+        for index, handled in enumerate(advance.handlers):
+            key = advance.property, index
+            if key not in self._handlers and not handled.states.isdisjoint(advance.table):
+                try:
+                    written = self._writer.event(handled.function)
+                except (NotScalarError, RecursionError):
+                    written = None
+                if len(self.verdicts) == MAX_VERDICTS:
+                    written = None
+                self._handlers[key] = len(self.verdicts), written
+                self.verdicts += [(number, place, index)] if written is not None else []
+            if key in self._handlers and self._handlers[key][1] is None:
+                left |= handled.states
+        table = tuple(-1 if state in left else state for state in advance.table)
+        if not self._written[number].passes and max(table) < 0:
+            raise NotScalarError("a verdict with each message")
+        idle = advance.clock is None and not self._handled(advance) and table == tuple(range(len(table)))
+        return None if idle else self._known_tables.address(table)
+
+    def _handled(self, advance: form.Advance) -> dict[tuple[int, Written], frozenset[int]]:
+        """The verdicts that a step may come to here, with what their handlers do, and the states of each."""
+        found = {}
+        for index, handled in enumerate(advance.handlers):
+            verdict, written = self._handlers.get((advance.property, index), (0, None))
+            if written is not None and not handled.states.isdisjoint(advance.table):
+                found[verdict, written] = handled.states
+        return found
 
     def code(self) -> bytes:
         """The function."""
         here = _get(_AT) + b"\xad" + load(I32, EFFECT) + constant(I32, self._effects) + _SUB
         here += constant(I32, 4) + b"\x76\xad" + constant(I64, 32) + _SHL64 + _OR64
+        if self.verdicts:
+            here += _get(self._telling + 2) + b"\xad" + constant(I64, TOLD.bit_length() - 1) + _SHL64 + _OR64
         body = [
             store(I64, NOW, _get(_NOW)),
             store(I32, EFFECT, constant(I32, self._effects)),
@@ -249,6 +308,7 @@ class _Walk:
             _set(_ENABLED, load(I64, self._cells.source + 16)),
             *(_set(local, load(I32, self._state(number))) for number, local in self._states.items()),
             *(_set(local, load(I64, at)) for local, at in self._clock_cells()),
+            _set(self._telling + 1, load(I64, self._cells.source + 24)) if self.verdicts else b"",
             self._begin(), _BLOCK, _BLOCK, _LOOP,
             self._frame(),
             _BLOCK, _BLOCK,
@@ -262,7 +322,8 @@ class _Walk:
             here, constant(I64, LEFT), _OR64, END,
         ]  # fmt: skip
         numbered = [I32] * (len(self._events) + len(self._states) + 3)
-        made = [I64, I64, I32, I32, I64, I32, *numbered, *[I64] * 3 * len(self._clocks)]
+        made = [I64, I64, I32, I32, I64, I32, *numbered, *[I64] * (3 * len(self._clocks) + 2)]
+        made += [I32] * (4 + len(self.verdicts))  # see `_handle`
         whole = row([b"\x01" + bytes((machine,)) for machine in made]) + b"".join(body)
         return unsigned(len(whole)) + whole
 
@@ -321,20 +382,25 @@ class _Walk:
             code += changed + loud + _AND + left
             code += _set(_WHO, _get(_WHO) + changed + b"\xad" + constant(I64, number) + _SHL64 + _OR64)
         if written.drops:
-            dropped = self._is(bits, DROPPED) + b"\x41\x00\x47"
-            hidden = _get(_TOLD) + constant(I64, 1 << number) + _AND64 + _EQZ64
-            code += dropped + hidden + _EQZ + _AND + left
-            code += (
-                self._count(len(self._events) + number, dropped) + self._is(bits, DROPPED) + _BR_IF + b"\x01"
-            )
+            code += self._drop(number, self._is(bits, DROPPED))
+        gone = self._telling + 3
         steps = [
             self._advance(each, table)
             for each, table in zip(event.advances, self._tables[number], strict=True)
-            if each.clock is not None or any(target != state for state, target in enumerate(each.table))
+            if table is not None
         ]
         if steps:
             code += self._is(bits, HAPPENED) + IF + NOTHING + b"".join(steps) + END
+        if any(written.drops for each in event.advances for _, written in self._handled(each)):
+            code = _set(gone, constant(I32, 0)) + code + self._drop(number, _get(gone))
         return code + END
+
+    def _drop(self, number: int, condition: bytes) -> bytes:
+        """The way of the message ends where a condition is not 0 (dropped: 1, left: 5)."""
+        dropped = condition + b"\x41\x00\x47"
+        hidden = _get(_TOLD) + constant(I64, 1 << number) + _AND64 + _EQZ64
+        code = dropped + hidden + _EQZ + _AND + _BR_IF + b"\x05"
+        return code + self._count(len(self._events) + number, dropped) + condition + _BR_IF + b"\x01"
 
     def _is(self, bits: int, which: int) -> bytes:
         return _get(bits) + constant(I32, which) + _AND
@@ -359,7 +425,36 @@ class _Walk:
             code += _get(room) + value + b"\x37\x00" + unsigned(exits + offset)
         if self._stamped:
             code += _get(room) + _get(_AT) + b"\x28\x00\x04\x36\x00" + unsigned(exits + 16)
-        return code + _set(state, _get(following)) + END
+        code += _set(state, _get(following)) + END
+        return code + self._handle(advance, state) if self._handled(advance) else code
+
+    def _handle(self, advance: form.Advance, state: int) -> bytes:
+        """Run the handlers of the state that was entered, in their order; then the property may begin anew.
+
+        Blocks from here: the `if` of the event's steps and of the event, ..., left (6).
+        """
+        handlers = self._handled(advance)
+        which, counted, _, gone, anew, some = range(self._telling, self._telling + 6)
+        masks = [0] * len(advance.table)
+        for (verdict, _), states in handlers.items():
+            for each in states:
+                masks[each] |= 1 << verdict
+        table = self._known_tables.address(tuple(masks), "q")
+        code = _set(which, _get(state) + constant(I32, 3) + b"\x74\x29\x00" + unsigned(table))
+        code += _get(which) + _EQZ64 + _EQZ + IF + NOTHING
+        code += _get(which) + _get(counted) + _AND64 + _get(which) + b"\x52" + _BR_IF + b"\x07"
+        code += _set(anew, constant(I32, 0)) + _set(some, constant(I32, 1))
+        bits, message = self._following, _get(_AT) + constant(I32, 4) + _ADD + _get(_SIZE)
+        for verdict, written in handlers:
+            code += _get(which) + constant(I64, 1 << verdict) + _AND64 + _EQZ64 + _EQZ + IF + NOTHING
+            code += _set(bits, message + b"\x10" + unsigned(written.number))
+            code += self._is(bits, ELSEWHERE) + _BR_IF + b"\x08"
+            for kept, bit in ((gone, DROPPED), (anew, RESET)):
+                code += _set(kept, _get(kept) + self._is(bits, bit) + b"\x72")
+            count = some + 1 + verdict
+            code += _set(count, _get(count) + constant(I32, 1) + _ADD) + END
+        again = _get(anew) + IF + NOTHING + _set(state, constant(I32, advance.initial)) + END
+        return code + again + END
 
     def _advance_clock(self, number: int, clock: form.Clock, event: int, table: int) -> bytes:
         """The same of a property with a clock, as `ClockedRun` and `ClockedSteps` do it."""
@@ -464,6 +559,15 @@ class _Walk:
             store(I32, self._state(number), _get(local)) for number, local in self._states.items()
         )
         code += b"".join(store(I64, at, _get(local)) for local, at in self._clock_cells())
+        if self.verdicts:
+            _, _, ever, _, _, some = range(self._telling, self._telling + 6)
+            code += _get(some) + IF + NOTHING
+            for verdict in range(len(self.verdicts)):
+                count = some + 1 + verdict
+                code += self._count(2 * len(self._events) + verdict, _get(count)) + _set(
+                    count, constant(I32, 0)
+                )
+            code += _set(some, constant(I32, 0)) + _set(ever, constant(I32, 1)) + END
         code += _set(_AT, _get(_NEXT)) + self._begin()
         return code + (_get(self._sooner) + _BR_IF + b"\x01" if self._clocks else b"")
 

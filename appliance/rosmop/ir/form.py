@@ -653,17 +653,28 @@ class Clock:
 
 
 @dataclass(frozen=True, slots=True)
+class Handled:
+    """The states of a property in which the handler of a category runs when they are entered, also from themselves."""
+
+    category: str
+    function: str
+    states: frozenset[int]
+
+
+@dataclass(frozen=True, slots=True)
 class Advance:
-    """What an event does to a property: the next state for each of its states; -1 where a handler runs then, or where
-    the property has no table of states. `property` is its number among those with tables; None without one. `event` is
-    the event's number in its specification. With a `clock` there is twice the next state, and one more where it begins
-    anew.
+    """What an event does to a property: the next state for each of its states, -1 where the property has no table of
+    states. `property` is its number among those with tables; None without one. `event` is the event's number in its
+    specification. `handlers` run in their order, and may have it begin anew in its state `initial`. With a `clock`
+    there is twice the next state, and one more where it begins anew; -1 where a handler runs.
     """
 
     property: int | None
     table: tuple[int, ...]
     event: int = 0
     clock: Clock | None = None
+    handlers: tuple[Handled, ...] = ()
+    initial: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ address of a table that says where each begins.
 
 `Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
 
-- An event takes where the message is in the memory and its size (i32, i32), and returns bits (i32): `HAPPENED`,
-  `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`.
+- An event, and the handler of a verdict, takes where the message is in the memory and its size (i32, i32), and returns
+  bits (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`, `RESET`.
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
   it is taken back. Within a helper function it is a trap. Beyond are strings and vectors that are made, changed or
   kept, whole messages, what is put out or published, recursion, `sin` and its like. An event of which no message can
@@ -56,7 +56,7 @@ from appliance.rosmop.runtime.wire import FEW, MAX_EMPTY
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
-HAPPENED, DROPPED, CHANGED, ELSEWHERE = 1, 2, 4, 8
+HAPPENED, DROPPED, CHANGED, ELSEWHERE, RESET = 1, 2, 4, 8, 16
 
 UNDO, NOW, FIRST = 8, 16, 24
 """Where the end of the log and the time stand, and what is given out begins."""
@@ -204,7 +204,7 @@ class Writer:
         return self.throttles[context, site]
 
     def event(self, name: str) -> Written:
-        """The function of an event. Raises `NotScalarError`."""
+        """The function of an event, or of a handler. Raises `NotScalarError`."""
         function = self.functions[name]
         return self.function(function, {"at": I32, "size": I32}, I32, function.context)
 
@@ -238,7 +238,8 @@ class _Body:
         self._writer = writer
         self._function = function
         self._result = result
-        self._is_event = isinstance(function, form.Function) and function.happens is not None
+        self._answers = isinstance(function, form.Function) and function.parameters == ("m",)
+        self._is_handler = self._answers and function.happens is None  # type: ignore[union-attr]  # has looked
         self._context = context
         self._types = tuple(parameters.values())
         self._locals = {name: (index, kind) for index, (name, kind) in enumerate(parameters.items())}
@@ -249,15 +250,20 @@ class _Body:
         self._writes = 0
         self._drops = False
         self._brief = True
-        if self._is_event:
-            self._local("dropped", I32)
-            self._local("changed", I32)
+        self._bits: tuple[tuple[str, int], ...] = ()
+        """What is answered besides whether it happened: the local variables, and how far each is shifted."""
+        if self._answers:
+            self._bits = (("dropped", 1), ("changed", 2), *([("reset", 4)] if self._is_handler else ()))
+        for name, _ in self._bits:
+            self._local(name, I32)
 
     def written(self) -> Written:
         """The function. Raises `NotScalarError`."""
         body = self._block(self._function.body)
         if isinstance(self._function, form.Skipper):
             body += self._position(self._function.end) + RETURN
+        if self._is_handler:
+            body += self._leave(form.Leave(-1, None))
         made = sorted(self._locals.values())[len(self._types) :]
         whole = row([b"\x01" + bytes((machine,)) for _, machine in made]) + body + UNREACHABLE + END
         return Written(
@@ -293,7 +299,7 @@ class _Body:
         return test + IF + NOTHING + inner + END
 
     def _elsewhere(self) -> bytes:
-        return constant(I32, ELSEWHERE) + RETURN if self._is_event else UNREACHABLE
+        return constant(I32, ELSEWHERE) + RETURN if self._answers else UNREACHABLE
 
     def _cell(self, opcode: int, address: int, value: bytes = b"") -> bytes:
         """Load or store at an address."""
@@ -396,9 +402,10 @@ class _Body:
         return self._value(node.value) + RETURN
 
     def _leave(self, node: form.Leave) -> bytes:
-        dropped = self._get("dropped") + constant(I32, 1) + b"\x74"
-        changed = self._get("changed") + constant(I32, 2) + b"\x74"
-        return constant(I32, bool(node.happened)) + dropped + b"\x72" + changed + b"\x72" + RETURN
+        code = constant(I32, bool(node.happened))
+        for name, shift in self._bits:
+            code += self._get(name) + constant(I32, shift) + b"\x74\x72"
+        return code + RETURN
 
     def _charge(self, node: form.Charge) -> bytes:
         return self._spend(constant(I64, node.instructions))
@@ -428,6 +435,9 @@ class _Body:
     def _drop(self, _node: form.Drop) -> bytes:
         self._drops = True
         return constant(I32, 1) + self._set("dropped")
+
+    def _reset(self, _node: form.Reset) -> bytes:
+        return constant(I32, 1) + self._set("reset")
 
     def _read_value(self, node: form.ReadValue) -> bytes:
         place, count, start = f"place of {node.name}", f"count of {node.name}", node.at

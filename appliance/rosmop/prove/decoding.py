@@ -145,8 +145,8 @@ class _Reader:
         raise UnknownInstructionError(f"the instruction {code:#04x}")
 
 
-def functions_of(module: bytes) -> tuple[list[Code], dict[str, int]]:
-    """The functions of a module without imports, and the numbers of those that it exports.
+def functions_of(module: bytes) -> list[Code]:
+    """The functions of a module without imports.
 
     Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` where the module ends too early.
     """
@@ -154,20 +154,16 @@ def functions_of(module: bytes) -> tuple[list[Code], dict[str, int]]:
     reader.take(8)
     types: list[tuple[tuple[str, ...], tuple[str, ...]]] = []
     chosen: list[int] = []
-    exports: dict[str, int] = {}
     found: list[Code] = []
     while reader.at < len(module):
         section, size = reader.byte(), reader.unsigned()
         end = reader.at + size
-        for _ in range(reader.unsigned() if section in (1, 3, 7, 10) else 0):
+        for _ in range(reader.unsigned() if section in (1, 3, 10) else 0):
             if section == 1:
                 reader.byte()
                 types.append((reader.types(), reader.types()))
             elif section == 3:
                 chosen.append(reader.unsigned())
-            elif section == 7:
-                name, kind, number = reader.take(reader.unsigned()).decode(), reader.byte(), reader.unsigned()
-                exports |= {name: number} if not kind else {}
             else:
                 reader.unsigned()
                 parameters, results = types[chosen[len(found)]]
@@ -177,4 +173,4 @@ def functions_of(module: bytes) -> tuple[list[Code], dict[str, int]]:
                     made += [_TYPES[reader.byte()]] * count
                 found.append(Code(parameters, results[0], tuple(made), reader.block()[0]))
         reader.at = end
-    return found, exports
+    return found

@@ -22,7 +22,7 @@ from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.feed import AREA, FeedModule, module_of
 from appliance.rosmop.ir.values import Values
-from appliance.rosmop.prove.decoding import Instruction, functions_of
+from appliance.rosmop.prove.decoding import functions_of
 from appliance.rosmop.prove.form_terms import Meaning, wrapped
 from appliance.rosmop.prove.module_terms import Done, Execution
 from appliance.rosmop.prove.terms import (
@@ -104,16 +104,15 @@ class Validation:
         self._module = module
         self._clock = clock
         self._patience = patience
-        self.codes, self._exports = functions_of(module.code)
+        self.codes = functions_of(module.code)
 
     def finding(self, topic: str, event: str, function: str, place: int) -> Finding:
         """What is known of the event that is at this place among those of a topic."""
         feed = self._module.feeds.get(topic)
         if feed is None:
             return Finding(topic, event, IN_PYTHON)
-        numbers = list(_called(self.codes[self._exports[feed.name]].body))
         try:
-            return Finding(topic, event, self._compared(function, numbers[place], topic))
+            return Finding(topic, event, self._compared(function, feed.functions[place], topic))
         except DiffersError as error:
             return Finding(topic, event, f"not equal: {error}", differs=True)
         except NotProvedError as error:
@@ -222,15 +221,6 @@ class Validation:
         taken_back = {address for address, _ in self._module.feeds[topic].undo}
         for address in sorted(done.stored - taken_back - set(self._module.budgets.values())):
             raise DiffersError(f"what it writes at {address} is not taken back")
-
-
-def _called(instructions: Sequence[Instruction]) -> Iterator[int]:
-    """The functions that are called, in the order of the text."""
-    for each in instructions:
-        if each.name == "call":
-            yield int(each.operands[0])
-        yield from _called(each.body)
-        yield from _called(each.otherwise)
 
 
 def _holds(conditions: Sequence[Term], guess: Any) -> bool:

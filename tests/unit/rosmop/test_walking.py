@@ -14,7 +14,7 @@ from appliance.rosmop.engine import MonitorSet, OnFault
 from appliance.rosmop.ir.feed import AREA, MAX_EFFECTS
 from appliance.rosmop.ir.module import MOST_TEXTS
 from appliance.rosmop.logics.interface import ClockedRun, FiniteRun
-from appliance.rosmop.outcomes import Outcome, Verdict
+from appliance.rosmop.outcomes import Outcome, Verdict, named
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walking import BEGINNING, Walker
@@ -54,6 +54,10 @@ class Fed:
         """Each verdict, and why, in order."""
         self.interpreted: list[Verdict] = []
         """The same of the interpreter."""
+        self.counts: Counter[str] = Counter()
+        """How often there was each verdict, whoever came to it."""
+        self.counting = False
+        """Whether verdicts are only counted."""
         self._inside = False
         """Whether messages stand in the module's memory, every other time."""
 
@@ -66,6 +70,7 @@ class Fed:
     def check(self, bodies: list[bytes], topic: str = "/plain", time: int = 1) -> list[bytes]:
         """Fail if messages that come together make a difference; what goes on."""
         expected = []
+        began, self.counts = len(self.interpreted), Counter()
         for body in bodies:
             outcome = self.interpreter.process(topic, bytearray(body), time)
             self.interpreted += (one for each in (*outcome.before, outcome) for one in each.verdicts)
@@ -73,7 +78,12 @@ class Fed:
             if outcome.result != "dropped":
                 expected.append(bytes(outcome.buffer))
         self._inside = not self._inside
+        told = len(self.told)
         assert self._fed(frames(bodies), topic, time) == frames(expected)
+        assert self.counts + Counter(map(named, self.told[told:])) == Counter(
+            map(named, self.interpreted[began:])
+        )
+        assert self.counting or self.told[told:] == self.interpreted[began:]
         assert self.state() == _state(self.interpreter)
         return expected
 
@@ -92,7 +102,11 @@ class Fed:
         while position < len(view):
             if walker is not None and self.monitors.walks(walker, time):
                 before = position
-                walked = walker.walk(view, position, run, pieces, time, walker.prepare(loud=False, told=()))
+                counted = [self.counting] * len(walker.verdicts)
+                prepared = walker.prepare(loud=False, told=(), counted=counted)
+                walked = walker.walk(view, position, run, pieces, time, prepared)
+                for verdict, count in zip(walker.verdicts, walked.told if walked else (), strict=False):
+                    self.counts[named(verdict)] += count
                 position, run = (len(view), run) if walked is None else (walked.position, walked.run)
                 self.came["together"] += position > before
                 if position == len(view):
@@ -146,6 +160,7 @@ def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> Non
     messages = Messages(seed)
     for number in range(4):
         traffic = messages.traffic()
+        fed.counting = bool(seed + number & 2)
         fed.check([*traffic.bodies(), *wild], traffic.topic, number)
 
 
@@ -604,6 +619,40 @@ def test_properties_with_clocks(text: str) -> None:
     assert fed.came["together"] > 10
     assert fed.told == fed.interpreted
     assert len(fed.told) > 5
+    assert all(one.why for one in fed.told)
+
+
+HANDLED = (
+    "ere: a* (b | epsilon) @fail { n++; if (k > 40) { DROP; } __RESET; } @match { m = m * 3 + n; }",
+    "ptltl: a -> (*) b @violation { m++; if (n > 9) { return; } DROP; n += 10; } @validation { n = n / 2; }",
+    "fsm: one [ a -> two, b -> one ] two [ a -> one, b -> three ] three [ default one ]"
+    " @two { } @three { m = 100 / (k % 7); } @one { if (m > 3) { v.push_back(1); m = 0; } }",
+    "ere: (a | b)* a b @match { DROP; __RESET; } ltl: [] (a => o (a or b)) @violation { n++; __RESET; }"
+    " fsm: s [ a -> t, default s ] t [ b -> s, default t ] @t { m += n; }"
+    " @s { for (int i = 0; i < 3; i++) { n ^= i; } }",
+)
+
+
+@pytest.mark.parametrize("text", HANDLED)
+def test_handlers_run_where_their_verdicts_are_only_counted(text: str) -> None:
+    """Variables, drops, what begins anew; faults and what the module has not; why, when a verdict is told again."""
+    fed = Fed(
+        f"""s() {{ int n = 0; int m = 0; int k = 0; std::vector<int> v;
+        event a(int c) /plain own/Plain '{{count:c}}' when (c % 2 == 0) {{ k++; if (c == 8) {{ k = 1 / (k - k); }} }}
+        event b(int c) /plain own/Plain '{{count:c}}' when (c % 3 == 0) {{ k++; c = k; }} {text} }}
+        t() {{ int seen = 0; event all(double x) /plain own/Plain '{{x:x}}' {{ seen++; x = seen; }} }}"""
+    )
+    random, counted = Random(5), 0  # noqa: S311  draws examples, not keys
+    for time in range(1, 40):
+        fed.counting = time % 3 > 0
+        fed.check(
+            [plain(random.choice((0, 1, 2, 3, 4, 6, 8) if time % 5 else (2, 3))) for _ in range(30)],
+            time=time,
+        )
+        counted += fed.counts.total()
+    assert counted > 100
+    assert fed.came["together"] > 60
+    assert fed.came["dropped"] > 5 or "DROP" not in text
     assert all(one.why for one in fed.told)
 
 

@@ -214,6 +214,12 @@ HARD = {
         s() { int n = 0; event e(int kind) /plain own/Plain '{kind:kind}' { n++; }
             event o() /stamped own/Stamped '{}' { }
             ere: e e o @fail { DROP; __RESET; } }""",
+    "handlers that count and drop": """
+        s() { int n = 0; event e(int kind) /plain own/Plain '{kind:kind}' { n++; }
+            event o(int kind) /plain own/Plain '{kind:kind}' when (kind == 1) { }
+            ptltl: e @violation { n = n * 2 % 1000; } @validation { n++; }
+            ere: (e o*)* o e @match { } @fail { __RESET; if (n % 3 == 0) { DROP; } } }
+        t() { int n = 0; event e(double x) /plain own/Plain '{x:x}' { n++; x = n; } }""",
     "a budget that runs out": """
         s() { int n = 0; event e(int count, double x) /plain own/Plain '{count:count, x:x, kind:2}' {
             if (count == 5 && x > 50) { while (true) { n++; } } n = 1; } }""",
