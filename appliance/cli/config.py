@@ -12,8 +12,6 @@ import yaml
 from appliance.config import Settings
 from appliance.config_sources import ConfigError, resolve
 
-app = typer.Typer(help="Check or show the configuration.", no_args_is_help=True)
-
 _CheckedFile = Annotated[Path | None, typer.Argument(metavar="[FILE]", help="The same as --config FILE")]
 _File = Annotated[
     Path | None, typer.Option("--config", help="Configuration file (default: ./appliance.yaml)")
@@ -21,7 +19,6 @@ _File = Annotated[
 _Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
 
 
-@app.command()
 def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = False) -> None:
     """Report every mistake in the file and the environment; exit status 1 when there is one.
 
@@ -39,7 +36,6 @@ def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = Fals
         _print("The configuration is right.")
 
 
-@app.command()
 def show(
     config: _File = None,
     as_json: _Json = False,

@@ -1,12 +1,17 @@
 """Verbs whose modules are imported when they are run, not when the command starts.
 
 `rosrv status` must not wait for the compiler of specifications, nor for a network library that one other verb needs.
-What `--help` and completion list is known without importing anything: names and first sentences stand in a table.
+What `--help` and completion list is known without importing anything: names stand in a table, the first sentences in
+the files of the verbs.
 """
 
+import functools
 import importlib
+import inspect
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -15,14 +20,33 @@ from typer.core import TyperCommand, TyperGroup
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """Where a verb is (`module:function`, or `module:app` for several), and the first sentence of its help."""
+    """Where a verb is in this folder (`module:function`); the first sentence of its help, if its docstring lacks it."""
 
     place: str
-    help: str
+    first: str = ""
     hidden: bool = False
+
+    @property
+    def help(self) -> str:
+        """The first sentence; a docstring is read without importing its module."""
+        module, _colon, function = self.place.partition(":")
+        file = _FOLDER.joinpath(*module.split(".")).with_suffix(".py")
+        return self.first or _first_sentence(file, function)
 
 
 Verbs = Mapping[str, "Verb | Group"]
+_FOLDER = Path(__file__).parent
+
+
+@functools.cache
+def _text(file: Path) -> str:
+    return file.read_text(encoding="utf-8")
+
+
+def _first_sentence(file: Path, function: str) -> str:
+    found = re.search(rf'(?ms)^def {function}\(.*?"""(.+?)(?:"""|\n\n)', _text(file))
+    assert found is not None, function  # noqa: S101  every verb has a docstring
+    return " ".join(found[1].split())
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,10 +99,12 @@ def _named(command: Any, name: str) -> Any:
 
 
 class _Deferred(TyperCommand):
-    """A verb that is not imported yet."""
+    """A verb that is not imported yet; its help is looked up when somebody wants to see it."""
+
+    help = property(lambda self: self._verb.help, lambda _self, _given: None)  # click sets it
 
     def __init__(self, verb: Verb, name: str) -> None:
-        super().__init__(name, help=verb.help, hidden=verb.hidden)
+        super().__init__(name, hidden=verb.hidden)
         self._verb = verb
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
@@ -89,9 +115,7 @@ class _Deferred(TyperCommand):
 def loaded(verb: Verb, name: str) -> Any:
     """The real command of a verb."""
     module, _colon, attribute = verb.place.partition(":")
-    found = getattr(importlib.import_module(module), attribute)
-    if isinstance(found, typer.Typer):
-        return _named(typer.main.get_group(found), name)
+    found = getattr(importlib.import_module(f"appliance.cli.{module}"), attribute)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command(name)(found)
+    app.command(name, help="\n\n".join(filter(None, (verb.first, inspect.getdoc(found)))))(found)
     return typer.main.get_command(app)

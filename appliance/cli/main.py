@@ -9,196 +9,123 @@ import typer
 from appliance import __version__
 from appliance.cli.lazy import Group, Verb, application
 
+_CONFIRM = "Keep what was loaded with --confirm-within; exit status 1 when there is nothing to confirm."
+
 VERBS: dict[str, Verb | Group] = {
-    "up": Verb("appliance.cli.up:up", "Start the appliance; ends on SIGTERM or Ctrl-C."),
-    "status": Verb(
-        "appliance.cli.status:status",
-        "Show the running appliance: processes, isolation, policy, graph, audit log.",
+    "up": Verb("up:up"),
+    "status": Verb("status:status"),
+    "selftest": Verb("selftest.verb:selftest"),
+    "demo": Verb("demo:demo"),
+    "protect": Verb("protect:protect", "Close the ROS ports of this machine to all but the appliance."),
+    "audit": Group(
+        "Review the audit log and prove that it is complete.",
+        {
+            "why": Verb("policy.granting:why"),
+            "search": Verb("audit.verbs:search"),
+            "tail": Verb("audit.verbs:tail"),
+            "show": Verb("audit.verbs:show"),
+            "verify": Verb("audit.verbs:verify"),
+            "checkpoints": Verb("audit.verbs:checkpoints"),
+            "export": Verb("audit.verbs:export"),
+        },
     ),
-    "selftest": Verb(
-        "appliance.cli.selftest.verb:selftest",
-        "Try whether this machine can run the appliance, and whether the running one does what it must.",
-    ),
-    "demo": Verb(
-        "appliance.cli.demo:demo",
-        "Show the appliance at work: a simulated robot, its operator and an attacker. Needs root.",
-    ),
-    "protect": Verb(
-        "appliance.cli.protect:protect", "Close the ROS ports of this machine to all but the appliance."
-    ),
-    "audit": Verb("appliance.cli.audit.verbs:app", "Review the audit log and prove that it is complete."),
     "evidence": Group(
         "Evidence: what happened, in one file that proves itself elsewhere.",
         {
-            "export": Verb(
-                "appliance.cli.evidence:export_evidence",
-                "Write what the log has of a time, and what was in force, as a bundle that proves itself anywhere.",
-            ),
-            "verify": Verb(
-                "appliance.cli.evidence:verify",
-                "Hold a bundle against what the appliance signed: exit status 0 right, 1 not, 2 when it is no bundle.",
-            ),
-            "verifier": Verb(
-                "appliance.cli.evidence:verifier",
-                "Write the verifier that comes with this version, for who does not trust the one in a bundle.",
-            ),
+            "export": Verb("evidence:export_evidence"),
+            "verify": Verb("evidence:verify"),
+            "verifier": Verb("evidence:verifier"),
         },
     ),
-    "policy": Verb(
-        "appliance.cli.policy.verbs:app", "Check, explain, test, compare, learn and change access policies."
+    "policy": Group(
+        "Check, explain, test, compare, learn and change access policies.",
+        {
+            "learn": Verb("policy.learning:learn_policy"),
+            "reload": Verb("policy.running:reload"),
+            "rollback": Verb(
+                "policy.running:rollback", "Bring a kept revision of the policy into force again."
+            ),
+            "confirm": Verb("policy.running:confirm", _CONFIRM),
+            "revisions": Verb(
+                "policy.running:revisions", "List the kept revisions of the policy, the newest first."
+            ),
+            "grant": Verb("policy.granting:grant"),
+            "check": Verb("policy.verbs:check"),
+            "explain": Verb("policy.verbs:explain_request"),
+            "test": Verb("policy.verbs:test"),
+            "diff": Verb("policy.verbs:compare"),
+        },
     ),
     "monitor": Group(
         "Monitors: check specifications, try them on a recording, run them on the robot.",
         {
-            "check": Verb(
-                "appliance.cli.monitor.verbs:check",
-                "Report every error and warning with its place; exit status 1 if there is an error.",
-            ),
-            "run": Verb(
-                "appliance.cli.monitor.verbs:run",
-                "Give a recording to the monitors and report what came of every message, by the recording's clock.",
-            ),
-            "learn": Verb(
-                "appliance.cli.monitor.learning:learn_monitors",
-                "Propose specifications out of recordings of a robot that behaves, for a person to edit.",
-            ),
-            "replay": Verb(
-                "appliance.cli.monitor.replaying:replay_monitor",
-                "Say what a monitor would have dropped and changed of recordings, where, and how often.",
-            ),
-            "coverage": Verb(
-                "appliance.cli.monitor.coverage:coverage",
-                "Say which events, branches, handlers, states and transitions recordings exercised, and what never"
-                " happened.",
-            ),
-            "list": Verb(
-                "appliance.cli.monitor.running:list_monitors",
-                "Show every monitor: enabled or not, what it listens to, what it did.",
-            ),
-            "margins": Verb(
-                "appliance.cli.monitor.running:margins",
-                "Show how close conditions on numbers came, today and since they were loaded.",
-            ),
-            "enable": Verb(
-                "appliance.cli.monitor.running:enable",
-                "Let the events of these monitors happen again, or first on trial.",
-            ),
-            "promote": Verb(
-                "appliance.cli.monitor.running:promote",
-                "Bring monitors that are on trial into force, with the state that they have.",
-            ),
-            "disable": Verb(
-                "appliance.cli.monitor.running:disable",
-                "Let messages pass these monitors untouched; their variables stay.",
-            ),
-            "load": Verb(
-                "appliance.cli.monitor.running:load",
-                "Load specifications while the robot runs; a file of the same name is replaced.",
-            ),
-            "remove": Verb(
-                "appliance.cli.monitor.running:remove",
-                "Remove specifications, by the names of their monitors or files.",
-            ),
-            "reload": Verb(
-                "appliance.cli.monitor.running:reload",
-                "Take what the folder of specifications has now; what it does not have stays in force, and is named.",
-            ),
+            "check": Verb("monitor.verbs:check"),
+            "run": Verb("monitor.verbs:run"),
+            "learn": Verb("monitor.learning:learn_monitors"),
+            "replay": Verb("monitor.replaying:replay_monitor"),
+            "coverage": Verb("monitor.coverage:coverage"),
+            "list": Verb("monitor.running:list_monitors"),
+            "margins": Verb("monitor.running:margins"),
+            "enable": Verb("monitor.running:enable"),
+            "promote": Verb("monitor.running:promote"),
+            "disable": Verb("monitor.running:disable"),
+            "load": Verb("monitor.running:load"),
+            "remove": Verb("monitor.running:remove"),
+            "reload": Verb("monitor.running:reload"),
             "revisions": Verb(
-                "appliance.cli.monitor.revisions:revisions",
+                "monitor.revisions:revisions",
                 "List the kept revisions of the specifications, the newest first.",
             ),
-            "show": Verb("appliance.cli.monitor.revisions:show", "Show the specifications of a revision."),
-            "diff": Verb(
-                "appliance.cli.monitor.revisions:diff",
-                "Show what a revision changed of the texts; exit status 1 when they are different.",
-            ),
+            "show": Verb("monitor.revisions:show"),
+            "diff": Verb("monitor.revisions:diff"),
             "rollback": Verb(
-                "appliance.cli.monitor.revisions:rollback",
+                "monitor.revisions:rollback",
                 "Bring a kept revision of the specifications into force again; what comes back is switched as it was.",
             ),
-            "confirm": Verb(
-                "appliance.cli.monitor.revisions:confirm",
-                "Keep what was loaded with --confirm-within; exit status 1 when there is nothing to confirm.",
-            ),
-            "resume": Verb(
-                "appliance.cli.monitor.running:resume",
-                "Let the topics go on that these monitors hold since the relay was restarted (`hold` specifications).",
-            ),
-            "reset": Verb(
-                "appliance.cli.monitor.offline:reset",
-                "Give up the specifications that were loaded by command: the next start takes those of the folder.",
-            ),
-            "rvstate": Verb(
-                "appliance.cli.monitor.running:rv_state",
-                "ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried.",
-                hidden=True,
-            ),
+            "confirm": Verb("monitor.revisions:confirm", _CONFIRM),
+            "resume": Verb("monitor.running:resume"),
+            "reset": Verb("monitor.offline:reset"),
+            "rvstate": Verb("monitor.running:rv_state", hidden=True),
         },
     ),
     "topic": Group(
         "What is said on the topics of the running robot.",
-        {
-            "echo": Verb(
-                "appliance.cli.topic:echo",
-                "Show the next messages of a topic as subscribers get them, after the monitors; it is recorded who"
-                " looked.",
-            ),
-            "info": Verb(
-                "appliance.cli.topic:info", "Show who publishes a topic, who hears it, and how much flows."
-            ),
-        },
+        {"echo": Verb("topic:echo"), "info": Verb("topic:info")},
     ),
     "record": Group(
         "The flight recorder: what was said before and after something happened.",
         {
-            "now": Verb(
-                "appliance.cli.record:now",
-                "Record the last seconds, and the next ones, of what the robot says.",
-            ),
-            "list": Verb(
-                "appliance.cli.record:list_recordings", "List the recordings that are kept, the oldest first."
-            ),
-            "show": Verb("appliance.cli.record:show", "Show why a recording was made, and what it has."),
-            "timeline": Verb(
-                "appliance.cli.record:show_timeline",
-                "Show what flowed on each topic of a recording, and what happened, on one time line.",
-            ),
-            "messages": Verb(
-                "appliance.cli.record:messages",
-                "Show the messages of a recording around a moment; it is recorded who read them.",
-            ),
-            "fetch": Verb(
-                "appliance.cli.record:fetch",
-                "Write a recording's bag to a file; it is recorded who fetched it.",
-            ),
-            "remove": Verb(
-                "appliance.cli.record:remove", "Remove a recording; it is recorded who removed it."
-            ),
+            "now": Verb("record:now"),
+            "list": Verb("record:list_recordings"),
+            "show": Verb("record:show"),
+            "timeline": Verb("record:show_timeline"),
+            "messages": Verb("record:messages"),
+            "fetch": Verb("record:fetch"),
+            "remove": Verb("record:remove"),
         },
     ),
-    "sign": Verb(
-        "appliance.cli.sign:sign",
-        "Sign policies, specifications and message definitions; the signature of FILE is written to FILE.sig.",
+    "sign": Verb("sign:sign"),
+    "version": Verb("version:version"),
+    "config": Group(
+        "Check or show the configuration.", {"check": Verb("config:check"), "show": Verb("config:show")}
     ),
-    "version": Verb("appliance.cli.version:version", "Show which version this is, and what it stands on."),
-    "config": Verb("appliance.cli.config:app", "Check or show the configuration."),
-    "host": Verb(
-        "appliance.cli.host.verbs:app", "Enrol, list and revoke hosts that come through IPsec tunnels."
+    "host": Group(
+        "Enrol, list and revoke hosts that come through IPsec tunnels.",
+        {
+            "add": Verb("host.verbs:add"),
+            "kit": Verb("host.verbs:kit"),
+            "list": Verb("host.verbs:list_hosts"),
+            "reload": Verb("host.verbs:reload"),
+            "revoke": Verb("host.verbs:revoke"),
+        },
     ),
-    "backup": Verb(
-        "appliance.cli.backup:backup",
-        "Write the state directory to one file: audit log, registrations, policies, keys. The appliance may run.",
+    "backup": Verb("backup:backup"),
+    "restore": Verb("backup:restore"),
+    "purge": Verb("backup:purge"),
+    "token": Group(
+        "Make, list and revoke access tokens for REST.",
+        {"add": Verb("token:add"), "list": Verb("token:list_tokens"), "revoke": Verb("token:revoke")},
     ),
-    "restore": Verb(
-        "appliance.cli.backup:restore",
-        "Make a state directory of a backup; `rosrv up --state` there goes on from it. Nothing is written over.",
-    ),
-    "purge": Verb(
-        "appliance.cli.backup:purge",
-        "Remove a state directory for good: audit log, policies, keys of the appliance and of its hosts. It must not"
-        " run.",
-    ),
-    "token": Verb("appliance.cli.token:app", "Make, list and revoke access tokens for REST."),
 }
 
 

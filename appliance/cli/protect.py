@@ -26,9 +26,7 @@ OPEN_STATUS, ERROR_STATUS = 1, 2
 _SHOWN = 20  # open ports named on a terminal
 _MOST_TOLD = 100
 
-HELP = """Close the ROS ports of this machine to all but the appliance.
-
-Nodes listen on ports of the local port range. Without a verb the nftables file is only printed.
+HELP = """Nodes listen on ports of the local port range. Without a verb the nftables file is only printed.
 
 \b
   rosrv protect --appliance 192.168.1.20                    look at it

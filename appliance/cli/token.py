@@ -12,10 +12,7 @@ from appliance.cli.output import Json, moment, say, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
 
-app = typer.Typer(help="Make, list and revoke access tokens for REST.", no_args_is_help=True)
 
-
-@app.command()
 @speaks
 def add(
     appliance: Appliance,
@@ -45,7 +42,6 @@ def add(
     )
 
 
-@app.command("list")
 @speaks
 def list_tokens(appliance: Appliance, as_json: Json = False) -> None:
     """List all tokens that were made, without their secrets.
@@ -64,7 +60,6 @@ def list_tokens(appliance: Appliance, as_json: Json = False) -> None:
         say(f"{row.name:<24} {row.role:<12} {row.id}  made {moment(row.created)}  {end}")
 
 
-@app.command()
 @speaks
 def revoke(
     appliance: Appliance,

@@ -37,18 +37,15 @@ def say_deadline(confirm_by: float | None, noun: str) -> None:
 
 def verbs_of(
     noun: str,
-    what: str,
     *,
     listed: AdminRequest[_Listed],
     confirmation: AdminRequest[_Confirmed],
     back: Callable[[int | None], AdminRequest[_Done]],
     say_done: Callable[[_Done], None],
-    and_then: str = "",
 ) -> tuple[Callable[..., None], Callable[..., None], Callable[..., None]]:
-    """The verbs `revisions`, `rollback` and `confirm` of `rosrv noun`, for `what` it changes.
+    """The verbs `revisions`, `rollback` and `confirm` of `rosrv noun`; what they do says the table of verbs.
 
-    `listed`, `confirmation` and `back(revision)` are what each asks; `say_done` says what a rollback did, and
-    `and_then` is what the help adds to it.
+    `listed`, `confirmation` and `back(revision)` are what each asks; `say_done` says what a rollback did.
     """
 
     def revisions(appliance: Appliance, as_json: Json = False) -> None:
@@ -73,18 +70,8 @@ def verbs_of(
             say(kept if body.confirmed else f"nothing waits to be confirmed: {kept}")
         raise typer.Exit(0 if body.confirmed else 1)
 
-    revisions.__doc__ = f"""List the kept revisions of the {what}, the newest first.
-
-    Example: rosrv {noun} revisions
-    """
-    rollback.__doc__ = f"""Bring a kept revision of the {what} into force again{and_then}.
-
-    Example: rosrv {noun} rollback 7
-    """
-    confirm.__doc__ = f"""Keep what was loaded with --confirm-within; exit status 1 when there is nothing to confirm.
-
-    Example: rosrv {noun} confirm
-    """
+    for verb, example in ((revisions, "revisions"), (rollback, "rollback 7"), (confirm, "confirm")):
+        verb.__doc__ = f"Example: rosrv {noun} {example}"
     return speaks(revisions), speaks(rollback), speaks(confirm)
 
 

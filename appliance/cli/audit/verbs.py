@@ -31,12 +31,8 @@ from appliance.cli.audit.output import (
     print_verification,
     write,
 )
-from appliance.cli.policy.granting import why
 from appliance.cli.progress import progress
 from appliance.cli.running import Appliance, speaks
-
-app = typer.Typer(help="Review the audit log and prove that it is complete.", no_args_is_help=True)
-app.command()(why)
 
 _POLL_SECONDS = 0.2
 _CHECKPOINT_SECONDS = 5.0  # between two looks: one is made a minute, and a look over REST is itself recorded
@@ -46,7 +42,6 @@ _Ocsf = Annotated[bool, typer.Option("--ocsf", help="One event of OCSF 1.6.0 a l
 _AlwaysJson = Annotated[bool, typer.Option("--json", help="NDJSON, which it always is")]
 
 
-@app.command()
 @speaks
 @filtered
 def search(
@@ -72,7 +67,6 @@ def search(
         tell(f"more records match: --cursor {page.cursor}, or a larger --limit")
 
 
-@app.command()
 @speaks
 @filtered
 def tail(
@@ -92,7 +86,6 @@ def tail(
         _print_lines(entries, as_json_lines, ocsf=ocsf)
 
 
-@app.command()
 @speaks
 def show(
     appliance: Appliance,
@@ -118,7 +111,6 @@ def show(
             print_shown(shown)
 
 
-@app.command()
 @speaks
 def verify(
     appliance: Appliance,
@@ -178,7 +170,6 @@ def _verify_export(file: Path, key: Path | None, *, copies: bool, as_json_lines:
             raise typer.Exit(1)
 
 
-@app.command()
 @speaks
 def checkpoints(
     appliance: Appliance,
@@ -205,7 +196,6 @@ def checkpoints(
                 pause.wait(_CHECKPOINT_SECONDS)
 
 
-@app.command()
 @speaks
 @filtered
 def export(

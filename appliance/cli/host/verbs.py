@@ -16,8 +16,6 @@ from appliance.cli.output import Json, moment, say, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
 
-app = typer.Typer(help="Enrol, list and revoke hosts that come through IPsec tunnels.", no_args_is_help=True)
-
 _Name = Annotated[
     str,
     typer.Argument(
@@ -51,7 +49,6 @@ _Ports = Annotated[str, typer.Option(help="The host's local port range, where RO
 _Within = Annotated[str, typer.Option(help="With --token: how long it is good: 30m, 1h, 7d")]
 
 
-@app.command()
 @speaks
 def add(  # noqa: PLR0917  typer gives every flag by its name
     running: Appliance,
@@ -88,7 +85,6 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
         _write_kit(running, HostAdd(name, "", days, address), csr, wishes, out, as_json=as_json)
 
 
-@app.command()
 @speaks
 def kit(  # noqa: PLR0917  as above
     running: Appliance,
@@ -117,7 +113,6 @@ def kit(  # noqa: PLR0917  as above
         _write_kit(running, HostRenew(name, "", days), csr, wishes, out, as_json=as_json)
 
 
-@app.command("list")
 @speaks
 def list_hosts(
     running: Appliance,
@@ -147,7 +142,6 @@ def list_hosts(
         say(f"! {trouble}")
 
 
-@app.command()
 @speaks
 def reload(running: Appliance, as_json: Json = False) -> None:
     """Read hosts.yaml again. It opens and closes tunnels that it wants or does not want; it enrols and revokes nobody.
@@ -163,7 +157,6 @@ def reload(running: Appliance, as_json: Json = False) -> None:
         say(f"! {difference}")
 
 
-@app.command()
 @speaks
 def revoke(running: Appliance, name: _Name, as_json: Json = False) -> None:
     """Let a host in no more, close its tunnel and take back what it has, now; or await it no longer.

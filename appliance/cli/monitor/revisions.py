@@ -17,12 +17,10 @@ _Revision = Annotated[int | None, typer.Argument(help="A kept revision; without 
 
 revisions, rollback, confirm = verbs_of(
     "monitor",
-    "specifications",
     listed=MonitorRevisions(),
     confirmation=MonitorConfirm(),
     back=MonitorRollback,
     say_done=say_replaced,
-    and_then="; what comes back is switched as it was",
 )
 
 

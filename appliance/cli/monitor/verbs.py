@@ -25,13 +25,8 @@ from appliance.rosmop.positions import Finding
 from appliance.rosmop.syntax.errors import SpecificationError
 
 _TOLD_EVERY = 1000
-app = typer.Typer(
-    help="Monitors: check specifications, try them on a recording, run them on the robot.",
-    no_args_is_help=True,
-)
 
 
-@app.command()
 def check(
     files: Files,
     *,
@@ -83,7 +78,6 @@ def check(
     raise typer.Exit(1 if errors else 0)
 
 
-@app.command()
 def run(
     files: Files,
     *,

@@ -35,7 +35,6 @@ def say_loaded(body: Loaded) -> None:
 
 revisions, rollback, confirm = verbs_of(
     "policy",
-    "policy",
     listed=PolicyRevisions(),
     confirmation=PolicyConfirm(),
     back=PolicyRollback,

@@ -13,7 +13,6 @@ import typer
 
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.output import Json, counted, refused, say, say_json
-from appliance.cli.policy.granting import grant
 from appliance.cli.policy.input import (
     Enrolled,
     Robot,
@@ -25,9 +24,7 @@ from appliance.cli.policy.input import (
     requests_of_file,
     usage_error,
 )
-from appliance.cli.policy.learning import learn_policy
 from appliance.cli.policy.output import decision_fields, say_finding
-from appliance.cli.policy.running import confirm, reload, revisions, rollback
 from appliance.cli.policy.trial import Trial, try_policy
 from appliance.cli.running import Appliance, speaks
 from appliance.policy import (
@@ -47,17 +44,9 @@ from appliance.policy.grant import Asked, UngrantableError
 from appliance.policy.grant import grant as grant_of
 from appliance.policy.rights import needs_node, rights_of
 
-app = typer.Typer(
-    help="Check, explain, test, compare, learn and change access policies.", no_args_is_help=True
-)
-app.command("learn")(learn_policy)
-for _verb in (reload, rollback, confirm, revisions, grant):
-    app.command()(_verb)
-
 _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_default=False)]
 
 
-@app.command()
 @speaks
 def check(
     appliance: Appliance,
@@ -123,7 +112,6 @@ def _allowing(
     yield from (f"would be allowed by: {line}" for line in found.added)
 
 
-@app.command("explain")
 def explain_request(
     file: _File,
     *,
@@ -205,7 +193,6 @@ def _explanation_fields(explanation: Explanation) -> dict[str, object]:
     return fields
 
 
-@app.command()
 def test(
     file: _File,
     cases: Annotated[
@@ -236,7 +223,6 @@ def test(
     raise typer.Exit(1 if failed else 0)
 
 
-@app.command("diff")
 @speaks
 def compare(
     appliance: Appliance,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from appliance.cli.monitor.verbs import app
+from appliance.cli.main import app
 from examples.landshark.drive import TRIGGERED, Simulation, record
 from examples.landshark.messages import MONITORS
 
@@ -26,7 +26,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def said(*arguments: str) -> list[str]:
     """What `rosrv monitor` prints."""
-    return CliRunner().invoke(app, list(arguments)).output.splitlines()
+    return CliRunner().invoke(app, ["monitor", *arguments]).output.splitlines()
 
 
 def shown(command: str) -> list[str]:

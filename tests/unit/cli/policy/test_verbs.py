@@ -8,7 +8,7 @@ from typer.testing import CliRunner, Result
 
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Record
-from appliance.cli.policy.verbs import app
+from appliance.cli.main import app
 
 POLICIES = Path(__file__).parents[4] / "policies"
 
@@ -27,7 +27,7 @@ default = ocu
 
 def rosrv(*arguments: str | Path) -> Result:
     """Run `rosrv policy` with arguments."""
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+    return CliRunner().invoke(app, ["policy", *map(str, arguments)])
 
 
 @pytest.fixture
