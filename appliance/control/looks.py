@@ -13,11 +13,12 @@ from appliance.channel import admin
 from appliance.channel.answers.graph import Graph, Registration, Registrations, TopicMessage, TopicMessages
 from appliance.channel.answers.inventory import InUse, Inventory
 from appliance.channel.answers.measures import Measures
+from appliance.channel.answers.monitors import Monitors
 from appliance.channel.answers.status import AuditState, ClockState, PolicyState, RecorderState, Status
 from appliance.control.assembly import Parts
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.measures import measures_of
-from appliance.control.monitor_orders import monitors_status
+from appliance.control.monitor_states import monitors_of, monitors_status
 from appliance.control.overview import graph_of
 from appliance.control.policies import Policies
 from appliance.control.surroundings import Surroundings
@@ -76,6 +77,10 @@ class Looks:
     async def graph(self, _request: admin.GraphWanted) -> Graph:
         """Nodes, topics and services, and what flows."""
         return graph_of(self.parts)
+
+    async def monitors(self, request: admin.MonitorsWanted) -> Monitors:
+        """All monitors with state and counters."""
+        return monitors_of(self.parts.monitors, self.parts.monitor_calls.rv_state(), texts=request.texts)
 
     async def topic_look(self, request: admin.TopicLook, who: str) -> TopicMessages:
         """The next messages of a topic. Raises `UnknownThingError`, `SenselessError` and `TooManyLooksError`."""

@@ -35,7 +35,6 @@ from appliance.control.evidence_orders import EvidenceOrders
 from appliance.control.forwarder import Forwarded
 from appliance.control.lifeline import ControlLifeline
 from appliance.control.looks import Looks
-from appliance.control.monitor_orders import MonitorOrders
 from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.control.policy_orders import PolicyOrders
 from appliance.control.rest import RestLink
@@ -243,7 +242,7 @@ class _Control:
         administration = Administration(
             looks,
             PolicyOrders(base.policies, base.store, parts.relay.carried_out),
-            MonitorOrders(parts),
+            parts.monitors,
             self._hosts,
             self._hosts.itself,
             self._hosts.ports,

@@ -21,19 +21,21 @@ a change that is meant for another tag than the present one is refused.
 """
 
 import asyncio
+import contextlib
 import json
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import structlog
 
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
-from appliance.channel import messages
-from appliance.channel.answers.monitors import Replaced
+from appliance.channel import admin, messages
+from appliance.channel.answers import monitors as answers
+from appliance.channel.answers.monitors import Replaced, Switched
 from appliance.fingerprints import fingerprint_of_all
 from appliance.rosmop.engine import sharing
 from appliance.specifications.allocation import Allocation
@@ -62,7 +64,7 @@ _NO_FOLDER = (
 
 
 class UnknownMonitorError(Exception):
-    """There is no monitor, or file, of a name; the text says which there are."""
+    """There is no monitor or file of a name, or no such revision; the text says which there are."""
 
 
 class MonitorsChangedError(Exception):
@@ -83,7 +85,7 @@ class Kept(Sources, frozen=True):
 
 
 class Monitors:
-    """Keeps specifications and switches.
+    """Keeps specifications and switches. What operators ask of them is answered by the method that takes the request.
 
     `published()` is called when monitors may publish other topics; each of `told` hears of every event that a relay
     reports. Where there are `site_keys`, whatever comes into force is signed with one of them. Changes are made one at
@@ -115,7 +117,7 @@ class Monitors:
         self._switches: dict[str, Switch] = {}
         self._states: dict[str, Switch] = {}  # of those in force
         self._acts = 0  # switches and resumptions, ever
-        self._changing = asyncio.Lock()
+        self._one_change = asyncio.Lock()
         self._trial = Trial(store, "confirm monitors", self._go_back, (SpecificationsRefusedError,))
         self._row = MonitorRevisionRow(
             0, "{}", 0.0, _DISK, ""
@@ -203,10 +205,6 @@ class Monitors:
         """Whether a monitor is given copies, and what it would do is only told."""
         return self._states.get(name) == TRIAL
 
-    def began(self, names: Sequence[str]) -> list[str]:
-        """Which of these monitors are in their initial state since the last change."""
-        return self._stating.began(names)
-
     def names(self) -> list[str]:
         """All monitors, in the order in which they see messages."""
         return list(self.checked.monitors)
@@ -219,10 +217,19 @@ class Monitors:
             raise UnknownMonitorError(self._unknown([name]))
         return self.checked.monitors[name]
 
-    async def revisions(self) -> list[MonitorRevisionRow]:
+    async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
         """All kept revisions, the newest first."""
-        await self._store.settled()
-        return await asyncio.to_thread(self._store.monitor_revisions)
+        rows = await self._kept_rows()
+        return answers.MonitorRevisionList([answers.MonitorRevision(**self._described(row)) for row in rows])
+
+    async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
+        """A revision with its texts. Raises `UnknownMonitorError`."""
+        for row in await self._kept_rows():
+            if row.revision == request.revision:
+                return answers.RevisionTexts(
+                    **self._described(row), **msgspec.structs.asdict(sources_of(row))
+                )
+        raise UnknownMonitorError(f"there is no revision {request.revision} of the specifications")
 
     def statement(self, relay: int = 0) -> messages.SpecificationsStated:
         """What a relay is told before anything else."""
@@ -230,60 +237,63 @@ class Monitors:
 
     # --- changing ---
 
-    async def load(
-        self,
-        new: Sources,
-        *,
-        who: str,
-        note: str,
-        expected: str | None = None,
-        confirm_within: float | None = None,
-    ) -> Replaced:
+    @contextlib.asynccontextmanager
+    async def _changing(self, expected: str | None) -> AsyncIterator[None]:
+        """Around a change that is meant for this tag. Raises `MonitorsChangedError`."""
+        async with self._one_change:
+            if expected is not None and expected != self.tag:
+                raise MonitorsChangedError(expected, self.tag)
+            yield
+
+    async def load(self, request: admin.MonitorLoad, who: str) -> Replaced:
         """Add these files, or replace those of the same name. Raises `SpecificationsRefusedError`.
 
         This and every change of the specifications goes back by itself after `confirm_within` seconds unless confirmed.
         """
-        async with self._changing:
-            self._expect(expected)
+        async with self._changing(request.expected):
+            new = Sources(request.files, request.definitions, request.signatures)
             sources = self.sources.with_files(new)
             if self._row.who != _DISK and sources == self.sources:  # the same texts twice are one revision
                 return self._replaced(self.revision, ([], [], []))
-            return await self._change(sources, who, who, note or "loaded", confirm_within)
+            return await self._change(sources, who, who, request.note or "loaded", request.confirm_within)
 
-    async def reload(
-        self,
-        *,
-        who: str,
-        expected: str | None = None,
-        prune: bool = False,
-        confirm_within: float | None = None,
-    ) -> Replaced:
+    async def replace(self, request: admin.MonitorReplace, who: str) -> Replaced:
+        """Put a text in the place of a monitor's file. Raises `UnknownMonitorError`, and as `load`."""
+        file = self.file_of(request.name)
+        load = admin.MonitorLoad(
+            {file: request.text},
+            request.definitions,
+            request.note,
+            request.expected,
+            request.confirm_within,
+            {**request.signatures, file: request.signature},
+        )
+        return await self.load(load, who)
+
+    async def reload(self, request: admin.MonitorReload, who: str) -> Replaced:
         """Take what the folder has now; what it does not have stays, unless `prune`.
 
         Raises `SpecificationsRefusedError`, also when there is no folder.
         """
-        async with self._changing:
-            self._expect(expected)
+        async with self._changing(request.expected):
             if self.folder is None:
                 raise SpecificationsRefusedError([_NO_FOLDER])
             sources = await asyncio.to_thread(self._folder.read)
-            kept = [] if prune else sorted(self.sources.files.keys() - sources.files.keys())
+            kept = [] if request.prune else sorted(self.sources.files.keys() - sources.files.keys())
             if kept:
                 sources = self.sources.with_files(sources)
             keeper = who if kept else _DISK  # else the next start would read the folder, and nothing else
-            return await self._change(sources, keeper, who, "reloaded from disk", confirm_within, kept=kept)
+            within = request.confirm_within
+            return await self._change(sources, keeper, who, "reloaded from disk", within, kept=kept)
 
-    async def remove(
-        self, names: list[str], *, who: str, expected: str | None = None, confirm_within: float | None = None
-    ) -> Replaced:
+    async def remove(self, request: admin.MonitorRemove, who: str) -> Replaced:
         """Remove files, by their names or those of their monitors.
 
         Raises `UnknownMonitorError`, and `SpecificationsRefusedError` where others use their variables, or a file has
         other monitors as well.
         """
-        async with self._changing:
-            self._expect(expected)
-            owners = self.checked.monitors
+        async with self._changing(request.expected):
+            names, owners = request.names, self.checked.monitors
             known = set(self.sources.files) | set(owners)
             unknown = [name for name in names if name not in known]
             if unknown:
@@ -296,75 +306,69 @@ class Monitors:
                 text = f"{', '.join(left)} would go, too: they are in the same file; name the file, or load it without"
                 raise SpecificationsRefusedError([text])
             sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
-            return await self._change(sources, who, who, note, confirm_within)
+            return await self._change(sources, who, who, note, request.confirm_within)
 
-    async def rollback(self, revision: int | None, *, who: str, expected: str | None = None) -> Replaced:
+    async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replaced:
         """Bring a kept revision into force again (None: the one before this; 0: nothing).
 
         A monitor that comes back is switched as it was when it went. Raises `SpecificationsRefusedError`.
         """
-        async with self._changing:
-            self._expect(expected)
+        async with self._changing(request.expected):
             row = MonitorRevisionRow(0, "{}", 0.0, _DISK, "")
-            if revision != 0:
+            if request.revision != 0:
                 try:
-                    row = wanted(await self.revisions(), revision, self.revision)
+                    row = wanted(await self._kept_rows(), request.revision, self.revision)
                 except UnknownRevisionError as error:
                     raise SpecificationsRefusedError([str(error)]) from error
             note, switches = f"rolled back to revision {row.revision}", _kept(row).switches
             return await self._change(sources_of(row), who, who, note, switches=switches)
 
-    async def confirm(self, *, who: str, expected: str | None = None) -> bool:
-        """Keep an unconfirmed change; False when there is none."""
-        async with self._changing:
-            self._expect(expected)
-            if self.confirm_by is None:
-                return False
-            self._trial.end()
-            self._trail.happened(
-                "specifications confirmed",
-                f"revision {self.revision} of the specifications was confirmed",
-                category="monitor",
-                resource="",
-                who=who,
-            )
-            await self._store.settled()
-            return True
+    async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
+        """Keep an unconfirmed change, if there is one."""
+        async with self._changing(request.expected):
+            waited = self.confirm_by is not None
+            if waited:
+                self._trial.end()
+                self._trail.happened(
+                    "specifications confirmed",
+                    f"revision {self.revision} of the specifications was confirmed",
+                    category="monitor",
+                    resource="",
+                    who=who,
+                )
+                await self._store.settled()
+            return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
-    async def switch(
-        self, names: list[str], enabled: bool, *, who: str, expected: str | None = None
-    ) -> list[str]:
+    async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
         """Enable or disable monitors; those that were not so already.
 
         Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for one that is to be enabled but is on trial, or
         shares variables with one that is.
         """
-        async with self._changing:
-            self._expect(expected)
-            self._all_known(names)
-            tried = [name for name in names if enabled and self.on_trial(name)]
+        async with self._changing(request.expected):
+            self._all_known(request.names)
+            tried = [name for name in request.names if request.enabled and self.on_trial(name)]
             if tried:
                 text = f"{', '.join(tried)} is on trial: rosrv monitor promote brings it into force"
                 raise SpecificationsRefusedError([text])
-            return await self._switch(names, enabled, who)
+            return self._switched(await self._switch(request.names, request.enabled, who))
 
-    async def try_out(self, names: list[str], *, who: str, expected: str | None = None) -> list[str]:
-        """Put monitors on trial; those that were not so already. The same errors, where variables are shared."""
-        async with self._changing:
-            self._expect(expected)
-            self._all_known(names)
-            return await self._switch(names, TRIAL, who)
+    async def trial(self, request: admin.MonitorTrial, who: str) -> Switched:
+        """Put monitors on trial, or bring those on trial into force; those that were not so already.
 
-    async def promote(self, names: list[str], *, who: str, expected: str | None = None) -> list[str]:
-        """Bring monitors on trial into force; those that were not already. The same errors, and for a disabled one."""
-        async with self._changing:
-            self._expect(expected)
-            self._all_known(names)
-            disabled = [name for name in names if self._states[name] is False]
-            if disabled:
+        The same errors, and for a disabled one that is to be brought into force.
+        """
+        async with self._changing(request.expected):
+            self._all_known(request.names)
+            disabled = [name for name in request.names if self._states[name] is False]
+            if disabled and not request.trial:
                 text = f"{', '.join(disabled)} is disabled, not on trial: rosrv monitor enable"
                 raise SpecificationsRefusedError([text])
-            return await self._switch(names, True, who)
+            names = await self._switch(request.names, TRIAL if request.trial else True, who)
+            return self._switched(names, self._stating.began(names))
+
+    def _switched(self, names: list[str], began: Sequence[str] = ()) -> Switched:
+        return Switched(names, self.revision, self.tag, [*began])
 
     async def _switch(self, names: list[str], to: Switch, who: str) -> list[str]:
         changed = [name for name in dict.fromkeys(names) if self._states[name] != to]
@@ -404,16 +408,15 @@ class Monitors:
             who=who,
         )
 
-    async def resume(self, names: list[str], *, who: str, expected: str | None = None) -> list[str]:
+    async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
         """Let the topics of held monitors go on; which were held.
 
         Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for those whose relay process is away: the one
         that comes will hold them.
         """
-        async with self._changing:
-            self._expect(expected)
-            self._all_known(names)
-            held = [name for name in dict.fromkeys(names) if name in self.held]
+        async with self._changing(request.expected):
+            self._all_known(request.names)
+            held = [name for name in dict.fromkeys(request.names) if name in self.held]
             if held:
                 await self._count()
             away = []
@@ -436,7 +439,7 @@ class Monitors:
                 )
                 raise SpecificationsRefusedError([text])
             await self._stating.carried_out()
-            return held
+            return self._switched(held)
 
     # --- what the relay says ---
 
@@ -452,6 +455,21 @@ class Monitors:
         self._stating.lost(relay)
 
     # --- inside ---
+
+    async def _kept_rows(self) -> list[MonitorRevisionRow]:
+        await self._store.settled()
+        return await asyncio.to_thread(self._store.monitor_revisions)
+
+    def _described(self, row: MonitorRevisionRow) -> dict[str, Any]:
+        """The fields of `MonitorRevision`."""
+        return {
+            "revision": row.revision,
+            "loaded": row.loaded,
+            "who": row.who,
+            "note": row.note,
+            "in_force": row.revision == self.revision,
+            "names": list(sources_of(row).files),
+        }
 
     def _states_of(self, checked: Checked) -> dict[str, Switch]:
         """What these monitors are, or would be; what shares variables with a monitor on trial is on trial, too."""
@@ -490,10 +508,6 @@ class Monitors:
         if unknown:
             raise UnknownMonitorError(self._unknown(unknown))
 
-    def _expect(self, expected: str | None) -> None:
-        if expected is not None and expected != self.tag:
-            raise MonitorsChangedError(expected, self.tag)
-
     async def _count(self) -> None:
         """The tag is another when this returns; kept before anybody sees it, so that no crash brings one back."""
         self._store.save_setting(_ACTS, str(self._acts + 1))
@@ -501,7 +515,7 @@ class Monitors:
         self._acts += 1
 
     async def _go_back(self, revision: int) -> None:
-        await self.rollback(revision, who="not confirmed in time")
+        await self.roll_back(admin.MonitorRollback(revision), "not confirmed in time")
 
     async def _change(
         self,

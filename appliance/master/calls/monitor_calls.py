@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import cast
 
+from appliance.channel.admin import MonitorSwitch
 from appliance.master.caller import Answer, Caller
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.reach.relays import RelayControl
@@ -33,9 +34,8 @@ class MonitorCalls:
         if word not in _WORDS:
             return [-1, f"{word[:80]!r} is not to be done with monitors: enable or disable", []]
         try:
-            changed = await self.monitors.switch(
-                names, _WORDS[word], who=f"{caller.caller_id} ({caller.peer.text})"
-            )
+            order = MonitorSwitch(names, _WORDS[word])
+            changed = (await self.monitors.switch(order, f"{caller.caller_id} ({caller.peer.text})")).names
         except (UnknownMonitorError, SpecificationsRefusedError) as error:
             return [-1, str(error), []]
         return [

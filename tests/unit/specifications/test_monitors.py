@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import asdict
 
 from appliance.audit.log import AuditLog
-from appliance.channel import messages
+from appliance.channel import admin, messages
 from appliance.specifications.allocation import Allocation, Move, Resource
 from appliance.specifications.files import Sources, SpecificationsRefusedError
 from appliance.specifications.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
@@ -127,14 +128,14 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
     again = desk.monitors()
     assert again.revision == 1
     desk.began = ["b"]
-    replaced = await again.load(Sources({"b.rv": B}), who="eve", note="")
+    replaced = await again.load(admin.MonitorLoad({"b.rv": B}), "eve")
     assert (replaced.revision, replaced.added, replaced.changed) == (2, ["b.rv"], [])
     assert replaced.began == ["b"]
-    repeated = await again.load(Sources({"b.rv": B}), who="adam", note="")
+    repeated = await again.load(admin.MonitorLoad({"b.rv": B}), "adam")
     assert (repeated.revision, repeated.replaced, repeated.changed, again.who) == (2, 2, [], "eve")
     restarted = desk.monitors()
     assert (restarted.names(), restarted.who, restarted.differs_from_folder) == (["a", "b"], "eve", True)
-    back = await restarted.reload(who="operator", prune=True)
+    back = await restarted.reload(admin.MonitorReload(prune=True), "operator")
     assert (back.removed, restarted.names(), restarted.differs_from_folder) == (["b.rv"], ["a"], False)
     loaded = [fields for event, fields in desk.trail.heard if event == "specifications loaded"]
     assert [fields["began"] for fields in loaded][:2] == [[], ["b"]]
@@ -151,18 +152,18 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
 async def test_a_reload_takes_nothing_away_that_the_folder_did_not_bring(desk: Desk) -> None:
     """What the folder does not have stays in force, over restarts, too, until somebody says that it is to go."""
     monitors = desk.monitors()
-    await monitors.load(Sources({"b.rv": B}), who="eve", note="")
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
     (desk.folder / "c.rv").write_text(C)
-    kept = await monitors.reload(who="operator")
+    kept = await monitors.reload(admin.MonitorReload(), "operator")
     assert (kept.added, kept.removed, kept.kept) == (["c.rv"], [], ["b.rv"])
     assert monitors.names() == ["a", "b", "c"]
     await desk.store.settled()
     restarted = desk.monitors()
     assert restarted.names() == ["a", "b", "c"]
     (desk.folder / "c.rv").unlink()
-    again = await restarted.reload(who="operator")
+    again = await restarted.reload(admin.MonitorReload(), "operator")
     assert (again.removed, again.kept, restarted.names()) == ([], ["b.rv", "c.rv"], ["a", "b", "c"])
-    pruned = await restarted.reload(who="operator", prune=True)
+    pruned = await restarted.reload(admin.MonitorReload(prune=True), "operator")
     assert (pruned.removed, pruned.kept, restarted.differs_from_folder) == (["b.rv", "c.rv"], [], False)
 
 
@@ -173,9 +174,9 @@ async def test_a_file_with_another_name_is_not_taken_beside_the_old_one(desk: De
     with pytest.raises(
         SpecificationsRefusedError, match=r"not of the folder, and kept: a\.rv \(prune removes"
     ):
-        await monitors.reload(who="operator")
+        await monitors.reload(admin.MonitorReload(), "operator")
     assert list(monitors.sources.files) == ["a.rv"]
-    pruned = await monitors.reload(who="operator", prune=True)
+    pruned = await monitors.reload(admin.MonitorReload(prune=True), "operator")
     assert (pruned.added, pruned.removed, monitors.names()) == (["new.rv"], ["a.rv"], ["a"])
 
 
@@ -183,34 +184,34 @@ async def test_a_revision_comes_back_with_its_switches(desk: Desk) -> None:
     """Specifications and switches are as they were, over restarts; what was in force all the time keeps its switch."""
     (desk.folder / "b.rv").write_text(B)
     monitors = desk.monitors(enable="none")
-    await monitors.switch(["a", "b"], True, who="eve")
-    await monitors.remove(["b"], who="eve")
-    await monitors.switch(["a"], False, who="eve")
+    await monitors.switch(admin.MonitorSwitch(["a", "b"], True), "eve")
+    await monitors.remove(admin.MonitorRemove(["b"]), "eve")
+    await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")
     restarted = desk.monitors(enable="none", restarted=True)
-    back = await restarted.rollback(None, who="adam")
+    back = await restarted.roll_back(admin.MonitorRollback(None), "adam")
     assert (back.added, back.removed, back.revision) == (["b.rv"], [], 3)
     assert {name: restarted.enabled(name) for name in restarted.names()} == {"a": False, "b": True}
-    rows = await restarted.revisions()
+    rows = (await restarted.revisions(admin.MonitorRevisions())).revisions
     assert [(row.revision, row.who, row.note) for row in rows] == [
         (3, "adam", "rolled back to revision 1"),
         (2, "eve", "removed b.rv"),
         (1, "disk", "read at start"),
     ]
     with pytest.raises(SpecificationsRefusedError, match="there is no revision 9; kept are: 1, 2, 3"):
-        await restarted.rollback(9, who="adam")
+        await restarted.roll_back(admin.MonitorRollback(9), "adam")
 
 
 async def test_a_refused_rollback_leaves_no_switch_behind(desk: Desk) -> None:
     """A monitor of that name that is loaded later is as if nobody had switched it."""
     (desk.folder / "b.rv").write_text(B)
     monitors = desk.monitors(enable="none")
-    await monitors.switch(["b"], True, who="eve")
-    await monitors.remove(["b"], who="eve")
+    await monitors.switch(admin.MonitorSwitch(["b"], True), "eve")
+    await monitors.remove(admin.MonitorRemove(["b"]), "eve")
     desk.findings = ["the relay says no"]
     with pytest.raises(SpecificationsRefusedError, match="the relay says no"):
-        await monitors.rollback(1, who="eve")
+        await monitors.roll_back(admin.MonitorRollback(1), "eve")
     desk.findings = []
-    await monitors.load(Sources({"b.rv": B}), who="eve", note="")
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
     assert not monitors.enabled("b")
 
 
@@ -225,19 +226,19 @@ async def test_what_is_not_confirmed_goes_back(desk: Desk) -> None:
     """The monitor that was removed on trial stands guard again, enabled as it was, also after a restart."""
     (desk.folder / "b.rv").write_text(B)
     monitors = desk.monitors(enable="none")
-    await monitors.switch(["b"], True, who="eve")
-    gone = await monitors.remove(["b"], who="eve", confirm_within=0.0)
+    await monitors.switch(admin.MonitorSwitch(["b"], True), "eve")
+    gone = await monitors.remove(admin.MonitorRemove(["b"], confirm_within=0.0), "eve")
     assert gone.confirm_by is not None
     await gone_back(monitors, 3)
     assert (monitors.names(), monitors.enabled("b"), monitors.confirm_by) == (["a", "b"], True, None)
     assert (monitors.who, monitors.note) == ("not confirmed in time", "rolled back to revision 1")
-    await monitors.remove(["b"], who="eve", confirm_within=300.0)
-    await monitors.remove(["a"], who="eve", confirm_within=300.0)
+    await monitors.remove(admin.MonitorRemove(["b"], confirm_within=300.0), "eve")
+    await monitors.remove(admin.MonitorRemove(["a"], confirm_within=300.0), "eve")
     restarted = desk.monitors(enable="none", restarted=True)
     assert restarted.names() == []
     assert restarted.confirm_by is not None
-    assert await restarted.confirm(who="eve")
-    assert not await restarted.confirm(who="eve")
+    assert (await restarted.confirm(admin.MonitorConfirm(), "eve")).confirmed
+    assert not (await restarted.confirm(admin.MonitorConfirm(), "eve")).confirmed
     again = desk.monitors(enable="none", restarted=True)
     assert (again.names(), again.confirm_by) == ([], None)
     assert [fields["who"] for event, fields in desk.trail.heard if event == "specifications confirmed"] == [
@@ -249,7 +250,7 @@ async def test_the_first_load_goes_back_to_nothing(tmp_path: Path) -> None:
     """Where there was no revision before."""
     desk = Desk(tmp_path)
     monitors = desk.monitors(folder=False)
-    await monitors.load(Sources({"b.rv": B}), who="eve", note="", confirm_within=0.0)
+    await monitors.load(admin.MonitorLoad({"b.rv": B}, confirm_within=0.0), "eve")
     await gone_back(monitors, 2)
     assert monitors.names() == []
     desk.store.close()
@@ -260,11 +261,11 @@ async def test_without_a_folder_a_reload_is_an_error(tmp_path: Path) -> None:
     """Nothing is removed, the words say what to do, and nothing is said to differ from a folder that is not there."""
     desk = Desk(tmp_path)
     monitors = desk.monitors(folder=False)
-    await monitors.load(Sources({"b.rv": B}), who="eve", note="")
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
     assert not monitors.differs_from_folder
     for prune in (False, True):
         with pytest.raises(SpecificationsRefusedError, match="no folder of specifications is configured"):
-            await monitors.reload(who="operator", prune=prune)
+            await monitors.reload(admin.MonitorReload(prune=prune), "operator")
     assert monitors.names() == ["b"]
     desk.store.close()
     desk.log.close()
@@ -274,17 +275,17 @@ async def test_a_bad_specification_changes_nothing(desk: Desk) -> None:
     """Whether control or the relay finds the fault; it is a record."""
     monitors = desk.monitors()
     with pytest.raises(SpecificationsRefusedError):
-        await monitors.load(Sources({"b.rv": "nonsense"}), who="eve", note="")
+        await monitors.load(admin.MonitorLoad({"b.rv": "nonsense"}), "eve")
     assert not desk.sent
     desk.findings = ["b.rv:1:1: error: something"]
     with pytest.raises(SpecificationsRefusedError, match="something"):
-        await monitors.load(Sources({"b.rv": B}), who="eve", note="")
+        await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
     assert (monitors.revision, monitors.names()) == (1, ["a"])
     assert [event for event, _ in desk.trail.heard].count("specifications refused") == 3
     desk.findings = []
     (desk.folder / "a.rv").write_text("nonsense")
     with pytest.raises(SpecificationsRefusedError):
-        await monitors.reload(who="eve")
+        await monitors.reload(admin.MonitorReload(), "eve")
     await desk.store.settled()
     with pytest.raises(SpecificationsRefusedError):
         desk.monitors()
@@ -294,7 +295,10 @@ async def test_a_switch_is_answered_when_the_relay_has_carried_it_out(desk: Desk
     """What is sent after the answer is judged by it: told is not done, nor when monitors are resumed."""
     monitors = desk.monitors()
     monitors.received(messages.SpecificationsTaken(1, [], ["a"], monitors.statement(0).statement))
-    for order in (monitors.switch(["a"], False, who="eve"), monitors.resume(["a"], who="eve")):
+    for order in (
+        monitors.switch(admin.MonitorSwitch(["a"], False), "eve"),
+        monitors.resume(admin.MonitorResume(["a"]), "eve"),
+    ):
         desk.carried_out.clear()
         told = len(desk.sent)
         task = asyncio.ensure_future(order)
@@ -305,20 +309,20 @@ async def test_a_switch_is_answered_when_the_relay_has_carried_it_out(desk: Desk
             await asyncio.sleep(0)
         assert not task.done()
         desk.carried_out.set()
-        assert await task == ["a"]
+        assert (await task).names == ["a"]
 
 
 async def test_switches_are_kept_and_recorded(desk: Desk) -> None:
     """Only what changes is told and recorded; `--enable` is for those that nobody has switched."""
     monitors = desk.monitors("none")
     assert monitors.enabled("a") is False
-    assert await monitors.switch(["a", "a"], True, who="eve") == ["a"]
-    assert await monitors.switch(["a"], True, who="eve") == []
+    assert (await monitors.switch(admin.MonitorSwitch(["a", "a"], True), "eve")).names == ["a"]
+    assert (await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")).names == []
     assert desk.sent == [messages.MonitorSwitched("a", True)]
     assert desk.monitors("none").enabled("a") is True
     assert monitors.statement().enabled == {"a": True}
     with pytest.raises(UnknownMonitorError, match="there are: a"):
-        await monitors.switch(["nobody"], True, who="eve")
+        await monitors.switch(admin.MonitorSwitch(["nobody"], True), "eve")
     with pytest.raises(SpecificationsRefusedError, match="--enable"):
         desk.monitors("a,nobody")
     assert [fields["who"] for event, fields in desk.trail.heard if event == "monitor enabled"] == ["eve"]
@@ -329,7 +333,7 @@ async def test_a_monitor_that_was_removed_while_the_robot_ran_does_not_keep_it_f
 ) -> None:
     """Though `--enable` still names it; nor does a crash of control."""
     monitors = desk.monitors("a")
-    await monitors.remove(["a"], who="eve")
+    await monitors.remove(admin.MonitorRemove(["a"]), "eve")
     assert desk.monitors("a").names() == []
     assert desk.monitors("a", restarted=True).names() == []
 
@@ -345,7 +349,7 @@ async def test_a_relay_that_follows_another_is_an_alarm_and_holds(desk: Desk) ->
     monitors.received(messages.SpecificationsTaken(1, ["a", "b"], ["b"]))
     assert [fields["held"] for event, fields in desk.trail.heard if event == "monitors restarted"] == [["b"]]
     assert monitors.held == {"b"}
-    assert await monitors.resume(["a", "b"], who="eve") == ["b"]
+    assert (await monitors.resume(admin.MonitorResume(["a", "b"]), "eve")).names == ["b"]
     assert desk.sent[-1] == messages.MonitorResumed("b")
     await desk.store.settled()
     control = desk.monitors(restarted=True)
@@ -359,35 +363,35 @@ async def test_what_others_use_is_not_removed_alone(desk: Desk) -> None:
     monitors = desk.monitors()
     user = "c() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
     await monitors.load(
-        Sources({"c.rv": user + "\nd() { event said() /x std_msgs/String '{}' { } }"}), who="eve", note=""
+        admin.MonitorLoad({"c.rv": user + "\nd() { event said() /x std_msgs/String '{}' { } }"}), "eve"
     )
     for names in (["a"], ["c"]):
         with pytest.raises(SpecificationsRefusedError):
-            await monitors.remove(names, who="eve")
+            await monitors.remove(admin.MonitorRemove(names), "eve")
     with pytest.raises(UnknownMonitorError):
-        await monitors.remove(["nobody"], who="eve")
-    assert (await monitors.remove(["c", "d"], who="eve")).removed == ["c.rv"]
-    assert (await monitors.remove(["a.rv"], who="eve")).removed == ["a.rv"]
+        await monitors.remove(admin.MonitorRemove(["nobody"]), "eve")
+    assert (await monitors.remove(admin.MonitorRemove(["c", "d"]), "eve")).removed == ["c.rv"]
+    assert (await monitors.remove(admin.MonitorRemove(["a.rv"]), "eve")).removed == ["a.rv"]
 
 
 async def test_a_change_that_is_meant_for_other_monitors_is_refused(desk: Desk) -> None:
     """Two engineers cannot overwrite each other: not after a load, a switch, or a resumption."""
     monitors = desk.monitors()
     seen = [monitors.tag]
-    await monitors.load(Sources({"b.rv": B}), who="adam", note="", expected=monitors.tag)
+    await monitors.load(admin.MonitorLoad({"b.rv": B}, expected=monitors.tag), "adam")
     seen.append(monitors.tag)
-    await monitors.switch(["a"], False, who="adam", expected=monitors.tag)
+    await monitors.switch(admin.MonitorSwitch(["a"], False, expected=monitors.tag), "adam")
     seen.append(monitors.tag)
     monitors.received(messages.SpecificationsTaken(2, [], ["b"]))
-    await monitors.resume(["b"], who="adam", expected=monitors.tag)
+    await monitors.resume(admin.MonitorResume(["b"], expected=monitors.tag), "adam")
     assert len({*seen, monitors.tag}) == 4
     for stale in seen:
         changes: list[Callable[[], Any]] = [
-            partial(monitors.load, Sources({"b.rv": B}), who="eve", note="", expected=stale),
-            partial(monitors.reload, who="eve", expected=stale),
-            partial(monitors.remove, ["a"], who="eve", expected=stale),
-            partial(monitors.switch, ["a"], True, who="eve", expected=stale),
-            partial(monitors.resume, ["b"], who="eve", expected=stale),
+            partial(monitors.load, admin.MonitorLoad({"b.rv": B}, expected=stale), "eve"),
+            partial(monitors.reload, admin.MonitorReload(expected=stale), "eve"),
+            partial(monitors.remove, admin.MonitorRemove(["a"], expected=stale), "eve"),
+            partial(monitors.switch, admin.MonitorSwitch(["a"], True, expected=stale), "eve"),
+            partial(monitors.resume, admin.MonitorResume(["b"], expected=stale), "eve"),
         ]
         for change in changes:
             with pytest.raises(MonitorsChangedError, match="look at them first") as caught:
@@ -399,11 +403,11 @@ async def test_a_change_that_is_meant_for_other_monitors_is_refused(desk: Desk) 
 async def test_a_switch_goes_with_its_monitor(desk: Desk) -> None:
     """One that is loaded later under its name is as `--enable` says; so it is in the next life of control."""
     monitors = desk.monitors()
-    await monitors.switch(["a"], False, who="eve")
-    await monitors.load(Sources({"a.rv": A.replace("{", "{ int n;", 1)}), who="eve", note="")
+    await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")
+    await monitors.load(admin.MonitorLoad({"a.rv": A.replace("{", "{ int n;", 1)}), "eve")
     assert not monitors.enabled("a")
-    await monitors.remove(["a"], who="eve")
-    await monitors.load(Sources({"a.rv": A}), who="eve", note="")
+    await monitors.remove(admin.MonitorRemove(["a"]), "eve")
+    await monitors.load(admin.MonitorLoad({"a.rv": A}), "eve")
     assert monitors.enabled("a")
     assert desk.monitors(restarted=True).enabled("a")
 
@@ -415,7 +419,7 @@ async def test_a_monitor_is_not_resumed_while_its_relay_is_away(desk: Desk) -> N
     monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
     desk.away = True
     with pytest.raises(SpecificationsRefusedError, match="b not resumed: the relay process is away"):
-        await monitors.resume(["b"], who="eve")
+        await monitors.resume(admin.MonitorResume(["b"]), "eve")
     assert "monitor resumed" not in [event for event, _ in desk.trail.heard]
     assert monitors.held == {"b"}
 
@@ -427,9 +431,9 @@ async def test_of_two_changes_for_the_same_monitors_one_is_made(desk: Desk) -> N
     monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
     tag = monitors.tag
     done = await asyncio.gather(
-        monitors.load(Sources({"c.rv": A.replace("a()", "c()")}), who="adam", note="", expected=tag),
-        monitors.switch(["a"], False, who="eve", expected=tag),
-        monitors.resume(["b"], who="eve", expected=tag),
+        monitors.load(admin.MonitorLoad({"c.rv": A.replace("a()", "c()")}, expected=tag), "adam"),
+        monitors.switch(admin.MonitorSwitch(["a"], False, expected=tag), "eve"),
+        monitors.resume(admin.MonitorResume(["b"], expected=tag), "eve"),
         return_exceptions=True,
     )
     assert [isinstance(one, MonitorsChangedError) for one in done] == [False, True, True]
@@ -441,15 +445,15 @@ async def test_the_tag_is_that_of_what_changed_something(desk: Desk) -> None:
     """A switch that was so already, an unknown name and a bad specification leave it; no start brings one back."""
     monitors = desk.monitors()
     first = monitors.tag
-    assert await monitors.switch(["a"], True, who="eve") == []
-    assert await monitors.resume(["a"], who="eve") == []
+    assert (await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")).names == []
+    assert (await monitors.resume(admin.MonitorResume(["a"]), "eve")).names == []
     with pytest.raises(UnknownMonitorError):
-        await monitors.switch(["a", "nobody"], False, who="eve")
+        await monitors.switch(admin.MonitorSwitch(["a", "nobody"], False), "eve")
     with pytest.raises(SpecificationsRefusedError):
-        await monitors.load(Sources({"b.rv": "nonsense"}), who="eve", note="")
+        await monitors.load(admin.MonitorLoad({"b.rv": "nonsense"}), "eve")
     assert monitors.tag == first
-    await monitors.switch(["a"], False, who="eve")
-    await monitors.switch(["a"], True, who="eve")
+    await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")
+    await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")
     assert monitors.tag != first
     assert desk.monitors().tag == desk.monitors(restarted=True).tag == monitors.tag
 
@@ -501,24 +505,24 @@ async def test_where_the_site_signs_nothing_else_comes_into_force(desk: Desk) ->
         Sources({"a.rv": A + "//"}),
     ):
         with pytest.raises(SpecificationsRefusedError):
-            await monitors.load(new, who="eve", note="")
+            await monitors.load(admin.MonitorLoad(**asdict(new)), "eve")
     with pytest.raises(SpecificationsRefusedError, match=r"msg/own/T.msg:1:1: error: it has no signature"):
         await monitors.load(
-            Sources({"a.rv": A}, {"own/T.msg": "int32 x"}, {"a.rv": signed(A)}), who="eve", note=""
+            admin.MonitorLoad({"a.rv": A}, {"own/T.msg": "int32 x"}, signatures={"a.rv": signed(A)}), "eve"
         )
     with pytest.raises(SpecificationsRefusedError, match=unsigned):
-        await monitors.rollback(1, who="eve")
+        await monitors.roll_back(admin.MonitorRollback(1), "eve")
     assert monitors.revision == 2
-    await monitors.load(sources(b=B), who="adam", note="")
-    await monitors.remove(["a"], who="adam")
+    await monitors.load(admin.MonitorLoad(**asdict(sources(b=B))), "adam")
+    await monitors.remove(admin.MonitorRemove(["a"]), "adam")
     assert monitors.sources == sources(b=B)
-    await monitors.rollback(3, who="adam")
+    await monitors.roll_back(admin.MonitorRollback(3), "adam")
     assert monitors.sources == sources(a=A, b=B)
     (desk.folder / "a.rv").write_text(A + " ")
     with pytest.raises(SpecificationsRefusedError, match="it is not the text that"):
-        await monitors.reload(who="adam")
+        await monitors.reload(admin.MonitorReload(), "adam")
     beside.write_text(signed(A + " "))
-    assert (await monitors.reload(who="adam")).changed == ["a.rv"]
+    assert (await monitors.reload(admin.MonitorReload(), "adam")).changed == ["a.rv"]
     assert desk.monitors(restarted=True, site_keys=[LINE]).sources == sources(a=A + " ", b=B)
     with pytest.raises(SpecificationsRefusedError, match="rosrv monitor reset"):
         desk.monitors(restarted=True, site_keys=[OTHER_LINE])
@@ -538,7 +542,7 @@ async def test_a_signature_that_changes_is_a_change(desk: Desk) -> None:
     for path, text in texts.items():
         Path(f"{path}.sig").write_text(signed(text, OTHER_KEY))
     differs.append(monitors.differs_from_folder)
-    await monitors.reload(who="adam")
+    await monitors.reload(admin.MonitorReload(), "adam")
     assert [*differs, monitors.differs_from_folder] == [False, True, False]
     assert desk.monitors(restarted=True, site_keys=[OTHER_LINE]).names() == ["a"]
 
@@ -546,8 +550,8 @@ async def test_a_signature_that_changes_is_a_change(desk: Desk) -> None:
 async def test_a_trial_is_told_kept_and_promoted(desk: Desk) -> None:
     """It is not enabled; it survives a restart; the relays compile anew when it begins and when it ends."""
     monitors = desk.monitors()
-    assert await monitors.try_out(["a"], who="eve") == ["a"]
-    assert await monitors.try_out(["a"], who="eve") == []
+    assert (await monitors.trial(admin.MonitorTrial(["a"], True), "eve")).names == ["a"]
+    assert (await monitors.trial(admin.MonitorTrial(["a"], True), "eve")).names == []
     assert (monitors.enabled("a"), monitors.on_trial("a")) == (False, True)
     stated = desk.sent[-1]
     assert isinstance(stated, messages.SpecificationsStated)
@@ -557,14 +561,14 @@ async def test_a_trial_is_told_kept_and_promoted(desk: Desk) -> None:
         assert again.on_trial("a")
         assert again.statement().trials == ("a",)
     with pytest.raises(SpecificationsRefusedError, match="rosrv monitor promote"):
-        await monitors.switch(["a"], True, who="eve")
-    assert await monitors.promote(["a"], who="adam") == ["a"]
+        await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")
+    assert (await monitors.trial(admin.MonitorTrial(["a"], False), "adam")).names == ["a"]
     assert monitors.enabled("a")
     assert monitors.statement().trials == ()
-    assert await monitors.promote(["a"], who="adam") == []
-    await monitors.switch(["a"], False, who="eve")
+    assert (await monitors.trial(admin.MonitorTrial(["a"], False), "adam")).names == []
+    await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")
     with pytest.raises(SpecificationsRefusedError, match="a is disabled, not on trial"):
-        await monitors.promote(["a"], who="eve")
+        await monitors.trial(admin.MonitorTrial(["a"], False), "eve")
     said = [(event, fields["who"]) for event, fields in desk.trail.heard if event.startswith("monitor ")]
     assert said == [("monitor on trial", "eve"), ("monitor enabled", "adam"), ("monitor disabled", "eve")]
 
@@ -572,16 +576,16 @@ async def test_a_trial_is_told_kept_and_promoted(desk: Desk) -> None:
 async def test_a_trial_that_is_disabled_is_over(desk: Desk) -> None:
     """It is as any disabled monitor; and a switch goes with its monitor."""
     monitors = desk.monitors()
-    await monitors.try_out(["a"], who="eve")
-    assert await monitors.switch(["a"], False, who="eve") == ["a"]
+    await monitors.trial(admin.MonitorTrial(["a"], True), "eve")
+    assert (await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")).names == ["a"]
     assert (monitors.enabled("a"), monitors.on_trial("a")) == (False, False)
     assert monitors.statement().trials == ()
     assert monitors.statement().enabled == {"a": False}
-    await monitors.try_out(["a"], who="eve")
-    await monitors.remove(["a"], who="eve")
-    await monitors.load(Sources({"a.rv": A}), who="eve", note="")
+    await monitors.trial(admin.MonitorTrial(["a"], True), "eve")
+    await monitors.remove(admin.MonitorRemove(["a"]), "eve")
+    await monitors.load(admin.MonitorLoad({"a.rv": A}), "eve")
     assert monitors.enabled("a")
-    await monitors.rollback(1, who="eve")
+    await monitors.roll_back(admin.MonitorRollback(1), "eve")
     assert monitors.enabled("a")
 
 
@@ -590,7 +594,7 @@ async def test_a_relay_that_does_not_take_a_trial_leaves_everything(desk: Desk) 
     monitors = desk.monitors()
     desk.findings = ["no"]
     with pytest.raises(SpecificationsRefusedError, match="no"):
-        await monitors.try_out(["a"], who="eve")
+        await monitors.trial(admin.MonitorTrial(["a"], True), "eve")
     desk.findings = []
     assert monitors.enabled("a")
     assert monitors.statement().trials == ()
@@ -605,31 +609,31 @@ async def test_what_shares_variables_is_on_trial_together(desk: Desk) -> None:
     (desk.folder / "u.rv").write_text(USER)
     monitors = desk.monitors()
     with pytest.raises(SpecificationsRefusedError, match="u on trial and a in force do not go together"):
-        await monitors.try_out(["u"], who="eve")
-    assert await monitors.try_out(["u", "a"], who="eve") == ["u", "a"]
+        await monitors.trial(admin.MonitorTrial(["u"], True), "eve")
+    assert (await monitors.trial(admin.MonitorTrial(["u", "a"], True), "eve")).names == ["u", "a"]
     with pytest.raises(SpecificationsRefusedError, match="share variables"):
-        await monitors.promote(["a"], who="eve")
-    await monitors.load(Sources({"v.rv": USER.replace("u()", "v()")}), who="eve", note="")
+        await monitors.trial(admin.MonitorTrial(["a"], False), "eve")
+    await monitors.load(admin.MonitorLoad({"v.rv": USER.replace("u()", "v()")}), "eve")
     assert monitors.statement().trials == ("a", "u", "v")
     assert desk.monitors(restarted=True).on_trial("v")
-    await monitors.load(Sources({"c.rv": C}), who="eve", note="")
+    await monitors.load(admin.MonitorLoad({"c.rv": C}), "eve")
     uses_both = C.replace("{ }", "{ shared = 2; }")
     with pytest.raises(SpecificationsRefusedError, match="a, u, v on trial and c in force"):
-        await monitors.load(Sources({"c.rv": uses_both}), who="eve", note="")
+        await monitors.load(admin.MonitorLoad({"c.rv": uses_both}), "eve")
     assert monitors.enabled("c")
-    assert await monitors.switch(["v"], False, who="eve") == ["v"]
+    assert (await monitors.switch(admin.MonitorSwitch(["v"], False), "eve")).names == ["v"]
     assert monitors.statement().trials == ("a", "u")
-    assert await monitors.promote(["a", "u"], who="eve") == ["a", "u"]
+    assert (await monitors.trial(admin.MonitorTrial(["a", "u"], False), "eve")).names == ["a", "u"]
 
 
 async def test_a_rollback_brings_a_trial_back(desk: Desk) -> None:
     """A monitor that comes back is on trial as it was when it went."""
     monitors = desk.monitors()
-    await monitors.load(Sources({"c.rv": C}), who="eve", note="")
-    await monitors.try_out(["c"], who="eve")
-    await monitors.remove(["c"], who="eve")
+    await monitors.load(admin.MonitorLoad({"c.rv": C}), "eve")
+    await monitors.trial(admin.MonitorTrial(["c"], True), "eve")
+    await monitors.remove(admin.MonitorRemove(["c"]), "eve")
     assert not monitors.on_trial("c")
-    await monitors.rollback(2, who="eve")
+    await monitors.roll_back(admin.MonitorRollback(2), "eve")
     assert monitors.on_trial("c")
 
 

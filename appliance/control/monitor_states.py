@@ -1,0 +1,93 @@
+"""How the monitors stand, for whoever looks."""
+
+import msgspec
+
+from appliance.channel.answers import monitors as answers
+from appliance.channel.answers.status import MonitorsState
+from appliance.channel.messages import Approach, MarginRow
+from appliance.rosmop.positions import line_of
+from appliance.specifications.monitors import Monitors
+
+
+def monitors_of(monitors: Monitors, rv_state: list[object], *, texts: bool) -> answers.Monitors:
+    """All monitors with state and counters; with `texts`, the specifications too."""
+    return answers.Monitors(
+        revision=monitors.revision,
+        tag=monitors.tag,
+        who=monitors.who,
+        note=monitors.note,
+        loaded=monitors.loaded,
+        confirm_by=monitors.confirm_by,
+        folder=str(monitors.folder) if monitors.folder is not None else None,
+        differs_from_folder=monitors.differs_from_folder,
+        warnings=list(monitors.checked.warnings),
+        refused=monitors.refused,
+        site_keys=list(monitors.site_keys),
+        rv_state=msgspec.convert(rv_state, answers.RvState),
+        monitors=states_of(monitors),
+        **(msgspec.structs.asdict(monitors.sources) if texts else {}),
+    )
+
+
+def monitors_status(monitors: Monitors) -> MonitorsState:
+    """The few words of `rosrv status`."""
+    rows = states_of(monitors)
+    return MonitorsState(
+        revision=monitors.revision,
+        tag=monitors.tag,
+        loaded=len(rows),
+        enabled=sum(row.enabled for row in rows),
+        held=[row.name for row in rows if row.held],
+        failing=[row.name for row in rows if row.failing and not row.trial],
+        refused=monitors.refused,
+        who=monitors.who,
+        differs_from_folder=monitors.differs_from_folder,
+        confirm_by=monitors.confirm_by,
+        trials=[row.name for row in rows if row.trial],
+    )
+
+
+def states_of(monitors: Monitors) -> list[answers.MonitorState]:
+    """Every monitor, in the order in which they see messages."""
+    return [_state(monitors, name) for name in monitors.names()]
+
+
+def _state(monitors: Monitors, name: str) -> answers.MonitorState:
+    row, checked = monitors.rows.get(name), monitors.checked
+    drops, changes = (row.drops, row.changes) if row is not None else (0, 0)
+    tried = row is not None and row.trial
+    return answers.MonitorState(
+        name=name,
+        file=checked.monitors[name],
+        enabled=monitors.enabled(name),
+        held=name in monitors.held,
+        failing=row is not None and row.failing,
+        topics=sorted(checked.topics[name]),
+        services=sorted(checked.services[name]),
+        events=row.events if row is not None else 0,
+        verdicts=row.verdicts if row is not None else 0,
+        drops=0 if tried else drops,
+        changes=0 if tried else changes,
+        faults=row.faults if row is not None else 0,
+        certificates=checked.certificates.get(name, []),
+        trial=monitors.on_trial(name),
+        would_drop=drops if tried else 0,
+        would_change=changes if tried else 0,
+        missed=row.missed if row is not None else 0,
+        slices=row.slices if row is not None else 0,
+        slice_limit=row.slice_limit if row is not None else 0,
+        margins=[]
+        if row is None
+        else [_margin(each, monitors.sources.files.get(row.file, "")) for each in row.margins],
+    )
+
+
+def _margin(row: MarginRow, text: str) -> answers.MonitorMargin:
+    def approach(sides: Approach) -> answers.Approach:
+        reached = None if row.threshold is None else (sides.right, sides.left)[row.threshold]
+        return answers.Approach(sides.time / 1e9, sides.left, sides.right, sides.distance, reached)
+
+    today = approach(row.today) if row.today is not None else None
+    return answers.MonitorMargin(
+        row.line, row.column, line_of(text, row.line), row.holds, approach(row.load), today
+    )
