@@ -1,7 +1,7 @@
 """What operators can do with the running appliance, over the admin socket and over REST alike.
 
 One core for both: a request of `appliance.channel.admin` in, an answer out. A request is answered by the method that
-takes it: of `Looks`, `PolicyOrders`, `Monitors`, `Tokens`, `RecordingOrders`, `EvidenceOrders`, or `Hosts` and
+takes it: of `Looks`, `Policies`, `Monitors`, `Tokens`, `RecordingOrders`, `EvidenceOrders`, or `Hosts` and
 its parts. To add a question, write the request and the struct that answers it, and such a method.
 """
 
@@ -15,8 +15,7 @@ from appliance.channel.admin import A
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
 from appliance.control.looks import Looks
-from appliance.control.policies import PolicyRefusedError, RevisionChangedError
-from appliance.control.policy_orders import PolicyOrders
+from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.control.recording_orders import RecorderAwayError, RecordingOrders
 from appliance.control.tokens import TokenRefusedError, Tokens
 from appliance.hosts.certification import Certification
@@ -49,7 +48,7 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     NotSealedError: "failed",
 }
 Orders = (
-    PolicyOrders | Monitors | Tokens | RecordingOrders | EvidenceOrders
+    Policies | Monitors | Tokens | RecordingOrders | EvidenceOrders
     | Hosts | SelfService | CheckedPorts | Certification
 )  # fmt: skip
 _Method = Callable[..., Awaitable[Any]]

@@ -2,19 +2,28 @@
 
 A new policy is checked, run against its own tests and compiled before anything changes; a bad one changes nothing
 and says everything that is wrong with it. Every policy that came into force is a revision in the store.
+
+Operators' changes are made one at a time, and one that names the revision it is meant for is refused when another is in
+force by then. A change is answered when it is on the disk and the relays have carried it out: who was told that
+something is taken back can rely on it that nothing of it goes through any more.
 """
 
 import asyncio
+import contextlib
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import structlog
 
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
+from appliance.channel import admin
+from appliance.channel.answers import policy as answers
 from appliance.channel.answers.policy import Loaded
+from appliance.control.errors import UnknownThingError
 from appliance.fingerprints import fingerprint
 from appliance.policy import Known, Policy, PolicyError, judge
 from appliance.policy.hosts import Network
@@ -55,7 +64,7 @@ class RevisionChangedError(Exception):
 
 
 class Policies:
-    """Keeps the policy in force. Changes are made one at a time by whoever calls (`Administration` has the lock)."""
+    """Keeps the policy in force. What operators ask of it is answered by the method that takes the request."""
 
     def __init__(
         self,
@@ -66,12 +75,14 @@ class Policies:
         robot: Collection[Address | Network],
         hosts: Callable[[], Mapping[str, Address]],
         changed: Callable[[Policy, Policy], int],
+        carried_out: Callable[[], Awaitable[None]],
         site_keys: Sequence[str],
     ) -> None:
         """`hosts()` is what `host:NAME` means now; `hosts_changed` is to be called when it means another thing.
 
-        `changed(before, policy)` decides again what is live, and says how much was revoked. Where there are
-        `site_keys`, whatever comes into force is signed with one of them.
+        `changed(before, policy)` decides again what is live, and says how much was revoked; `carried_out()` waits until
+        the relays have done what they were told. Where there are `site_keys`, whatever comes into force is signed with
+        one of them.
         """
         self.file = file
         self.store = store
@@ -79,6 +90,8 @@ class Policies:
         self._robot = robot
         self._hosts = hosts
         self._changed = changed
+        self._carried_out = carried_out
+        self._one_change = asyncio.Lock()
         self._site_keys = site_keys
         self._current: Policy | None = None
         self.trial = Trial(store, "confirm", self._go_back, (PolicyRefusedError,))
@@ -130,35 +143,46 @@ class Policies:
             self.trial.end()
             self._keep(policy, signature, who=_DISK, note="read at start")
 
-    async def reload(self, *, who: str = _DISK, confirm_within: float | None = None) -> Loaded:
+    @contextlib.asynccontextmanager
+    async def _changing(self, expected: int | None) -> AsyncIterator[None]:
+        """Around an operator's change; it is on the disk and carried out afterwards."""
+        async with self._one_change:
+            if expected not in (None, self.revision):
+                raise RevisionChangedError(expected, self.revision)
+            yield
+            await self.store.settled()
+            await self._carried_out()
+
+    async def reload(self, request: admin.PolicyReload, who: str) -> Loaded:
         """Read the file again: check, test, swap, decide again what is live.
 
         Raises `PolicyRefusedError`, and `RevisionChangedError` when another revision came into force meanwhile. The
         revision is the disk's, whoever asked for it: `who` is for the record.
         """
-        before = self.revision
-        policy, signature = await self._prepared(self._read, str(self.file), who)
-        self.trial.announce(before, confirm_within)
-        revoked = self._keep(policy, signature, who=_DISK, note="reloaded from disk", by=who)
-        return self._answer(policy, before, revoked, confirm_within)
+        by, within = _DISK if who == "operator" else who, request.confirm_within
+        async with self._changing(request.expected):
+            before = self.revision
+            policy, signature = await self._prepared(self._read, str(self.file), by)
+            self.trial.announce(before, within)
+            revoked = self._keep(policy, signature, who=_DISK, note="reloaded from disk", by=by)
+            return self._answer(policy, before, revoked, within)
 
-    async def load_text(
-        self, text: str, signature: str, *, who: str, note: str, confirm_within: float | None = None
-    ) -> Loaded:
+    async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
         """Bring a text that is not the file's into force, as `reload` does.
 
         What was loaded so already, and is in force, stays as it is: the same text twice is one revision.
         Raises `PolicyRefusedError`, `RevisionChangedError`. Its rules are cited as `revision N:line`, for the file
         says something else.
         """
-        before = self.revision
-        now = self.in_force
-        if now.who != _DISK and (now.text, now.signature) == (text, signature):
-            return Loaded(before, before, [str(one) for one in self.current.warnings], 0, self.confirm_by)
-        policy, _ = await self._prepared(lambda: (text, signature), f"revision {self._next_number()}", who)
-        self.trial.announce(before, confirm_within)
-        revoked = self._keep(policy, signature, who=who, note=note or "posted")
-        return self._answer(policy, before, revoked, confirm_within)
+        given, within = (request.text, request.signature), request.confirm_within
+        async with self._changing(request.expected):
+            before, now = self.revision, self.in_force
+            if now.who != _DISK and (now.text, now.signature) == given:
+                return Loaded(before, before, [str(one) for one in self.current.warnings], 0, self.confirm_by)
+            policy, signature = await self._prepared(lambda: given, f"revision {self._next_number()}", who)
+            self.trial.announce(before, within)
+            revoked = self._keep(policy, signature, who=who, note=request.note or "posted")
+            return self._answer(policy, before, revoked, within)
 
     def hosts_changed(self) -> int:
         """Compile the policy in force again, for hosts were enrolled or revoked; how much was taken back."""
@@ -170,8 +194,13 @@ class Policies:
             return 0
         return self._changed(before, self._current)
 
+    async def roll_back(self, request: admin.PolicyRollback, who: str) -> Loaded:
+        """Bring a kept revision into force. Raises `PolicyRefusedError`, `RevisionChangedError`."""
+        async with self._changing(request.expected):
+            return self.rollback(request.revision, who=who)
+
     def rollback(self, revision: int | None, *, who: str) -> Loaded:
-        """Bring a kept revision into force (None: the one before this). Raises `PolicyRefusedError`."""
+        """Bring a kept revision into force (None: the one before this) at once. Raises `PolicyRefusedError`."""
         before = self.revision
         try:
             row = wanted(self.store.revisions(), revision, before)
@@ -181,19 +210,54 @@ class Policies:
         revoked = self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
         return self._answer(policy, before, revoked, None)
 
-    def confirm(self, *, who: str) -> bool:
-        """Keep an unconfirmed change; False when there is none."""
-        if self.confirm_by is None:
-            return False
-        self.trial.end()
-        self._trail.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
-        return True
+    async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
+        """Keep an unconfirmed change, if there is one. Raises `RevisionChangedError`."""
+        async with self._changing(request.expected):
+            waited = self.confirm_by is not None
+            if waited:
+                self.trial.end()
+                self._trail.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
+            return answers.PolicyConfirmed(waited, self.revision)
 
-    def revision_row(self, revision: int | None) -> RevisionRow | None:
-        """A kept revision (None: the one in force); None when it is not kept."""
-        if revision is None or revision == self.revision:
-            return self.in_force
-        return next((row for row in self.store.revisions() if row.revision == revision), None)
+    async def revisions(self, _request: admin.PolicyRevisions) -> answers.PolicyRevisionList:
+        """The kept revisions."""
+        rows = self.store.revisions()
+        return answers.PolicyRevisionList([answers.PolicyRevision(**self._described(row)) for row in rows])
+
+    async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
+        """A revision, and with what its text is judged. Raises `UnknownThingError`."""
+        return await asyncio.to_thread(self._text, request.revision, self.known)
+
+    def _text(self, revision: int | None, known: Known) -> answers.PolicyKnown:
+        now = revision is None or revision == self.revision
+        row = (
+            self.in_force
+            if now
+            else next(filter(lambda row: row.revision == revision, self.store.revisions()), None)
+        )
+        if row is None:
+            raise UnknownThingError(f"there is no revision {revision}")
+        return answers.PolicyKnown(
+            **self._described(row),
+            text=row.text,
+            signature=row.signature,
+            policy_file=str(self.file),
+            differs_from_file=self.differs_from_file,
+            warnings=[str(warning) for warning in self.current.warnings],
+            confirm_by=self.confirm_by,
+            **self.with_cases(known).fields(),
+        )
+
+    def _described(self, row: RevisionRow) -> dict[str, Any]:
+        """The fields of `PolicyRevision`."""
+        return {
+            "revision": row.revision,
+            "file": row.file,
+            "loaded": row.loaded,
+            "who": row.who,
+            "note": row.note,
+            "in_force": row.revision == self.revision,
+        }
 
     @property
     def known(self) -> Known:

@@ -22,7 +22,7 @@ from appliance.audit.record import Severity
 from appliance.audit.retention import Retention
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
-from appliance.channel.admin import HostsReload
+from appliance.channel.admin import HostsReload, PolicyReload
 from appliance.channel.answers.status import AuditState
 from appliance.channel.channel import Channel
 from appliance.config import Settings, load_resolved
@@ -36,7 +36,6 @@ from appliance.control.forwarder import Forwarded
 from appliance.control.lifeline import ControlLifeline
 from appliance.control.looks import Looks
 from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
-from appliance.control.policy_orders import PolicyOrders
 from appliance.control.rest import RestLink
 from appliance.control.robot import master_address, robot_addresses
 from appliance.control.signing import Signing
@@ -156,6 +155,7 @@ class _Control:
             robot=robot_addresses(self._settings),
             hosts=lambda: self._tunnels.addresses,
             changed=lambda before, policy: self._parts.policy_changed(before, policy),  # noqa: PLW0108 - made later
+            carried_out=lambda: self._parts.relay.carried_out(),  # noqa: PLW0108 - made later
             site_keys=self._settings.site_keys,
         )
         policies.start(restarted=restarted)
@@ -241,7 +241,7 @@ class _Control:
         )
         administration = Administration(
             looks,
-            PolicyOrders(base.policies, base.store, parts.relay.carried_out),
+            base.policies,
             parts.monitors,
             self._hosts,
             self._hosts.itself,
@@ -413,7 +413,7 @@ async def _reload_policy(policies: Policies) -> None:
     """The file as it is now, also when another revision comes into force meanwhile. Raises `PolicyRefusedError`."""
     while True:
         try:
-            await policies.reload()
+            await policies.reload(PolicyReload(), "disk")
         except RevisionChangedError:
             continue
         return

@@ -11,6 +11,7 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.channel.admin import PolicyConfirm, PolicyLoad, PolicyReload
 from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.policy import Policy, judging
 from appliance.policy.model import Address, Category, Request
@@ -25,6 +26,10 @@ OTHER = OPEN.replace("default=*", "default=10.0.0.5", 1)
 def fail(reason: str) -> None:
     """The store could not write."""
     raise AssertionError(reason)
+
+
+async def at_once() -> None:
+    """The relays have carried out what they were told."""
 
 
 class Appliance:
@@ -49,7 +54,14 @@ class Appliance:
         store = StateStore(self.state, failed=fail)
         records = cast(Any, Records())
         policies = Policies(
-            self.file, store, records, robot=(), hosts=hosts, changed=changed, site_keys=site_keys
+            self.file,
+            store,
+            records,
+            robot=(),
+            hosts=hosts,
+            changed=changed,
+            carried_out=at_once,
+            site_keys=site_keys,
         )
         policies.start(restarted=restarted)
         try:
@@ -72,7 +84,7 @@ async def test_an_unconfirmed_change_goes_back_after_a_start_of_the_appliance(tm
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
-        await policies.reload(confirm_within=1.5)
+        await policies.reload(PolicyReload(confirm_within=1.5), "operator")
         deadline = policies.confirm_by
     with appliance.started() as policies:
         assert (policies.revision, policies.current.text) == (2, OTHER)
@@ -90,7 +102,7 @@ async def test_a_file_that_was_edited_ends_the_time_limit(tmp_path: Path) -> Non
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
-        await policies.reload(confirm_within=0.0)
+        await policies.reload(PolicyReload(confirm_within=0.0), "operator")
     appliance.file.write_text(OTHER + "# edited\n")
     with appliance.started() as policies:
         assert (policies.revision, policies.confirm_by) == (3, None)
@@ -103,11 +115,11 @@ async def test_a_change_stays_confirmed_over_a_crash(tmp_path: Path) -> None:
     appliance = Appliance(tmp_path)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
-        await policies.reload(confirm_within=300.0)
+        await policies.reload(PolicyReload(confirm_within=300.0), "operator")
     with appliance.started(restarted=True) as policies:
         assert policies.confirm_by is not None
         assert policies.confirm_by > time.time()
-        assert policies.confirm(who="operator")
+        assert (await policies.confirm(PolicyConfirm(), "operator")).confirmed
     with appliance.started(restarted=True) as policies:
         assert (policies.revision, policies.confirm_by) == (2, None)
 
@@ -138,7 +150,7 @@ async def test_a_reload_does_not_keep_nodes_waiting(tmp_path: Path, monkeypatch:
     slow = Slow(monkeypatch, appliance)
     with appliance.started() as policies:
         appliance.file.write_text(OTHER)
-        loading = asyncio.ensure_future(policies.reload())
+        loading = asyncio.ensure_future(policies.reload(PolicyReload(), "operator"))
         await slow.until_begun()
         assert policies.revision == 1
         slow.over.set()
@@ -154,7 +166,7 @@ async def test_a_reload_that_another_change_overtakes_is_refused(
     slow = Slow(monkeypatch, appliance)
     with appliance.started() as policies:
         await policies.store.settled()
-        loading = asyncio.ensure_future(policies.reload())
+        loading = asyncio.ensure_future(policies.reload(PolicyReload(), "operator"))
         await slow.until_begun()
         policies.rollback(1, who="not confirmed in time")
         slow.over.set()
@@ -172,7 +184,7 @@ async def test_hosts_that_change_while_a_policy_is_tested_are_known_to_it(
     hosts = {"ocu": ipaddress.ip_address("10.0.0.7"), "new": ipaddress.ip_address("10.0.0.8")}
     with appliance.started(hosts=lambda: hosts) as policies:
         appliance.file.write_text(OPEN.replace("[Nodes]\ndefault=*", "[Nodes]\ndefault=host:ocu host:new"))
-        loading = asyncio.ensure_future(policies.reload())
+        loading = asyncio.ensure_future(policies.reload(PolicyReload(), "operator"))
         await slow.until_begun()
         hosts["ocu"] = ipaddress.ip_address("10.0.0.9")
         slow.over.set()
@@ -201,7 +213,7 @@ async def test_a_change_to_be_confirmed_goes_back_though_control_dies_while_it_i
     with appliance.started(changed=die) as policies:
         appliance.file.write_text(OTHER)
         with pytest.raises(DiedError):
-            await policies.reload(confirm_within=1.0)
+            await policies.reload(PolicyReload(confirm_within=1.0), "operator")
     with appliance.started(restarted=True) as policies:
         assert (policies.revision, policies.current.text) == (2, OTHER)
         await until(policies, 3)
@@ -231,13 +243,13 @@ async def test_where_the_site_signs_nothing_else_comes_into_force(tmp_path: Path
         appliance.file.write_text(OTHER)
         assert policies.differs_from_file
         with pytest.raises(PolicyRefusedError, match="it is not the text that"):
-            await policies.reload()
+            await policies.reload(PolicyReload(), "operator")
         for signature in ("", signed(OPEN), signed(OTHER, OTHER_KEY)):
             with pytest.raises(PolicyRefusedError):
-                await policies.load_text(OTHER, signature, who="eve", note="")
+                await policies.load(PolicyLoad(OTHER, signature=signature), "eve")
         assert "no signature" in unsigned(policies, lambda: policies.rollback(1, who="eve"))
         assert policies.hosts_changed() == 0
-        await policies.load_text(OTHER, signed(OTHER), who="adam", note="")
+        await policies.load(PolicyLoad(OTHER, signature=signed(OTHER)), "adam")
         assert policies.rollback(2, who="eve").revision == 4
     with appliance.started(restarted=True, site_keys=[LINE]) as policies:
         assert (policies.revision, policies.in_force.signature) == (4, signed(OPEN))
@@ -250,7 +262,7 @@ async def test_a_trial_goes_back_to_what_is_signed(tmp_path: Path) -> None:
     appliance = Appliance(tmp_path)
     (tmp_path / "policy.ini.sig").write_text(signed(OPEN))
     with appliance.started(site_keys=[LINE]) as policies:
-        await policies.load_text(OTHER, signed(OTHER), who="adam", note="", confirm_within=0.0)
+        await policies.load(PolicyLoad(OTHER, confirm_within=0.0, signature=signed(OTHER)), "adam")
         await until(policies, 3)
         assert (policies.current.text, policies.in_force.signature) == (OPEN, signed(OPEN))
 
@@ -274,9 +286,9 @@ async def test_keys_are_changed_over_with_both_in_force(tmp_path: Path) -> None:
 async def test_the_same_text_posted_twice_is_one_revision(tmp_path: Path) -> None:
     """Who repeats an order changes nothing; a time limit that runs goes on; another text is another revision."""
     with Appliance(tmp_path).started() as policies:
-        first = await policies.load_text(OTHER, "", who="adam", note="", confirm_within=100.0)
-        again = await policies.load_text(OTHER, "", who="eve", note="once more")
+        first = await policies.load(PolicyLoad(OTHER, confirm_within=100.0), "adam")
+        again = await policies.load(PolicyLoad(OTHER, "once more"), "eve")
         assert (first.revision, again.revision, again.replaced) == (2, 2, 2)
         assert again.confirm_by == first.confirm_by
         assert policies.in_force.who == "adam"
-        assert (await policies.load_text(OPEN, "", who="adam", note="")).revision == 3
+        assert (await policies.load(PolicyLoad(OPEN), "adam")).revision == 3
