@@ -44,7 +44,6 @@ def export_evidence(
         str | None, typer.Option("--since", help="From this moment: 1h (ago), a date, or RFC 3339")
     ] = None,
     until: Annotated[str | None, typer.Option("--until", help="Before this moment")] = None,
-    as_json: Json = False,
 ) -> None:
     """Write what the log has of a time, and what was in force, as a bundle that proves itself anywhere.
 
@@ -72,7 +71,7 @@ def export_evidence(
             if isinstance(error, BundleError | ProblemError):
                 fail(str(error), 1)
             raise
-    if as_json:
+    if appliance.as_json:
         say_json({"file": str(output), "bytes": size})
     else:
         say(f"{output}: {size} bytes; prove it: python3 verify.py {output.name} --key audit.pub")

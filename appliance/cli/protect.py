@@ -189,7 +189,7 @@ def _check(checked: _Checked, running: Appliance, as_json: bool) -> None:
     if running.said:
         found = sorted({port for result in results for port in result.open})[:_MOST_TOLD]
         name = checked.name or results[0].address
-        body = running.ask_or_exit(HostPorts(name, state, found, time.time()), as_json=as_json)
+        body = running.ask_or_exit(HostPorts(name, state, found, time.time()))
         sys.stderr.write(f"rosrv: the appliance knows it: the ports of {body.name} are {state}\n")
     if opened:
         raise typer.Exit(OPEN_STATUS)

@@ -18,7 +18,7 @@ from appliance.channel import admin
 from appliance.channel.answers.recordings import RecordedMessages, Recording, Timeline
 from appliance.cli import completion
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
-from appliance.cli.output import Json, counted, printable, say, say_json, usage_error
+from appliance.cli.output import counted, printable, say, say_json, usage_error
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
 from appliance.cli.topic import lines_of
@@ -56,41 +56,40 @@ def now(
     note: Annotated[
         str, typer.Option(help="What happened; it stands in the recording and the audit log")
     ] = "",
-    as_json: Json = False,
 ) -> None:
     """Record the last seconds, and the next ones, of what the robot says.
 
     Example: rosrv record now --after 30s --note "the arm hit the door"
     """
     request = admin.RecordNow(_seconds("--before", before), _seconds("--after", after), note)
-    body = appliance.answer_or_exit(request, as_json=as_json)
+    body = appliance.answer_or_exit(request)
     say(body.id)
     typer.echo(f"rosrv: it is there from {_moment(body.ends)} on: rosrv record fetch {body.id}", err=True)
 
 
 @speaks
-def list_recordings(appliance: Appliance, as_json: Json = False) -> None:
+def list_recordings(appliance: Appliance) -> None:
     """List the recordings that are kept, the oldest first.
 
     Example: rosrv record list
     """
-    rows = appliance.ask_or_exit(admin.RecordingsWanted(), as_json=as_json).recordings
+    rows = appliance.ask_or_exit(admin.RecordingsWanted()).recordings
     for row in rows:
-        if as_json:
+        if appliance.as_json:
             say_json(row)
         else:
             say(f"{row.id}  {_moment(row.began)}  {_summary(row)}")
-    if not rows and not as_json:
+    if not rows and not appliance.as_json:
         say("nothing has been recorded: rosrv record now (what is being recorded is listed when it ends)")
 
 
 @speaks
-def show(appliance: Appliance, recording: _Id, as_json: Json = False) -> None:
+def show(appliance: Appliance, recording: _Id) -> None:
     """Show why a recording was made, and what it has.
 
     Example: rosrv record show 1879f3c2a4b5d6e7f012
     """
-    body = appliance.answer_or_exit(admin.RecordingWanted(recording), as_json=as_json)
+    body = appliance.answer_or_exit(admin.RecordingWanted(recording))
     for line in _described(body):
         say(line)
 
@@ -109,7 +108,6 @@ def show_timeline(
     columns: Annotated[
         int, typer.Option(min=1, max=MOST_COLUMNS, help="Parts that the time is divided into")
     ] = 60,
-    as_json: Json = False,
 ) -> None:
     """Show what flowed on each topic of a recording, and what happened, on one time line.
 
@@ -117,13 +115,13 @@ def show_timeline(
     """
     way = appliance.way
     if isinstance(way, AdminSocket):
-        body = appliance.ask_or_exit(admin.RecordingWanted(recording), as_json=as_json)
+        body = appliance.ask_or_exit(admin.RecordingWanted(recording))
         start, end = _moment_given("--since", since), _moment_given("--until", until)
         found = _read(lambda: timeline(body, _bag(way, body), start, end, columns))
     else:
         query = {"since": since, "until": until, "columns": columns}
         found = _asked(way, f"{recording}/timeline", query, Timeline)
-    if as_json:
+    if appliance.as_json:
         say_json(found)
         return
     for line in _drawn(found):
@@ -150,7 +148,6 @@ def messages(
     neighbours: Annotated[
         int, typer.Option(min=1, max=MOST_NEIGHBOURS, help="How many before it, and after")
     ] = NEIGHBOURS,
-    as_json: Json = False,
 ) -> None:
     """Show the messages of a recording around a moment; it is recorded who read them.
 
@@ -159,20 +156,20 @@ def messages(
     Example: rosrv record messages 1879f3c2a4b5d6e7f012 --topic /cmd_vel
     """
     topics = topic or []
-    body = appliance.ask_or_exit(admin.RecordingWanted(recording), as_json=as_json)
+    body = appliance.ask_or_exit(admin.RecordingWanted(recording))
     moments = {trigger.record: rfc3339(trigger.time) for trigger in body.triggers}
     text = next(iter(moments.values())) if at is None else moments.get(at, at)
     way = appliance.way
     if isinstance(way, AdminSocket):
         place = Place.parsed(text) or _moment_given("--at", text)
         assert place is not None  # noqa: S101  it is text
-        appliance.ask_or_exit(admin.RecordingRead(recording, topics), as_json=as_json)
+        appliance.ask_or_exit(admin.RecordingRead(recording, topics))
         found = _read(lambda: messages_around(body, _bag(way, body), place, topics, neighbours))
     else:
         query = {"at": text, "topic": topics, "neighbours": neighbours}
         found = _asked(way, f"{recording}/messages", query, RecordedMessages)
     for number, message in enumerate(found.messages):
-        if as_json:
+        if appliance.as_json:
             say_json(message)
             continue
         mark = "->" if number == found.chosen else "  "
@@ -194,7 +191,6 @@ def fetch(
     mcap: Annotated[
         bool, typer.Option("--mcap", help="As MCAP (rosrv-ID.mcap), for Foxglove and others")
     ] = False,
-    as_json: Json = False,
 ) -> None:
     """Write a recording's bag to a file; it is recorded who fetched it.
 
@@ -209,8 +205,8 @@ def fetch(
     except OSError as error:
         raise usage_error(f"{part}: {error.strerror}") from None
     try:
-        body = appliance.ask_or_exit(admin.RecordingWanted(recording), as_json=as_json)
-        bag = bag_of(appliance, body.id, part, as_json=as_json)
+        body = appliance.ask_or_exit(admin.RecordingWanted(recording))
+        bag = bag_of(appliance, body.id, part)
         if bag is not part:
             shutil.copyfile(bag, part)
         with part.open("rb") as file:
@@ -228,27 +224,27 @@ def fetch(
             f"rosrv: the bag of {body.id} is not the one that was recorded: its hash is another", err=True
         )
         raise typer.Exit(1)
-    if as_json:
+    if appliance.as_json:
         say_json({"file": str(target), "sha256": body.sha256, "format": "mcap" if mcap else "bag"})
     else:
         say(f"{target}: {_summary(body)}")
 
 
 @speaks
-def remove(appliance: Appliance, recording: _Id, as_json: Json = False) -> None:
+def remove(appliance: Appliance, recording: _Id) -> None:
     """Remove a recording; it is recorded who removed it.
 
     Example: rosrv record remove 1879f3c2a4b5d6e7f012
     """
-    body = appliance.answer_or_exit(admin.RecordingRemove(recording), as_json=as_json)
+    body = appliance.answer_or_exit(admin.RecordingRemove(recording))
     say(f"recording {body.id} is removed")
 
 
-def bag_of(appliance: Appliance, recording: str, part: Path, *, as_json: bool) -> Path:
+def bag_of(appliance: Appliance, recording: str, part: Path) -> Path:
     """The bag where it lies, or over REST in `part`, once it is on record who takes it. Raises `OSError`."""
     way = appliance.way
     if isinstance(way, AdminSocket):
-        return _bag(way, appliance.ask_or_exit(admin.RecordingFetch(recording), as_json=as_json))
+        return _bag(way, appliance.ask_or_exit(admin.RecordingFetch(recording)))
     from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
     try:

@@ -9,7 +9,7 @@ import functools
 import inspect
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Concatenate, ParamSpec
 
@@ -18,7 +18,7 @@ import typer
 
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
-from appliance.cli.output import printable, say_json, usage_error
+from appliance.cli.output import Json, printable, say_json, usage_error
 
 if TYPE_CHECKING:
     from appliance.cli.audit.rest import RestLog
@@ -62,11 +62,13 @@ class Appliance:
     """The appliance that a verb is for.
 
     `said`: it was named, on the command line or in the environment. `place` is the URL of REST; None over the socket.
+    `as_json`: what is shown of its answers is for programs.
     """
 
     way: "AdminSocket | RestWay"
     said: bool = False
     place: str | None = None
+    as_json: bool = False
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
         """Ask the running appliance one thing. Raises `NotRunningError`."""
@@ -76,33 +78,47 @@ class Appliance:
         """Its audit log; over the state directory it need not run."""
         return self.way.audit()
 
-    def ask_or_exit(self, request: AdminRequest[A], *, as_json: bool) -> A:
+    def ask_or_exit(self, request: AdminRequest[A]) -> A:
         """The answer's body. Ends the program with 1 when it refuses, 2 when none can be asked."""
         try:
-            return body_or_exit(self.way.ask(request), as_json=as_json)
+            return self.body_or_exit(self.way.ask(request))
         except NotRunningError as error:
             raise usage_error(str(error)) from None
 
-    def answer_or_exit(self, request: AdminRequest[A], *, as_json: bool) -> A:
+    def answer_or_exit(self, request: AdminRequest[A]) -> A:
         """The same for a person to read: with --json the answer is written here as it is, and the verb ends."""
-        body = self.ask_or_exit(request, as_json=as_json)
-        if as_json:
+        body = self.ask_or_exit(request)
+        if self.as_json:
             say_json(body)  # type: ignore[arg-type]  # each answer is a struct
             raise typer.Exit
         return body
 
+    def body_or_exit(self, answer: AdminAnswer[A]) -> A:
+        """The answer's body; a refusal is shown whole and ends the program with status 1."""
+        if answer.ok:
+            return answer.given()
+        if self.as_json:
+            typer.echo(msgspec.json.encode({"error": answer.error, "findings": answer.findings}).decode())
+        else:
+            for finding in answer.findings:
+                typer.echo(printable(finding), err=True)
+            typer.echo(f"rosrv: {printable(answer.error)}", err=True)
+        raise typer.Exit(1)
+
 
 def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, None]:
-    """Give a verb whose first parameter is an `Appliance` the options that say which."""
+    """Give a verb whose first parameter is an `Appliance` the options that say which, and --json if it has none."""
+    own = inspect.signature(verb, eval_str=True)
+    its_json = next(filter(lambda name: name.startswith("as_json"), own.parameters), None)
 
     @functools.wraps(verb)
     def asked(*args: _P.args, **kwargs: _P.kwargs) -> None:
         context, state, api, authority = (kwargs.pop(place.name) for place in _PLACES)
+        as_json = kwargs[its_json] if its_json else kwargs.pop(_JSON.name)
         appliance = _chosen(context, state, api, authority)  # type: ignore[arg-type]  # typer gives what they say
-        verb(appliance, *args, **kwargs)
+        verb(replace(appliance, as_json=as_json), *args, **kwargs)  # type: ignore[arg-type]  # as above
 
-    own = inspect.signature(verb, eval_str=True)
-    parameters = [*list(own.parameters.values())[1:], *_PLACES]
+    parameters = [*list(own.parameters.values())[1:], *([] if its_json else [_JSON]), *_PLACES]
     asked.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]  # what typer reads
     asked.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters} | {
         "return": None
@@ -110,6 +126,7 @@ def speaks(verb: Callable[Concatenate[Appliance, _P], None]) -> Callable[_P, Non
     return asked
 
 
+_JSON = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Json)
 _PLACES = [
     inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
     for name, default, annotation in (
@@ -140,16 +157,3 @@ def _chosen(context: typer.Context, state: Path, api: str | None, authority: Pat
         raise usage_error(str(error)) from None
     context.call_on_close(way.client.close)
     return Appliance(way, said=True, place=api)
-
-
-def body_or_exit(answer: AdminAnswer[A], *, as_json: bool) -> A:
-    """The answer's body; a refusal is shown whole and ends the program with status 1."""
-    if answer.ok:
-        return answer.given()
-    if as_json:
-        typer.echo(msgspec.json.encode({"error": answer.error, "findings": answer.findings}).decode())
-    else:
-        for finding in answer.findings:
-            typer.echo(printable(finding), err=True)
-        typer.echo(f"rosrv: {printable(answer.error)}", err=True)
-    raise typer.Exit(1)

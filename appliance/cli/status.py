@@ -35,7 +35,7 @@ def status(
 
     Example: rosrv status --state /var/lib/rosrv
     """
-    body = appliance.ask_or_exit(StatusWanted(), as_json=as_json)
+    body = appliance.ask_or_exit(StatusWanted())
     troubles = list(troubles_of(body))
     if as_json:
         say_json({**in_full(body), "troubles": troubles})

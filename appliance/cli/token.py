@@ -8,7 +8,7 @@ import typer
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke
 from appliance.channel.answers.tokens import TokenRole
 from appliance.cli import completion
-from appliance.cli.output import Json, moment, say, say_json
+from appliance.cli.output import moment, say, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
 
@@ -27,14 +27,13 @@ def add(
         ),
     ] = "viewer",
     expires: Annotated[str, typer.Option(help="After this time it ends: 12h, 90d, 52w")] = "90d",
-    as_json: Json = False,
 ) -> None:
     """Make a token. Its text is printed once, here, and kept nowhere.
 
     Example: rosrv token add alice --role operator --expires 30d
     """
     seconds = span_given("--expires", expires, "30m, 12h, 90d or 52w")
-    body = appliance.answer_or_exit(TokenAdd(name, role, seconds), as_json=as_json)
+    body = appliance.answer_or_exit(TokenAdd(name, role, seconds))
     say(body.token)
     typer.echo(
         f"rosrv: {body.role} {body.name}, until {moment(body.expires)}. This is the only time it is shown.",
@@ -43,14 +42,14 @@ def add(
 
 
 @speaks
-def list_tokens(appliance: Appliance, as_json: Json = False) -> None:
+def list_tokens(appliance: Appliance) -> None:
     """List all tokens that were made, without their secrets.
 
     Example: rosrv token list
     """
     now = datetime.datetime.now(datetime.UTC).timestamp()
-    for row in appliance.ask_or_exit(TokenList(), as_json=as_json).tokens:
-        if as_json:
+    for row in appliance.ask_or_exit(TokenList()).tokens:
+        if appliance.as_json:
             say_json(row)
             continue
         if row.revoked is not None:
@@ -69,11 +68,10 @@ def revoke(
             help="The name it was made with", show_default=False, autocompletion=completion.tokens
         ),
     ],
-    as_json: Json = False,
 ) -> None:
     """End a token now; exit status 1 when there is none of this name.
 
     Example: rosrv token revoke alice
     """
-    body = appliance.answer_or_exit(TokenRevoke(name), as_json=as_json)
+    body = appliance.answer_or_exit(TokenRevoke(name))
     say(f"token {body.name} ({body.role}) is revoked")

@@ -10,7 +10,7 @@ from appliance.api.moments import in_full
 from appliance.channel import admin
 from appliance.channel.answers.graph import Topic, TopicMessage
 from appliance.cli import completion
-from appliance.cli.output import Json, printable, say, say_json, usage_error
+from appliance.cli.output import printable, say, say_json, usage_error
 from appliance.cli.running import Appliance, speaks
 
 _AT_ONCE = 20  # messages of one look
@@ -31,7 +31,6 @@ def echo(
     field: Annotated[
         str | None, typer.Option(metavar="NAME", help="Only this field, such as pose.position.x or ranges.3")
     ] = None,
-    as_json: Json = False,
 ) -> None:
     """Show the next messages of a topic as subscribers get them, after the monitors; it is recorded who looked.
 
@@ -42,9 +41,9 @@ def echo(
     shown = 0
     while shown < count:
         request = admin.TopicLook(topic, min(count - shown, _AT_ONCE), seconds, latched=not shown)
-        body = appliance.ask_or_exit(request, as_json=as_json)
+        body = appliance.ask_or_exit(request)
         for message in body.messages:
-            _show(message, field, as_json=as_json)
+            _show(message, field, as_json=appliance.as_json)
         shown += len(body.messages)
         if not body.messages:
             typer.echo(f"rosrv topic: no message of {printable(topic)} in {seconds:g} s", err=True)
@@ -52,16 +51,16 @@ def echo(
 
 
 @speaks
-def info(appliance: Appliance, topic: _Topic, as_json: Json = False) -> None:
+def info(appliance: Appliance, topic: _Topic) -> None:
     """Show who publishes a topic, who hears it, and how much flows.
 
     Example: rosrv topic info /scan
     """
-    body = appliance.ask_or_exit(admin.GraphWanted(), as_json=as_json)
+    body = appliance.ask_or_exit(admin.GraphWanted())
     found = next((row for row in body.topics if row.name == topic), None)
     if found is None:
         raise usage_error(f"no node publishes or subscribes to {topic}")
-    if as_json:
+    if appliance.as_json:
         say_json(found)
     else:
         for line in _described(found):

@@ -8,7 +8,7 @@ import typer
 
 from appliance.channel.admin import AdminRequest
 from appliance.channel.answers import monitors, policy
-from appliance.cli.output import Json, say, say_json
+from appliance.cli.output import say, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
 
@@ -48,22 +48,21 @@ def verbs_of(
     `listed`, `confirmation` and `back(revision)` are what each asks; `say_done` says what a rollback did.
     """
 
-    def revisions(appliance: Appliance, as_json: Json = False) -> None:
-        for row in appliance.ask_or_exit(listed, as_json=as_json).revisions:
-            _say_revision(row, as_json=as_json)
+    def revisions(appliance: Appliance) -> None:
+        for row in appliance.ask_or_exit(listed).revisions:
+            _say_revision(row, as_json=appliance.as_json)
 
     def rollback(
         appliance: Appliance,
         revision: Annotated[
             int | None, typer.Argument(help="A kept revision; without it, the one before")
         ] = None,
-        as_json: Json = False,
     ) -> None:
-        say_done(appliance.answer_or_exit(back(revision), as_json=as_json))
+        say_done(appliance.answer_or_exit(back(revision)))
 
-    def confirm(appliance: Appliance, as_json: Json = False) -> None:
-        body = appliance.ask_or_exit(confirmation, as_json=as_json)
-        if as_json:
+    def confirm(appliance: Appliance) -> None:
+        body = appliance.ask_or_exit(confirmation)
+        if appliance.as_json:
             say_json(body)
         else:
             kept = f"revision {body.revision} stays in force"

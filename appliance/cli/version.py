@@ -1,21 +1,21 @@
 """`rosrv version`: what is installed here, or what a running appliance is."""
 
 from appliance.channel.admin import InventoryWanted
-from appliance.cli.output import Json, say, say_json
+from appliance.cli.output import say, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.inventory import inventory
 
 
 @speaks
-def version(appliance: Appliance, as_json: Json = False) -> None:
+def version(appliance: Appliance) -> None:
     """Show which version this is, and what it stands on.
 
     With --state or --api: of the appliance that runs there.
 
     Example: rosrv version --json
     """
-    facts = appliance.ask_or_exit(InventoryWanted(), as_json=as_json) if appliance.said else inventory()
-    if as_json:
+    facts = appliance.ask_or_exit(InventoryWanted()) if appliance.said else inventory()
+    if appliance.as_json:
         say_json(facts)
         return
     say(f"rosrv {facts.version}")

@@ -33,14 +33,14 @@ def wishes_of(appliance: str | None, ports: str, opened: list[str] | None) -> Wi
         raise usage_error(str(error)) from None
 
 
-def placed(running: Appliance, wishes: Wishes, *, as_json: bool) -> tuple[Wishes, str]:
+def placed(running: Appliance, wishes: Wishes) -> tuple[Wishes, str]:
     """The wishes with the address of the appliance, and why it is that where nobody said it.
 
     Ends the program with 1 when it cannot be told.
     """
     if wishes.endpoint:
         return wishes, ""
-    found = running.ask_or_exit(HostEndpoint(), as_json=as_json)
+    found = running.ask_or_exit(HostEndpoint())
     return replace(wishes, endpoint=found.endpoint), found.reason
 
 

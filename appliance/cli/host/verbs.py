@@ -12,7 +12,7 @@ from appliance.channel.answers.hosts import Host, PortsSeen
 from appliance.cli import completion
 from appliance.cli.host.kit import KitWriter, placed, wishes_of, write_script
 from appliance.cli.host.output import new_output, usage_error
-from appliance.cli.output import Json, moment, say, say_json
+from appliance.cli.output import moment, say, say_json
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
 
@@ -67,7 +67,6 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
     out: _Out = None,
     opened: _Open = None,
     ports: _Ports = "32768-60999",
-    as_json: Json = False,
 ) -> None:
     """Enrol a host: write its kit, one archive with all it needs; or with --token, let it enrol itself.
 
@@ -80,9 +79,9 @@ def add(  # noqa: PLR0917  typer gives every flag by its name
                 "--csr and --token are two ways: with a token the host brings its request itself"
             )
         order = HostToken(name, token_seconds=_seconds(within), days=days, address=address, new=True)
-        _write_script(running, order, wishes, out, as_json=as_json)
+        _write_script(running, order, wishes, out)
     else:
-        _write_kit(running, HostAdd(name, "", days, address), csr, wishes, out, as_json=as_json)
+        _write_kit(running, HostAdd(name, "", days, address), csr, wishes, out)
 
 
 @speaks
@@ -99,7 +98,6 @@ def kit(  # noqa: PLR0917  as above
     out: _Out = None,
     opened: _Open = None,
     ports: _Ports = "32768-60999",
-    as_json: Json = False,
 ) -> None:
     """Write a new kit for an enrolled host: a new certificate; the one before is revoked and its tunnel closed.
 
@@ -108,30 +106,29 @@ def kit(  # noqa: PLR0917  as above
     wishes = wishes_of(appliance, ports, opened)
     if token:
         order = HostToken(name, token_seconds=_seconds(within), days=days)
-        _write_script(running, order, wishes, out, as_json=as_json)
+        _write_script(running, order, wishes, out)
     else:
-        _write_kit(running, HostRenew(name, "", days), csr, wishes, out, as_json=as_json)
+        _write_kit(running, HostRenew(name, "", days), csr, wishes, out)
 
 
 @speaks
 def list_hosts(
     running: Appliance,
     group: Annotated[str | None, typer.Option(help="Only hosts of this group of hosts.yaml")] = None,
-    as_json: Json = False,
 ) -> None:
     """List the hosts that are enrolled, awaited or declared, with their tunnels; and machines in clear text.
 
     Example: rosrv host list
     """
-    body = running.ask_or_exit(HostList(), as_json=as_json)
+    body = running.ask_or_exit(HostList())
     for row in body.hosts:
         if group is not None and group not in row.groups:
             continue
-        if as_json:
+        if running.as_json:
             say_json(row)
         else:
             say("  ".join(_words(row)))
-    if as_json or group is not None:
+    if running.as_json or group is not None:
         return
     if not body.hosts:
         say("no host is enrolled, awaited or declared: rosrv host add NAME")
@@ -143,12 +140,12 @@ def list_hosts(
 
 
 @speaks
-def reload(running: Appliance, as_json: Json = False) -> None:
+def reload(running: Appliance) -> None:
     """Read hosts.yaml again. It opens and closes tunnels that it wants or does not want; it enrols and revokes nobody.
 
     Example: rosrv host reload
     """
-    body = running.answer_or_exit(HostsReload(), as_json=as_json)
+    body = running.answer_or_exit(HostsReload())
     say(f"{len(body.declared)} hosts are declared")
     for word, names in (("may come again", body.opened), ("tunnel closed", body.closed)):
         if names:
@@ -158,12 +155,12 @@ def reload(running: Appliance, as_json: Json = False) -> None:
 
 
 @speaks
-def revoke(running: Appliance, name: _Name, as_json: Json = False) -> None:
+def revoke(running: Appliance, name: _Name) -> None:
     """Let a host in no more, close its tunnel and take back what it has, now; or await it no longer.
 
     Example: rosrv host revoke ocu-1
     """
-    body = running.answer_or_exit(HostRevoke(name), as_json=as_json)
+    body = running.answer_or_exit(HostRevoke(name))
     if not body.serial:
         say(f"{body.name} is awaited no longer: its one-time token opens nothing")
     else:
@@ -180,22 +177,18 @@ def _write_kit(
     csr: Path | None,
     wishes: Wishes,
     out: Path | None,
-    *,
-    as_json: bool,
 ) -> None:
-    with new_output(out, f"rosrv-{order.name}.tar.gz", as_json=as_json) as output:
+    with new_output(out, f"rosrv-{order.name}.tar.gz", as_json=running.as_json) as output:
         writer = KitWriter(output, csr=csr)
-        wishes, reason = placed(running, wishes, as_json=as_json)
-        body = running.ask_or_exit(replace(order, request=writer.request), as_json=as_json)
-        writer.write(body, wishes, reason, as_json=as_json)
+        wishes, reason = placed(running, wishes)
+        body = running.ask_or_exit(replace(order, request=writer.request))
+        writer.write(body, wishes, reason, as_json=running.as_json)
 
 
-def _write_script(
-    running: Appliance, order: HostToken, wishes: Wishes, out: Path | None, *, as_json: bool
-) -> None:
+def _write_script(running: Appliance, order: HostToken, wishes: Wishes, out: Path | None) -> None:
     asked = replace(order, endpoint=wishes.endpoint or None, ports=wishes.ports, open=[*wishes.opened])
-    with new_output(out, f"rosrv-{order.name}-join.sh", as_json=as_json) as output:
-        write_script(output, running.ask_or_exit(asked, as_json=as_json), as_json=as_json)
+    with new_output(out, f"rosrv-{order.name}-join.sh", as_json=running.as_json) as output:
+        write_script(output, running.ask_or_exit(asked), as_json=running.as_json)
 
 
 def _words(row: Host) -> list[str]:

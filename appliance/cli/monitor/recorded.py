@@ -17,7 +17,7 @@ from appliance.channel.answers.recordings import Recording, Recordings
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.monitor.input import usage_error
 from appliance.cli.record import bag_of
-from appliance.cli.running import Appliance, body_or_exit
+from appliance.cli.running import Appliance
 
 _SECOND = 1_000_000_000
 
@@ -72,7 +72,7 @@ def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
 
 
 @contextmanager
-def pieces_of(appliance: Appliance, known: Recordings, span: Span, *, as_json: bool) -> Iterator[list[Piece]]:
+def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[list[Piece]]:
     """The recordings of this time and what is in memory, the oldest first; each is fetched, which is on record.
 
     They are open until the end: what is removed meanwhile can be read all the same.
@@ -88,7 +88,7 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span, *, as_json: b
             found.append((Span(since, until), row))
     memory = time.time_ns() - int(known.before * _SECOND)
     missing = [gap for gap in gaps([part for part, _row in found], span) if gap.until > memory]
-    lent = _lent(appliance, Span(missing[0].since, span.until), as_json=as_json) if missing else None
+    lent = _lent(appliance, Span(missing[0].since, span.until)) if missing else None
     if lent is not None:
         parts = (Span(max(gap.since, lent.began), min(gap.until, lent.ended)) for gap in missing)
         found += [(part, lent) for part in parts if part.since <= part.until]
@@ -97,7 +97,7 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span, *, as_json: b
         bags: dict[str, Path] = {}
         for part, row in sorted(found, key=lambda one: one[0]):
             if row.id not in bags:
-                bag = bag_of(appliance, row.id, Path(folder) / row.id, as_json=as_json)
+                bag = bag_of(appliance, row.id, Path(folder) / row.id)
                 try:
                     file = opened.enter_context(bag.open("rb"))
                 except OSError as error:
@@ -124,13 +124,13 @@ def gaps(parts: Sequence[Span], span: Span) -> Iterator[Span]:
         yield Span(at, span.until)
 
 
-def _lent(appliance: Appliance, span: Span, *, as_json: bool) -> Recording | None:
+def _lent(appliance: Appliance, span: Span) -> Recording | None:
     """What is in memory of a time, as a recording; None when nothing is. Ends the program with 1 when it is refused."""
     try:
         answer = appliance.ask(admin.RecordingOfMemory(*span))
     except NotRunningError as error:
         raise usage_error(str(error)) from None
-    return None if answer.trouble == "unknown" else body_or_exit(answer, as_json=as_json)
+    return None if answer.trouble == "unknown" else appliance.body_or_exit(answer)
 
 
 def _there(recordings: Sequence[Recording]) -> str:

@@ -16,7 +16,7 @@ from appliance.cli.monitor.bag import Replayed, definitions_of, open_bag, refusa
 from appliance.cli.monitor.input import Folders, read_definitions, read_specifications, usage_error
 from appliance.cli.monitor.output import BILLION, because
 from appliance.cli.monitor.recorded import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
-from appliance.cli.output import Json, counted, refused, say, say_json
+from appliance.cli.output import counted, refused, say, say_json
 from appliance.cli.progress import progress
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.tables import say_table, table_of
@@ -80,7 +80,6 @@ def replay_monitor(
         bool, typer.Option("--margins", help="Also how close each comparison of numbers came (takes longer)")
     ] = False,
     msg: Folders = None,
-    as_json: Json = False,
 ) -> None:
     """Say what a monitor would have dropped and changed of recordings, where, and how often.
 
@@ -92,19 +91,19 @@ def replay_monitor(
     """
     if bool(bags) is (since is not None or until is not None):
         raise usage_error("give --bag FILE (repeatable), or --since and --until for the flight recorder")
-    report = _Report(most, as_json)
+    report = _Report(most, appliance.as_json)
     patterns = topics or ["*"]
     messages = 0
     try:
-        texts, definitions, chosen = _specifications(appliance, what, msg or [], as_json=as_json)
+        texts, definitions, chosen = _specifications(appliance, what, msg or [])
         with ExitStack() as fetched:
             if bags:
                 pieces = [Piece(str(bag), bag, EVER, "") for bag in bags]
             else:
                 span = span_of(since, until)
-                recorded = appliance.ask_or_exit(admin.RecordingsWanted(), as_json=as_json)
+                recorded = appliance.ask_or_exit(admin.RecordingsWanted())
                 require_recorded(recorded, _topics(texts, chosen, patterns))
-                pieces = fetched.enter_context(pieces_of(appliance, recorded, span, as_json=as_json))
+                pieces = fetched.enter_context(pieces_of(appliance, recorded, span))
                 report.cover(pieces, span)
             for piece in pieces:
                 with closing(open_bag(piece.bag)) as reader:
@@ -116,21 +115,21 @@ def replay_monitor(
                     messages += report.of(monitors, reader, piece, patterns)
     except SpecificationError as error:
         raise refused(error.findings) from None
-    if not as_json:
+    if not appliance.as_json:
         report.show()
     report.show_margins(texts)
-    if not as_json:
+    if not appliance.as_json:
         say(f"{counted(messages, 'message')} of {counted(len(pieces), 'recording')}")
 
 
 def _specifications(
-    appliance: Appliance, what: str, folders: Sequence[Path], *, as_json: bool
+    appliance: Appliance, what: str, folders: Sequence[Path]
 ) -> tuple[dict[str, str], Definitions, str | None]:
     """Texts and definitions; of the running appliance all, and whose they are that were asked for."""
     path = Path(what)
     if path.suffix == ".rv" or path.is_file():
         return read_specifications([path]), read_definitions([path], folders), None
-    loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True), as_json=as_json)
+    loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
     names = [row.name for row in loaded.monitors]
     if what not in names:
         known = ", ".join(names) or "none is loaded"

@@ -8,7 +8,7 @@ import typer
 from appliance.channel.admin import MonitorConfirm, MonitorRevisions, MonitorRevisionWanted, MonitorRollback
 from appliance.channel.answers.monitors import RevisionTexts
 from appliance.cli.monitor.running import say_replaced
-from appliance.cli.output import Json, say, say_json, usage_error
+from appliance.cli.output import say, say_json, usage_error
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.trials import verbs_of
 
@@ -25,13 +25,13 @@ revisions, rollback, confirm = verbs_of(
 
 
 @speaks
-def show(appliance: Appliance, revision: _Revision = None, as_json: Json = False) -> None:
+def show(appliance: Appliance, revision: _Revision = None) -> None:
     """Show the specifications of a revision.
 
     Example: rosrv monitor show 7
     """
-    body = _texts(appliance, revision, as_json=as_json)
-    if as_json:
+    body = _texts(appliance, revision)
+    if appliance.as_json:
         say_json(body)
         return
     for name, text in _named(body).items():
@@ -45,15 +45,14 @@ def diff(
     appliance: Appliance,
     old: Annotated[int | None, typer.Argument(help="A kept revision; without it, the one before")] = None,
     new: _Revision = None,
-    as_json: Json = False,
 ) -> None:
     """Show what a revision changed of the texts; exit status 1 when they are different.
 
     Example: rosrv monitor diff 6 7
     """
-    later = _texts(appliance, new, as_json=as_json)
+    later = _texts(appliance, new)
     before = old if old is not None else later.revision - 1
-    earlier = _named(_texts(appliance, before, as_json=as_json)) if before else {}
+    earlier = _named(_texts(appliance, before)) if before else {}
     texts = _named(later)
     lines = [
         line
@@ -63,7 +62,7 @@ def diff(
             f"revision {before}: {name}", f"revision {later.revision}: {name}", lineterm="",
         )
     ]  # fmt: skip
-    if as_json:
+    if appliance.as_json:
         say_json({"old": before, "new": later.revision, "lines": lines})
         raise typer.Exit(1 if lines else 0)
     for line in lines:
@@ -71,13 +70,13 @@ def diff(
     raise typer.Exit(1 if lines else 0)
 
 
-def _texts(appliance: Appliance, revision: int | None, *, as_json: bool) -> RevisionTexts:
+def _texts(appliance: Appliance, revision: int | None) -> RevisionTexts:
     if revision is None:
-        rows = appliance.ask_or_exit(MonitorRevisions(), as_json=as_json).revisions
+        rows = appliance.ask_or_exit(MonitorRevisions()).revisions
         revision = next((row.revision for row in rows if row.in_force), None)
         if revision is None:
             raise usage_error("no specifications were ever loaded")
-    return appliance.ask_or_exit(MonitorRevisionWanted(revision), as_json=as_json)
+    return appliance.ask_or_exit(MonitorRevisionWanted(revision))
 
 
 def _named(body: RevisionTexts) -> dict[str, str]:

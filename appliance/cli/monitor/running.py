@@ -14,8 +14,8 @@ from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitors import MonitorState, Replaced, Switched
 from appliance.cli import completion
-from appliance.cli.output import Json, counted, printable, say, say_json, usage_error
-from appliance.cli.running import Appliance, body_or_exit, speaks
+from appliance.cli.output import counted, printable, say, say_json, usage_error
+from appliance.cli.running import Appliance, speaks
 from appliance.cli.tables import say_table, table_of
 from appliance.cli.trials import ConfirmWithin, say_deadline, seconds_within
 
@@ -25,13 +25,13 @@ _Names = Annotated[
 
 
 @speaks
-def list_monitors(appliance: Appliance, as_json: Json = False) -> None:
+def list_monitors(appliance: Appliance) -> None:
     """Show every monitor: enabled or not, what it listens to, what it did.
 
     Example: rosrv monitor list --json
     """
-    body = appliance.ask_or_exit(admin.MonitorsWanted(), as_json=as_json)
-    if as_json:
+    body = appliance.ask_or_exit(admin.MonitorsWanted())
+    if appliance.as_json:
         for row in body.monitors:
             say_json(row)
         return
@@ -69,7 +69,6 @@ def margins(
         list[str] | None,
         typer.Argument(metavar="[MONITOR…]", show_default=False, autocompletion=completion.monitors),
     ] = None,
-    as_json: Json = False,
 ) -> None:
     """Show how close conditions on numbers came, today and since they were loaded.
 
@@ -78,12 +77,12 @@ def margins(
 
     Example: rosrv monitor margins safeTrigger
     """
-    rows = appliance.ask_or_exit(admin.MonitorsWanted(), as_json=as_json).monitors
+    rows = appliance.ask_or_exit(admin.MonitorsWanted()).monitors
     unknown = sorted(set(names or ()) - {row.name for row in rows})
     if unknown:
         raise usage_error(f"no monitor is called {', '.join(unknown)}", "rosrv monitor")
     found = [(row, margin) for row in rows if not names or row.name in names for margin in row.margins]
-    if as_json:
+    if appliance.as_json:
         for row, margin in found:
             say_json({"monitor": row.name, "file": row.file, **to_builtins(margin)})
         return
@@ -112,34 +111,33 @@ def enable(
         bool,
         typer.Option("--trial", help="On trial: change and drop nothing, record what they would have done"),
     ] = False,
-    as_json: Json = False,
 ) -> None:
     """Let the events of these monitors happen again, or first on trial.
 
     Example: rosrv monitor enable safeTrigger --trial
     """
     order = admin.MonitorTrial(names, True) if trial else admin.MonitorSwitch(names, True)
-    _switch(appliance, order, "on trial" if trial else "enabled", as_json=as_json)
+    _switch(appliance, order, "on trial" if trial else "enabled")
 
 
 @speaks
-def promote(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
+def promote(appliance: Appliance, names: _Names) -> None:
     """Bring monitors that are on trial into force, with the state that they have.
 
     One that was not given all messages on trial begins in its initial state, and that is said.
 
     Example: rosrv monitor promote safeTrigger
     """
-    _switch(appliance, admin.MonitorTrial(names, False), "enabled", as_json=as_json)
+    _switch(appliance, admin.MonitorTrial(names, False), "enabled")
 
 
 @speaks
-def disable(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
+def disable(appliance: Appliance, names: _Names) -> None:
     """Let messages pass these monitors untouched; their variables stay.
 
     Example: rosrv monitor disable safeTrigger
     """
-    _switch(appliance, admin.MonitorSwitch(names, False), "disabled", as_json=as_json)
+    _switch(appliance, admin.MonitorSwitch(names, False), "disabled")
 
 
 @speaks
@@ -153,7 +151,6 @@ def load(
     *,
     note: Annotated[str, typer.Option(help="Why; kept with the revision")] = "",
     confirm_within: ConfirmWithin = None,
-    as_json: Json = False,
 ) -> None:
     """Load specifications while the robot runs; a file of the same name is replaced.
 
@@ -169,9 +166,7 @@ def load(
         sent = read_to_send(files, msg or [])
     except SpecificationError as error:
         found = [printable(str(finding)) for finding in error.findings]
-        body_or_exit(
-            AdminAnswer(False, error="refused here: nothing was sent", findings=found), as_json=as_json
-        )
+        appliance.body_or_exit(AdminAnswer(False, error="refused here: nothing was sent", findings=found))
         return
     order = admin.MonitorLoad(
         sent.files,
@@ -180,20 +175,18 @@ def load(
         confirm_within=seconds_within(confirm_within, "monitor"),
         signatures=sent.signatures,
     )
-    say_replaced(appliance.answer_or_exit(order, as_json=as_json))
+    say_replaced(appliance.answer_or_exit(order))
     _say_disabled(appliance, sent.files)
 
 
 @speaks
-def remove(
-    appliance: Appliance, names: _Names, confirm_within: ConfirmWithin = None, as_json: Json = False
-) -> None:
+def remove(appliance: Appliance, names: _Names, confirm_within: ConfirmWithin = None) -> None:
     """Remove specifications, by the names of their monitors or files.
 
     Example: rosrv monitor remove safeTrigger --confirm-within 5m
     """
     order = admin.MonitorRemove(names, confirm_within=seconds_within(confirm_within, "monitor"))
-    say_replaced(appliance.answer_or_exit(order, as_json=as_json))
+    say_replaced(appliance.answer_or_exit(order))
 
 
 @speaks
@@ -201,14 +194,13 @@ def reload(
     appliance: Appliance,
     prune: Annotated[bool, typer.Option("--prune", help="Also remove what the folder does not have")] = False,
     confirm_within: ConfirmWithin = None,
-    as_json: Json = False,
 ) -> None:
     """Take what the folder of specifications has now; what it does not have stays in force, and is named.
 
     Example: rosrv monitor reload
     """
     order = admin.MonitorReload(prune=prune, confirm_within=seconds_within(confirm_within, "monitor"))
-    body = appliance.answer_or_exit(order, as_json=as_json)
+    body = appliance.answer_or_exit(order)
     say_replaced(body)
     if body.kept:
         say(f"not of the folder, and still in force: {', '.join(body.kept)} (--prune removes them)", "yellow")
@@ -216,21 +208,21 @@ def reload(
 
 
 @speaks
-def resume(appliance: Appliance, names: _Names, as_json: Json = False) -> None:
+def resume(appliance: Appliance, names: _Names) -> None:
     """Let the topics go on that these monitors hold since the relay was restarted (`hold` specifications).
 
     Example: rosrv monitor resume safeTrigger
     """
-    body = appliance.answer_or_exit(admin.MonitorResume(names), as_json=as_json)
+    body = appliance.answer_or_exit(admin.MonitorResume(names))
     say(f"resumed: {', '.join(body.names) or 'none was held'}")
 
 
 @speaks
-def rv_state(appliance: Appliance, as_json: Json = False) -> None:
+def rv_state(appliance: Appliance) -> None:
     """ROSRV's `-rvstate`: the ports of ROSMaster and RVMaster, and where each monitor's topics are carried."""
-    body = appliance.ask_or_exit(admin.MonitorsWanted(), as_json=as_json)
+    body = appliance.ask_or_exit(admin.MonitorsWanted())
     real, port, rows = body.rv_state
-    if as_json:
+    if appliance.as_json:
         say_json(body.rv_state)
         return
     say(f"ROSMaster port {real}, RVMaster port {port}")
@@ -238,9 +230,9 @@ def rv_state(appliance: Appliance, as_json: Json = False) -> None:
         say(f"{name} {topic} XML-RPC port {xmlrpc} TCP port {tcp}")
 
 
-def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str, *, as_json: bool) -> None:
-    body = appliance.ask_or_exit(order, as_json=as_json)
-    if as_json:
+def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str) -> None:
+    body = appliance.ask_or_exit(order)
+    if appliance.as_json:
         say_json({**asdict(body), "enabled": word == "enabled", "trial": word == "on trial"})
         return
     say(f"{word}: {', '.join(body.names) or 'nothing, it was so already'}")
@@ -279,7 +271,7 @@ def say_replaced(body: Replaced) -> None:
 
 def _say_disabled(appliance: Appliance, files: Collection[str]) -> None:
     """Who loads a monitor expects it to stand guard; with `--enable none` it does not yet."""
-    rows = appliance.ask_or_exit(admin.MonitorsWanted(), as_json=False).monitors
+    rows = appliance.ask_or_exit(admin.MonitorsWanted()).monitors
     names = [row.name for row in rows if row.file in files and not row.enabled and not row.trial]
     if names:
         say(f"disabled (--enable): {', '.join(names)}; rosrv monitor enable {' '.join(names)}", "yellow")

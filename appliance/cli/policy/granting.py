@@ -11,7 +11,7 @@ from appliance.channel.admin import PolicyLoad, PolicyWanted
 from appliance.channel.answers.policy import Granted, Why
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.audit.errors import Errors, fail
-from appliance.cli.output import Json, printable, say, say_json, usage_error
+from appliance.cli.output import printable, say, say_json, usage_error
 from appliance.cli.policy.running import say_loaded
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.trials import ConfirmWithin, seconds_within
@@ -21,8 +21,6 @@ from appliance.cli.trials import ConfirmWithin, seconds_within
 def why(
     appliance: Appliance,
     record: Annotated[str, typer.Argument(metavar="RECORD", help="The record's id, or its sequence")],
-    *,
-    as_json: Json = False,
 ) -> None:
     """Say why what a record tells happened: who, which events and values, which line; what would allow a refusal.
 
@@ -32,7 +30,7 @@ def why(
     Example: rosrv audit why 18e9aa02efc40abb0e51
     """
     found = _explained(appliance, record)
-    if as_json:
+    if appliance.as_json:
         say_json(found)
         return
     for line in found.lines:
@@ -67,7 +65,6 @@ def grant(
     ] = None,
     load: Annotated[bool, typer.Option("--load", help="Bring the policy with the change into force")] = False,
     confirm_within: ConfirmWithin = None,
-    as_json: Json = False,
 ) -> None:
     """Show the smallest change of the policy in force that grants what a record says was refused.
 
@@ -80,7 +77,7 @@ def grant(
     if within is not None and not load:
         raise usage_error("--confirm-within is for --load")
     found = _granted(appliance, record)
-    if as_json:
+    if appliance.as_json:
         say_json(found)
     else:
         _show(found)
@@ -93,8 +90,8 @@ def grant(
             raise usage_error(f"cannot write {write}: {error.strerror}") from None
     if load:
         order = PolicyLoad(found.text, f"grants record {record[:100]}", within, found.revision)
-        body = appliance.ask_or_exit(order, as_json=as_json)
-        if as_json:
+        body = appliance.ask_or_exit(order)
+        if appliance.as_json:
             say_json(body)
         else:
             say_loaded(body)
@@ -122,7 +119,7 @@ def _granted(appliance: Appliance, record: str) -> Granted:
 
     with Errors():
         found = _record(appliance, record)
-        known = appliance.ask_or_exit(PolicyWanted(), as_json=False)
+        known = appliance.ask_or_exit(PolicyWanted())
         try:
             return granted(found, known)
         except UngrantableError as error:

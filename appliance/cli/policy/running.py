@@ -2,17 +2,13 @@
 
 from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
 from appliance.channel.answers.policy import Loaded
-from appliance.cli.output import Json, counted, say
+from appliance.cli.output import counted, say
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.trials import ConfirmWithin, say_deadline, seconds_within, verbs_of
 
 
 @speaks
-def reload(
-    appliance: Appliance,
-    confirm_within: ConfirmWithin = None,
-    as_json: Json = False,
-) -> None:
+def reload(appliance: Appliance, confirm_within: ConfirmWithin = None) -> None:
     """Read the policy file again: check, test, swap at once, and take back what it no longer allows.
 
     A bad file changes nothing; every error is shown and the exit status is 1.
@@ -20,7 +16,7 @@ def reload(
     Example: rosrv policy reload --confirm-within 5m
     """
     order = PolicyReload(seconds_within(confirm_within, "policy"))
-    say_loaded(appliance.answer_or_exit(order, as_json=as_json))
+    say_loaded(appliance.answer_or_exit(order))
 
 
 def say_loaded(body: Loaded) -> None:

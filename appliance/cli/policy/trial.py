@@ -4,7 +4,7 @@ Over the socket it is judged here, with the hosts, the robot and the test cases 
 REST it is a dry run.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from msgspec.structs import asdict
 
 from appliance.channel.admin import AdminAnswer, PolicyWanted
 from appliance.cli.policy.input import known_of, live_now, read_text
-from appliance.cli.running import Appliance, body_or_exit
+from appliance.cli.running import Appliance
 from appliance.policy import Ending, Finding, Known, PolicyError, Severity, endings, judge
 from appliance.site_keys import read_signature
 
@@ -49,7 +49,7 @@ def _by_dry_run(appliance: Appliance, file: Path) -> Trial:
         report = appliance.way.client.call("POST", "/v1/policy", params=query, body=text, order=False)
     except ProblemError as problem:
         if problem.findings is None:
-            body_or_exit(AdminAnswer(False, error=problem.lines[0]), as_json=False)
+            replace(appliance, as_json=False).body_or_exit(AdminAnswer(False, error=problem.lines[0]))
             raise
         return Trial([_finding(finding, file) for finding in problem.findings], [])
     warnings = [_finding(row, file) for row in report["warnings"]]

@@ -48,14 +48,7 @@ _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_d
 
 
 @speaks
-def check(
-    appliance: Appliance,
-    file: _File,
-    *,
-    robot: Robot = None,
-    enrolled: Enrolled = None,
-    as_json: Json = False,
-) -> None:
+def check(appliance: Appliance, file: _File, *, robot: Robot = None, enrolled: Enrolled = None) -> None:
     """Report every error and warning with its place; exit status 1 if there is an error.
 
     With --state or --api the running appliance says who is enrolled, and what is live and the policy would end.
@@ -66,8 +59,8 @@ def check(
     findings = trial.findings
     errors = sum(finding.severity is Severity.ERROR for finding in findings)
     for finding in findings:
-        say_finding(finding, as_json=as_json)
-    if not as_json:
+        say_finding(finding, as_json=appliance.as_json)
+    if not appliance.as_json:
         warnings = len(findings) - errors
         verdict = f"{counted(errors, 'error')}: the file is refused" if errors else f"{file} is right"
         say(
@@ -75,13 +68,13 @@ def check(
             "red" if errors else "green",
         )
     for ending in trial.ends:
-        if as_json:
+        if appliance.as_json:
             fields = asdict(ending)
             say_json({"ends": fields.pop("what"), **fields})
         else:
             whose = f"{ending.caller_id or 'a client'} on {ending.host}"
             say(f"would end: {ending.what} {ending.resource} of {whose}: {ending.reason}", "yellow")
-    if trial.ends and not as_json:
+    if trial.ends and not appliance.as_json:
         say(f"{counted(len(trial.ends), 'live connection')} would end", "yellow")
     raise typer.Exit(1 if errors else 0)
 
@@ -235,7 +228,6 @@ def compare(
     ] = None,
     robot: Robot = None,
     enrolled: Enrolled = None,
-    as_json: Json = False,
 ) -> None:
     """Show the requests that were seen and would be decided differently; exit status 1 if there are any.
 
@@ -248,12 +240,12 @@ def compare(
     before, after = (_judge_or_exit(file, robot, enrolled).policy for file in (old, new))
     differences = diff(before, after, _requests(requests, appliance))
     for difference in differences:
-        if as_json:
+        if appliance.as_json:
             say_json(_difference_fields(difference))
         else:
             for line in _difference_lines(difference):
                 say(line, "yellow" if difference.granted else "red")
-    if not as_json:
+    if not appliance.as_json:
         say(f"{counted(len(differences), 'request')} would be decided differently")
     raise typer.Exit(1 if differences else 0)
 
