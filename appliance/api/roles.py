@@ -19,16 +19,15 @@ class _Requires:
     """A dependency: the bearer, whose role must be at least this one."""
 
     def __init__(self, role: Role) -> None:
-        self._role = role
-        self._least = cast(TokenRole, role.name.lower())
+        self.least = cast(TokenRole, role.name.lower())
 
     def __call__(self, request: Request, _token: Annotated[Any, Security(_SCHEME)]) -> Bearer:
         bearer: Bearer = request.scope[BEARER]
-        if not may(bearer.role.name.lower(), self._least):
+        if not may(bearer.role.name.lower(), self.least):
             raise ProblemError(
                 403,
                 "not-for-this-role",
-                f"this is for {self._least}s; the token {bearer.name} has the role {bearer.role.name.lower()}",
+                f"this is for {self.least}s; the token {bearer.name} has the role {bearer.role.name.lower()}",
             )
         return bearer
 

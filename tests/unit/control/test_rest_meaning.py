@@ -4,12 +4,14 @@ import asyncio
 import functools
 import re
 import time
+from collections.abc import Iterator
 from typing import Any
 
 import httpx
 import msgspec
 import pytest
 from fastapi import FastAPI
+from fastapi.routing import iter_route_contexts
 
 from appliance.api.access import Bearer, Doorkeeper
 from appliance.api.app import build_app
@@ -163,16 +165,33 @@ def test_the_api_and_control_understand_the_same(method: str, target: str, body:
     assert meant(made.asked, made.request) == made.request
 
 
-def test_every_operation_is_a_route_of_the_api() -> None:
-    """What the command line calls, and what control understands, is there."""
-    paths = application(Listening(), Doorkeeper(10), Journal(lambda _call: None)).openapi()["paths"]
-    routes = {(method.upper(), _unnamed(path)) for path, methods in paths.items() for method in methods}
+def test_every_operation_is_a_route_of_the_api_and_for_the_same_role() -> None:
+    """What the command line calls, and what control lets a role do, the api has and lets the same role do.
+
+    Only what an operator may have judged, and an admin alone may load, is told apart by control.
+    """
+    app = application(Listening(), Doorkeeper(10), Journal(lambda _call: None))
+    routes = {
+        (method, _unnamed(str(route.path))): [role for role in roles_of(route.dependant) if role]
+        for route in iter_route_contexts(app.routes)
+        for method in route.methods or ()
+    }
     for one in OPERATIONS:
-        assert not one.path or (one.method, _unnamed(one.path)) in routes, one
+        if one.path:
+            dry = one.request in {admin.PolicyLoad, admin.MonitorLoad, admin.MonitorReplace}
+            assert routes[one.method, _unnamed(one.path)] == ["operator" if dry else one.role], one
+
+
+def roles_of(dependant: Any) -> Iterator[str | None]:
+    """The least roles that a route asks for, whatever it asks for by them."""
+    if dependant is not None:
+        yield getattr(dependant.call, "least", None)
+        for one in dependant.dependencies:
+            yield from roles_of(one)
 
 
 def _unnamed(path: str) -> str:
-    return re.sub(r"{\w+}", "{}", path)
+    return re.sub(r"{[\w:]+}", "{}", path)
 
 
 def test_every_order_has_its_way() -> None:
