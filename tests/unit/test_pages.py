@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from appliance.channel.operations import OPERATIONS
+
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 WITH_LINKS = [
@@ -36,3 +38,10 @@ def test_modules_that_are_named_are_there(page: str) -> None:
     names = re.findall(r"\b(?:[a-z_]+/)+[a-z_]+\.(?:py|sh|js|rv|toml|yaml)\b", (ROOT / page).read_text())
     folders = (ROOT, ROOT / "appliance", ROOT / "appliance" / "api" / "console")
     assert [name for name in names if not any((folder / name).exists() for folder in folders)] == []
+
+
+def test_every_operation_of_rest_is_on_its_page() -> None:
+    """Each path that the command line calls, with a name in the place of each parameter."""
+    text = (ROOT / "docs" / "rest.md").read_text()
+    paths = {re.sub(r"{\w+}", r"[^/\\s?\"]+", one.path) for one in OPERATIONS if one.path}
+    assert [path for path in paths if not re.search(rf"{path}(?![\w/])", text)] == []

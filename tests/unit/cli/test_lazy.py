@@ -13,6 +13,8 @@ from typer.testing import CliRunner
 from appliance.cli.lazy import Group, Verb, loaded
 from appliance.cli.main import VERBS, app
 
+ROOT = Path(__file__).parents[3]
+PAGES = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
 ROSRV = str(Path(sys.executable).parent / "rosrv")
 
 
@@ -51,9 +53,13 @@ def test_the_command_imports_only_what_a_verb_needs() -> None:
 
 @pytest.mark.parametrize(("name", "command"), [pytest.param(*one, id=one[0]) for one in commands()])
 def test_every_verb_has_help_with_an_example(name: str, command: Any) -> None:
-    """One sentence first, an example of this very verb, `--json`; every option and argument is explained."""
+    """One sentence first, an example of this very verb, `--json`; every option and argument is explained.
+
+    And some page names the verb.
+    """
     if command.hidden or name.rsplit(maxsplit=1)[-1] == "rvstate":
         pytest.skip("kept for ROSRV's own flag")
+    assert any(f"rosrv {name}" in page.read_text() for page in PAGES), f"no page names rosrv {name}"
     example = [line for line in str(command.help).splitlines() if "rosrv " in line]
     assert any(f"rosrv {name}" in line for line in example), command.help
     if name != "demo":  # which shows, and tells nothing to a program
