@@ -11,16 +11,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.sections import PARAMETERS
 from appliance.ros.names import is_global_name
 
-VERBS = {
-    "use-node": Category.NODE,
-    "publish": Category.PUBLISH,
-    "subscribe": Category.SUBSCRIBE,
-    "command": Category.COMMAND,
-    "offer": Category.OFFER,
-    "call": Category.CALL,
-    "read": Category.READ,
-    "write": Category.WRITE,
-}
+VERBS = {"use-node" if one is Category.NODE else one.value: one for one in Category}
 
 
 class BadWordError(ValueError):

@@ -12,8 +12,6 @@ from appliance.policy.sections import DEFAULT, PARAMETERS, Decider
 MAXIMUM_INNER_STARS = 1000
 """Keys with a star before the end, in all sections: they make looking up a name branch."""
 
-_VERBS = {"read": Category.READ, "write": Category.WRITE}
-
 
 class RuleCompiler:
     """Fills one `RuleTable` per category."""
@@ -86,7 +84,7 @@ class RuleCompiler:
         if len(decider.categories) == 1:
             return decider.categories[0], entry.key
         verb, _, name = entry.key.text.partition(" ")
-        category = _VERBS.get(verb)
+        category = next((one for one in decider.categories if one.value == verb), None)
         if category is None or not name:
             text = "a key here is read or write and a name, as read /ns/** or write default"
             self._error(entry.key, f"{quoted(entry.key.text)}: {text}")

@@ -14,6 +14,7 @@ import appliance.api
 from appliance.api.console import VIEWS, is_console, routes
 from appliance.api.problems import ProblemError
 from appliance.config import Settings
+from appliance.policy.model import Category
 
 FILES = Path(appliance.api.__file__).parent / "console"
 VENDOR = FILES / "vendor"
@@ -228,3 +229,9 @@ def _luminance(colour: str) -> float:
         part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
     )
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+def test_the_console_knows_every_category_of_a_decision() -> None:
+    """What the policy decides is offered to explain, and has its button at a record."""
+    text = (FILES / "js" / "categories.js").read_text()
+    assert set(re.findall(r'\["(\w+)", "', text)) == {*Category}

@@ -9,6 +9,7 @@ from typer.testing import CliRunner, Result
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Record
 from appliance.cli.main import app
+from appliance.policy.actions import VERBS
 
 POLICIES = Path(__file__).parents[4] / "policies"
 
@@ -64,6 +65,14 @@ def test_check_lists_findings_and_fails_on_errors(tmp_path: Path) -> None:
     warned = rosrv("check", file, "--json")
     assert warned.exit_code == 0
     assert {json.loads(line)["severity"] for line in warned.stdout.splitlines()} == {"warning"}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_explain_has_an_option_for_every_deed(policy: Path, verb: str) -> None:
+    """What a case of a policy can say is asked the same way on the command line."""
+    resource = "shutdown" if verb == "command" else "/cmd"
+    asked = rosrv("explain", policy, "--host", "10.0.0.9", "--node", "/ocu", f"--{verb}", resource, "--json")
+    assert json.loads(asked.stdout)["category"] == VERBS[verb], asked.stderr
 
 
 def test_explain_answers_by_exit_status_and_text(policy: Path) -> None:

@@ -1,5 +1,6 @@
 /** One record: what was decided and why, the rule where it stands, what a monitor changed, what happened around it. */
 
+import { isDecided } from "../categories.js";
 import { html, useEffect, useRef, useState } from "../html.js";
 import { Moment } from "../moments.js";
 import { Badge, Outcome } from "../parts/badge.js";
@@ -18,7 +19,6 @@ import { auditPath } from "./filters.js";
 import { Grant } from "./grant.js";
 import { Why } from "./why.js";
 
-const EXPLAINED = new Set(["publish", "subscribe", "offer", "call", "command", "node", "read", "write"]);
 const GIVEN = new Set(["revoked", "connection refused"]);
 const SHOWN_APART = new Set(["before", "after", "before_fields", "after_fields", "at", "timer", "conditions", "values", "handler", "why"]);
 const MONITORS = new Set(["monitor verdict", "message dropped", "message changed", "monitor fault", "monitor published", "trial observed"]);
@@ -53,8 +53,8 @@ function Shown(/** @type {{shown: any, filter: Record<string, string>}} */ { sho
     </dl>
     ${((MONITORS.has(record.event) && !record.detail.count) || isDenial(record)) && html`<${Why} key=${record.id} id=${record.id} />`}
     ${record.rule && record.revision !== null && html`<${Excerpt} rule=${record.rule} revision=${record.revision} />`}
-    ${record.decision && EXPLAINED.has(record.category) && html`<div class="row"><${Link} class="button" to=${explain(record)}>Explain in the policy</${Link}></div>`}
-    ${isDenial(record) && (EXPLAINED.has(record.category) || GIVEN.has(record.event)) && html`<${Grant} key=${record.id} id=${record.id} />`}
+    ${record.decision && isDecided(record.category) && html`<div class="row"><${Link} class="button" to=${explain(record)}>Explain in the policy</${Link}></div>`}
+    ${isDenial(record) && (isDecided(record.category) || GIVEN.has(record.event)) && html`<${Grant} key=${record.id} id=${record.id} />`}
     <${OnTimeline} key=${`t${record.id}`} record=${record} />
     ${(record.detail.before || record.detail.after) && html`<div><h3>Message</h3><${Change} detail=${record.detail} /></div>`}
     ${detail.length > 0 && html`<div><h3>Details</h3><dl class="facts">${detail.map(([name, value]) => html`<dt key=${name}><${Given} value=${name} most=${40} /></dt><dd><${Given} value=${typeof value === "string" ? value : JSON.stringify(value)} most=${800} mono /></dd>`)}</dl></div>`}

@@ -1,5 +1,6 @@
 /** Why a request is decided as it is: under the policy in force, or under the text in the editor. */
 
+import { CATEGORIES, isDecided } from "../categories.js";
 import { html, useEffect, useState } from "../html.js";
 import { Badge } from "../parts/badge.js";
 import { Check, Field } from "../parts/field.js";
@@ -8,17 +9,12 @@ import { Failure } from "../parts/notice.js";
 import { ask, get } from "../rest.js";
 import { draft } from "./draft.js";
 
-const CATEGORIES = /** @type {[string, string][]} */ ([
-  ["publish", "publish a topic"], ["subscribe", "subscribe to a topic"], ["offer", "offer a service"], ["call", "call a service"],
-  ["command", "make a call"], ["node", "use a node name"], ["read", "read a parameter"], ["write", "write a parameter"],
-]);
-
 /** @param {{query: URLSearchParams, pick: (place: any) => void}} given */
 export function Explain({ query, pick }) {
   const asked = query.get("category") ?? "publish";
   const [question, setQuestion] = useState({
     host: query.get("host") || "robot", node: query.get("node") ?? "",
-    category: CATEGORIES.some(([word]) => word === asked) ? asked : "publish", resource: query.get("resource") ?? "",
+    category: isDecided(asked) ? asked : "publish", resource: query.get("resource") ?? "",
   });
   const [underDraft, setUnderDraft] = useState(false);
   const [answer, setAnswer] = useState(/** @type {{value?: any, error?: unknown} | null} */ (null));
