@@ -34,6 +34,10 @@ class AdminRequest(msgspec.Struct, Generic[A], frozen=True, tag_field="verb", fo
     """A question or an order to the running appliance, which an `A` answers."""
 
 
+class WaitingRequest(AdminRequest[A], Generic[A], frozen=True):
+    """One whose answer waits for charon, the signer, the recorder or a topic's messages: others go past it."""
+
+
 def verb_of(request: AdminRequest[Any]) -> str:
     """The name of a request, as it stands in `verb`."""
     return str(type(request).__struct_config__.tag)
@@ -95,7 +99,7 @@ class GraphWanted(AdminRequest[graph.Graph], frozen=True, tag="graph"):
     """Nodes, topics and services with who is connected to whom and how much flows."""
 
 
-class TopicLook(AdminRequest[graph.TopicMessages], frozen=True, tag="topic look"):
+class TopicLook(WaitingRequest[graph.TopicMessages], frozen=True, tag="topic look"):
     """The next messages of a topic, read as fields; it is recorded who looked. At most 20, and for ten seconds.
 
     `latched`: what its publishers latched comes first; whoever looks on has it already.
@@ -217,17 +221,17 @@ MonitorChange = (
 )  # fmt: skip
 
 
-class RecordingsWanted(AdminRequest[recordings.Recordings], frozen=True, tag="recordings"):
+class RecordingsWanted(WaitingRequest[recordings.Recordings], frozen=True, tag="recordings"):
     """The recordings that are kept."""
 
 
-class RecordingWanted(AdminRequest[recordings.Recording], frozen=True, tag="recording"):
+class RecordingWanted(WaitingRequest[recordings.Recording], frozen=True, tag="recording"):
     """One of them."""
 
     id: str
 
 
-class RecordNow(AdminRequest[recordings.RecordingBegun], frozen=True, tag="record now"):
+class RecordNow(WaitingRequest[recordings.RecordingBegun], frozen=True, tag="record now"):
     """Record from `before` seconds before now to `after` seconds after; None: as configured."""
 
     before: float | None = None
@@ -235,20 +239,20 @@ class RecordNow(AdminRequest[recordings.RecordingBegun], frozen=True, tag="recor
     note: str = ""
 
 
-class RecordingFetch(AdminRequest[recordings.Recording], frozen=True, tag="recording fetch"):
+class RecordingFetch(WaitingRequest[recordings.Recording], frozen=True, tag="recording fetch"):
     """Somebody takes the messages of a recording: it is recorded who."""
 
     id: str
 
 
-class RecordingRead(AdminRequest[recordings.Recording], frozen=True, tag="recording read"):
+class RecordingRead(WaitingRequest[recordings.Recording], frozen=True, tag="recording read"):
     """Somebody reads messages of a recording, of these topics (none: of all): it is recorded who."""
 
     id: str
     topics: list[str] = []
 
 
-class RecordingOfMemory(AdminRequest[recordings.Recording], frozen=True, tag="recording memory"):
+class RecordingOfMemory(WaitingRequest[recordings.Recording], frozen=True, tag="recording memory"):
     """What is in memory, to be read: from `since` to `until`, nanoseconds since the epoch (None: all, now).
 
     It is no recording that is kept: for ten minutes, or until somebody else asks, it can be fetched as one.
@@ -258,7 +262,7 @@ class RecordingOfMemory(AdminRequest[recordings.Recording], frozen=True, tag="re
     until: int | None = None
 
 
-class RecordingRemove(AdminRequest[recordings.Recording], frozen=True, tag="recording remove"):
+class RecordingRemove(WaitingRequest[recordings.Recording], frozen=True, tag="recording remove"):
     """Remove a recording."""
 
     id: str
@@ -288,7 +292,7 @@ class TokenRevoke(AdminRequest[tokens.Token], frozen=True, tag="token revoke"):
     name: str
 
 
-class HostAdd(AdminRequest[hosts.KitParts], frozen=True, tag="host add"):
+class HostAdd(WaitingRequest[hosts.KitParts], frozen=True, tag="host add"):
     """Enrol a host by a signing request (PKCS #10, PEM) for the key that it has, for `days`.
 
     `address`: the virtual address it shall have; None: the next free one.
@@ -301,7 +305,7 @@ class HostAdd(AdminRequest[hosts.KitParts], frozen=True, tag="host add"):
     expected: int | None = None
 
 
-class HostToken(AdminRequest[hosts.EnrolmentToken], frozen=True, tag="host token"):
+class HostToken(WaitingRequest[hosts.EnrolmentToken], frozen=True, tag="host token"):
     """Make a token by which a host enrols itself once within `token_seconds`; an earlier one of the name ends.
 
     Its text is in the answer and nowhere else. `endpoint` (None: the appliance finds it), `ports` and `open` are kept
@@ -320,7 +324,7 @@ class HostToken(AdminRequest[hosts.EnrolmentToken], frozen=True, tag="host token
     new: bool = False
 
 
-class HostEnrol(AdminRequest[hosts.KitParts], frozen=True, tag="host enrol"):
+class HostEnrol(WaitingRequest[hosts.KitParts], frozen=True, tag="host enrol"):
     """The host itself, at the real address `peer`, brings its token and a signing request (PEM)."""
 
     token: str
@@ -328,7 +332,7 @@ class HostEnrol(AdminRequest[hosts.KitParts], frozen=True, tag="host enrol"):
     peer: str
 
 
-class HostRenew(AdminRequest[hosts.KitParts], frozen=True, tag="host renew"):
+class HostRenew(WaitingRequest[hosts.KitParts], frozen=True, tag="host renew"):
     """A new certificate for an enrolled host; the one before is revoked."""
 
     name: str
@@ -337,7 +341,7 @@ class HostRenew(AdminRequest[hosts.KitParts], frozen=True, tag="host renew"):
     expected: int | None = None
 
 
-class HostRenewItself(AdminRequest[hosts.NewCertificate], frozen=True, tag="host renew itself"):
+class HostRenewItself(WaitingRequest[hosts.NewCertificate], frozen=True, tag="host renew itself"):
     """A host asks through its tunnel, at its virtual address `peer`, for a certificate for a new key.
 
     `proof` is the signature of its present key over the bytes of `request`. The certificate before is good until
@@ -405,11 +409,11 @@ class AuthorityWanted(AdminRequest[hosts.AuthorityCertificate], frozen=True, tag
     """The authority's certificate, in PEM."""
 
 
-class LogSealed(AdminRequest[evidence.Sealed], frozen=True, tag="audit seal"):
+class LogSealed(WaitingRequest[evidence.Sealed], frozen=True, tag="audit seal"):
     """Have all that was recorded sealed by a signed checkpoint, now."""
 
 
-class EvidenceExported(AdminRequest[evidence.Sealed], frozen=True, tag="evidence exported"):
+class EvidenceExported(WaitingRequest[evidence.Sealed], frozen=True, tag="evidence exported"):
     """Record that a bundle was made whose manifest has this hash, and have that sealed.
 
     It has so many `records`, from `since` until before `until` (nanoseconds since the epoch), and the `recording` of

@@ -3,7 +3,7 @@
 Invariants, so that an api that is flooded or has fallen to a stranger cannot hold RVMaster up:
 
 1. At most `_MOST_WAITING` requests wait; one more is answered `busy` at once. Between two of them the loop serves
-   nodes. Those that wait for others (`_SLOW`, at most `_MOST_SLOW`) hold up nobody else.
+   nodes. Those that wait for others (`WaitingRequest`, at most `_MOST_SLOW`) hold up nobody else.
 2. What is not of the link ends it; an api that does not read its answers loses the link.
 3. Nothing that can be asked here makes an access token, and no decision of RVMaster depends on the api.
 4. Everything is asked in the name of a token that was shown and whose role may; a change is what the client asked for,
@@ -23,16 +23,10 @@ from appliance.channel import messages
 from appliance.channel.admin import (
     AdminAnswer,
     ChallengeWanted,
-    EvidenceExported,
-    HostAdd,
     HostEnrol,
-    HostRenew,
     HostRenewed,
     HostRenewItself,
-    HostToken,
-    LogSealed,
-    RecorderRequest,
-    TopicLook,
+    WaitingRequest,
     encode,
     verb_of,
 )
@@ -48,10 +42,6 @@ _TEXT = 300
 _DENIED = (401, 403, 421, 429)
 _ORDERS = ("POST", "PUT", "PATCH", "DELETE")  # refused in whatever way, nothing was changed
 _CHANGES = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
-_SLOW = (
-    HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself | TopicLook | LogSealed | EvidenceExported
-    | RecorderRequest
-)  # fmt: skip
 _MOST_SLOW = 16
 
 
@@ -121,7 +111,7 @@ class RestLink:
     async def _work(self, channel: Channel) -> None:
         while self._waiting and channel is self._channel:
             made = self._waiting.popleft()
-            if isinstance(made.request, _SLOW):
+            if isinstance(made.request, WaitingRequest):
                 self._begin(channel, made)
             else:
                 await self._serve(channel, made)
