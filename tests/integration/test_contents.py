@@ -12,7 +12,7 @@ import pytest
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
-from tests.support.rest import Answer, Rest
+from tests.support.rest import Rest
 from tests.support.waiting import eventually
 
 WORD = "zq7word"
@@ -92,16 +92,6 @@ def test_no_path_shows_a_viewer_what_messages_said(appliance: Appliance, tmp_pat
     assert WORD not in appliance.story()
 
 
-def answer_of(rest: Rest, place: str) -> Answer:
-    """The answer, once it is not that this host asks too fast."""
-
-    def answered() -> Answer | None:
-        answer = rest.get(place)
-        return None if answer.status == 429 else answer
-
-    return eventually(answered, place)
-
-
 def places_with(word: str, rest: Rest, values: dict[str, list[str]]) -> Iterator[str]:
     """The paths whose answer has it, of all that can be asked with GET, and the streams."""
     asked = {
@@ -120,6 +110,6 @@ def places_with(word: str, rest: Rest, values: dict[str, list[str]]) -> Iterator
                 body = json.dumps([*itertools.islice(events, 100 if query else 3)]).encode()
                 events.close()
             else:
-                body = answer_of(rest, place + query).body
+                body = rest.get(place + query).body
             if word.encode() in body:
                 yield place

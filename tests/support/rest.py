@@ -4,15 +4,19 @@ rest = Rest(appliance.ready["api"], appliance.ready["token"], certificate)
 assert rest.get("/v1/policy").status == 200
 """
 
+import contextlib
 import http.client
 import json
 import ssl
+import threading
 import time
 import urllib.parse
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from tests.support.processes import LIMIT
 
 
 @dataclass(frozen=True)
@@ -35,17 +39,28 @@ class Answer:
 
 
 class Rest:
-    """Makes requests, each on a connection of its own."""
+    """Makes requests, each on a connection of its own.
 
-    def __init__(self, url: str, token: str | None = None, certificate: Path | None = None) -> None:
+    Told that this host asks too much (429), it asks again when it may, as a good client does: what another test asked
+    of an appliance that they share is not this test's failure. A test of that answer takes `impatient()`.
+    """
+
+    def __init__(
+        self, url: str, token: str | None = None, certificate: Path | None = None, *, patient: bool = True
+    ) -> None:
         """`certificate` is what an https server is trusted by."""
         self.url = urllib.parse.urlsplit(url)
         self.token = token
         self.certificate = certificate
+        self.patient = patient
 
     def with_token(self, token: str | None) -> "Rest":
         """The same place, asked by somebody else."""
-        return Rest(self.url.geturl(), token, self.certificate)
+        return Rest(self.url.geturl(), token, self.certificate, patient=self.patient)
+
+    def impatient(self) -> "Rest":
+        """The same, which takes the first answer."""
+        return Rest(self.url.geturl(), self.token, self.certificate, patient=False)
 
     def connect(self, timeout: float = 30, source: str = "") -> http.client.HTTPConnection:
         """A connection, from the address `source` of this machine if it is given."""
@@ -68,15 +83,27 @@ class Rest:
     def request(
         self, method: str, path: str, body: bytes | None = None, headers: dict[str, str] | None = None
     ) -> Answer:
-        """One request."""
-        connection = self.connect()
-        try:
-            connection.request(method, path, body, self.headers(headers))
-            response = connection.getresponse()
+        """One request; the last answer of several to a patient one."""
+        with self._asked(method, path, body, headers) as response:
             names = {name.lower(): value for name, value in response.getheaders()}
             return Answer(response.status, names, response.read())
-        finally:
-            connection.close()
+
+    @contextlib.contextmanager
+    def _asked(
+        self, method: str, path: str, body: bytes | None, headers: dict[str, str] | None, timeout: float = 30
+    ) -> Iterator[http.client.HTTPResponse]:
+        begun = time.monotonic()
+        while True:
+            connection = self.connect(timeout)
+            try:
+                connection.request(method, path, body, self.headers(headers))
+                response = connection.getresponse()
+                if response.status != 429 or not self.patient or time.monotonic() > begun + LIMIT:
+                    yield response
+                    return
+            finally:
+                connection.close()
+            threading.Event().wait(float(response.headers["Retry-After"]))
 
     def get(self, path: str, **headers: str) -> Answer:
         """GET; header names with _ for -."""
@@ -97,11 +124,8 @@ class Rest:
 
         Each is waited for at most `timeout` seconds: the appliance's pings keep a stream alive, not a test.
         """
-        connection = self.connect(timeout)
-        try:
-            given = {name.replace("_", "-"): text for name, text in headers.items()}
-            connection.request("GET", path, None, self.headers(given))
-            response = connection.getresponse()
+        given = {name.replace("_", "-"): text for name, text in headers.items()}
+        with self._asked("GET", path, None, given, timeout) as response:
             assert response.status == 200, response.read()
             yield {}
             event: dict[str, str] = {}
@@ -116,5 +140,3 @@ class Rest:
                 if text and not text.startswith(":"):
                     name, _colon, value = text.partition(": ")
                     event[name] = value
-        finally:
-            connection.close()

@@ -167,7 +167,7 @@ def test_a_flood_of_one_host_is_slowed_down(tmp_path: Path) -> None:
     config = tmp_path / "appliance.yaml"
     config.write_text("api: 127.0.0.1:0\napi_tls: off\napi_limits: {requests_per_second: 1, burst: 100}\n")
     with Appliance(options=("--config", str(config))) as appliance:
-        rest = appliance.rest()
+        rest = appliance.rest().impatient()
         stranger = rest.with_token(None)
         statuses = [
             stranger.get("/v1/status", Authorization=f"Bearer rosrv_{n:012x}_{'A' * 43}").status

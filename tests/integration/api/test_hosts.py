@@ -100,7 +100,7 @@ def test_wrong_enrolment_tokens_are_slowed_down(running: Appliance, nobody: Rest
     problem(nobody.post("/v1/enrol", body | {"token": "rosrv_0_0"}), 422, "bad-input")
     problem(nobody.post("/v1/enrol", body | {"request": "x" * 30_000}), 413, "too-large")
     for _attempt in range(200):
-        answer = nobody.post("/v1/enrol", body)
+        answer = nobody.impatient().post("/v1/enrol", body)
         if answer.status == 429:
             break
     assert int(answer.headers["retry-after"]) >= 1
