@@ -129,16 +129,29 @@ class Process:
             there = self._changed.wait_for(lambda: any(text in line for line in self.errors), timeout)
         assert there, f"it did not say {text!r} within {timeout:.0f} s\n{self.story()}"
 
-    def wait_for_count(self, count: int, *, timeout: float = LIMIT, **fields: Any) -> list[Event]:
-        """The first `count` events that have these fields."""
-        position = 0
+    def wait_for_count(
+        self, count: int, *, timeout: float = LIMIT, since: int = 0, **fields: Any
+    ) -> list[Event]:
+        """The first `count` events (from index `since` on) that have these fields; each within `timeout` seconds."""
         found: list[Event] = []
-        while len(found) < count:
-            event = self.wait_for(timeout=timeout, since=position, **fields)
-            with self._changed:
-                position = next(i for i in range(position, len(self.events)) if self.events[i] is event) + 1
-            found.append(event)
-        return found
+        position = since
+        deadline = time.monotonic() + timeout
+        with self._changed:
+            while True:
+                for event in self.events[position:]:
+                    if all(event.get(key) == value for key, value in fields.items()):
+                        found.append(event)
+                        deadline = time.monotonic() + timeout
+                if len(found) >= count:
+                    return found[:count]
+                position = max(since, len(self.events))
+                left = deadline - time.monotonic()
+                if self._ended or left <= 0:
+                    why = "ended" if self._ended else f"{timeout:.0f} s passed"
+                    raise AssertionError(
+                        f"{len(found)} of {count} such events ({fields}): {why}\n{self.story()}"
+                    )
+                self._changed.wait(left)
 
     def mark(self) -> int:
         """A position in the events: pass it as `since` to look only at what comes after it."""

@@ -12,11 +12,13 @@ from tests.support.requirements import need_root, needs
 
 @pytest.fixture(scope="module")
 def battlefield(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Field]:
-    """The appliance with the policy (and the options) of the test file, and its hosts."""
+    """The appliance with the policy (and the configuration) of the test file, and its hosts."""
     need_root()
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    policy, options = request.module.POLICY, getattr(request.module, "OPTIONS", ())
-    with Lab("rosrv-test") as lab, Field(lab, tmp_path_factory.mktemp("field"), policy, options) as field:
+    home = tmp_path_factory.mktemp("field")
+    (home / "appliance.yaml").write_text(getattr(request.module, "CONFIGURATION", ""))
+    options = ("--config", str(home / "appliance.yaml"))
+    with Lab("rosrv-test") as lab, Field(lab, home, request.module.POLICY, options) as field:
         yield field
 
 
