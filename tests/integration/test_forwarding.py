@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
@@ -26,6 +27,20 @@ def forwarding(port: int, tmp_path: Path, **syslog: Any) -> Iterator[Appliance]:
     settings = {"syslog": {"to": f"tcp://127.0.0.1:{port}", **syslog}, "checkpoint_seconds": 1}
     file.write_text(json.dumps({"audit": settings}))
     with Appliance(options=("--config", str(file))) as appliance:
+        yield appliance
+
+
+@pytest.fixture(scope="module")
+def collector() -> Iterator[StreamCollector]:
+    """A receiver that several tests share."""
+    with StreamCollector() as collector:
+        yield collector
+
+
+@pytest.fixture(scope="module")
+def appliance(collector: StreamCollector, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Appliance]:
+    """An appliance that forwards all to it, and is at work after each test."""
+    with forwarding(collector.port, tmp_path_factory.mktemp("forwarding")) as appliance:
         yield appliance
 
 
@@ -53,64 +68,64 @@ def forwarding_status(appliance: Appliance) -> dict[str, Any]:
     return dict(status["audit"]["forwarding"])
 
 
-def test_everything_arrives_and_proves(tmp_path: Path) -> None:
+def test_everything_arrives_and_proves(
+    collector: StreamCollector, appliance: Appliance, tmp_path: Path
+) -> None:
     """What the receiver has is the whole log in order, and its checkpoints prove the log against root himself."""
-    with StreamCollector() as collector, forwarding(collector.port, tmp_path) as appliance:
-        work(appliance, 50)
-        wanted = all_sequences(appliance)
-        collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
-        assert collector.sequences() == sorted(set(collector.sequences()))
-        collector.wait_for(lambda messages: any(one.event == "checkpoint-signed" for one in messages))
-        kept = tmp_path / "receiver.ndjson"
-        checkpoints = [one for one in collector.messages if one.event == "checkpoint-signed"]
-        kept.write_text("".join(json.dumps(one.fields) + "\n" for one in checkpoints))
-        assert "kept elsewhere agree" in appliance.rosrv("audit", "verify", "--checkpoints", str(kept)).stdout
-        status = forwarding_status(appliance)
-        assert status["trouble"] == ""
-        assert status["to"] == f"tcp://127.0.0.1:{collector.port}"
-        samples = appliance.rest().get("/metrics").body.decode()
-        assert "rosrv_syslog_up 1.0" in samples
-        if os.geteuid() == 0:
-            (pid,) = appliance.pids("syslog")
-            owner = Path(f"/proc/{pid}").stat()
-            assert (owner.st_uid, owner.st_gid) == (61017, 61014)
+    work(appliance, 50)
+    wanted = all_sequences(appliance)
+    collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
+    assert collector.sequences() == sorted(set(collector.sequences()))
+    collector.wait_for(lambda messages: any(one.event == "checkpoint-signed" for one in messages))
+    kept = tmp_path / "receiver.ndjson"
+    checkpoints = [one for one in collector.messages if one.event == "checkpoint-signed"]
+    kept.write_text("".join(json.dumps(one.fields) + "\n" for one in checkpoints))
+    assert "kept elsewhere agree" in appliance.rosrv("audit", "verify", "--checkpoints", str(kept)).stdout
+    status = forwarding_status(appliance)
+    assert status["trouble"] == ""
+    assert status["to"] == f"tcp://127.0.0.1:{collector.port}"
+    samples = appliance.rest().get("/metrics").body.decode()
+    assert "rosrv_syslog_up 1.0" in samples
+    if os.geteuid() == 0:
+        (pid,) = appliance.pids("syslog")
+        owner = Path(f"/proc/{pid}").stat()
+        assert (owner.st_uid, owner.st_gid) == (61017, 61014)
 
 
-def test_a_receiver_that_is_away(tmp_path: Path) -> None:
+def test_a_receiver_that_is_away(collector: StreamCollector, appliance: Appliance) -> None:
     """While nobody receives, nodes are served as ever, the state says so; then everything arrives."""
-    with StreamCollector() as collector, forwarding(collector.port, tmp_path) as appliance:
-        collector.wait_for(lambda messages: messages)
-        collector.close()
-        start = time.monotonic()
-        work(appliance, 200)
-        assert time.monotonic() - start < allowed(10)
-        eventually(lambda: forwarding_status(appliance)["trouble"], "the trouble is in the status")
-        told = appliance.rosrv("status", check=False)
-        assert told.returncode == 1
-        assert "the audit log is not forwarded to tcp://" in told.stdout
-        eventually(lambda: appliance.audit(event="forwarding failed"), "it is recorded")
-        collector.open()
-        eventually(lambda: not forwarding_status(appliance)["trouble"], "the trouble is over")
-        eventually(lambda: appliance.audit(event="forwarding resumed"), "that it is over is recorded")
-        wanted = all_sequences(appliance)
-        collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
+    appliance.leave_out_what_was()
+    collector.wait_for(lambda messages: messages)
+    collector.close()
+    start = time.monotonic()
+    work(appliance, 200)
+    assert time.monotonic() - start < allowed(10)
+    eventually(lambda: forwarding_status(appliance)["trouble"], "the trouble is in the status")
+    told = appliance.rosrv("status", check=False)
+    assert told.returncode == 1
+    assert "the audit log is not forwarded to tcp://" in told.stdout
+    eventually(lambda: appliance.audit(event="forwarding failed"), "it is recorded")
+    collector.open()
+    eventually(lambda: not forwarding_status(appliance)["trouble"], "the trouble is over")
+    eventually(lambda: appliance.audit(event="forwarding resumed"), "that it is over is recorded")
+    wanted = all_sequences(appliance)
+    collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
 
 
-def test_deaths(tmp_path: Path) -> None:
+def test_deaths(collector: StreamCollector, appliance: Appliance) -> None:
     """The forwarder killed again and again, control too, the appliance stopped and started: nothing is missing."""
-    with StreamCollector() as collector, forwarding(collector.port, tmp_path) as appliance:
-        for role in ("syslog", "control", "syslog"):
-            work(appliance, 60)
-            before = appliance.pids(role)
-            os.kill(before[0], signal.SIGKILL)
-            another_life(appliance, role, before)
+    for role in ("syslog", "control", "syslog"):
         work(appliance, 60)
-        assert appliance.stop() == 0
-        appliance.start()
-        work(appliance, 10)
-        wanted = all_sequences(appliance)
-        collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
-        assert collector.problems == []
+        before = appliance.pids(role)
+        os.kill(before[0], signal.SIGKILL)
+        another_life(appliance, role, before)
+    work(appliance, 60)
+    assert appliance.stop() == 0
+    appliance.start()
+    work(appliance, 10)
+    wanted = all_sequences(appliance)
+    collector.wait_for(lambda _messages: wanted <= set(collector.sequences()))
+    assert collector.problems == []
 
 
 def test_only_denials(tmp_path: Path) -> None:

@@ -20,13 +20,23 @@ default = ocu
 [Commands]
 default = ocu, 127.0.0.1
 """
+HERE = "http://127.0.0.1:4000/"
+
+
+@pytest.fixture(scope="module")
+def common_appliance() -> Iterator[Appliance]:
+    """An appliance with REST."""
+    with Appliance(policy=POLICY, options=("--api", "127.0.0.1:0")) as appliance:
+        yield appliance
 
 
 @pytest.fixture
-def appliance() -> Iterator[Appliance]:
-    """An appliance with REST; only the operator's station may command."""
-    with Appliance(policy=POLICY, options=("--api", "127.0.0.1:0")) as appliance:
-        yield appliance
+def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
+    """The same with its first policy: only the operator's station may command. No node is registered."""
+    yield common_appliance
+    common_appliance.reload(POLICY)
+    with ServerProxy(common_appliance.master_uri) as master:
+        master.unregisterPublisher("/base", "/cmd_vel", HERE)
 
 
 def refused(appliance: Appliance, method: str, *arguments: object) -> str:
@@ -41,7 +51,7 @@ def refused(appliance: Appliance, method: str, *arguments: object) -> str:
 
 def test_what_was_refused_is_granted_on_trial(appliance: Appliance) -> None:
     """Shown as a diff, over REST alike; loaded with the time limit of any change; the node gets it without more ado."""
-    call = ("registerPublisher", "/base", "/cmd_vel", "std_msgs/String", "http://127.0.0.1:4000/")
+    call = ("registerPublisher", "/base", "/cmd_vel", "std_msgs/String", HERE)
     record = refused(appliance, *call)
     shown = appliance.rosrv("policy", "grant", record).stdout
     assert "+/cmd_vel = ocu robot" in shown.splitlines()
@@ -96,7 +106,6 @@ write default = ocu
 lookupNode = ocu
 default = ocu 127.0.0.1
 """
-HERE = "http://127.0.0.1:4000/"
 DENIALS: dict[str, tuple[tuple[object, ...], list[str]]] = {
     "a name": (
         ("registerPublisher", "/hidden", "/t", "std_msgs/String", HERE),

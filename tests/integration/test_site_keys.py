@@ -1,5 +1,6 @@
 """Where the site signs, no way into the appliance takes what it did not sign."""
 
+import contextlib
 import json
 import signal
 from collections.abc import Iterator
@@ -19,8 +20,8 @@ SPECIFICATION = "count() { event said() /chatter std_msgs/String '{}' { } }\n"
 NO_SIGNATURE = "it has no signature of the site (site_keys in appliance.yaml)"
 
 
-@pytest.fixture
-def appliance() -> Iterator[Appliance]:
+@contextlib.contextmanager
+def of_a_site() -> Iterator[Appliance]:
     """An appliance with a key of the site, a signed policy and an empty folder of specifications; not started."""
     appliance = Appliance()
     folder = appliance.directory / "monitors"
@@ -38,8 +39,17 @@ def appliance() -> Iterator[Appliance]:
         "off",
     )
     sign(appliance.policy_file)
-    yield appliance
-    appliance.close()
+    try:
+        yield appliance
+    finally:
+        appliance.close()
+
+
+@pytest.fixture(scope="module")
+def started() -> Iterator[Appliance]:
+    """One that runs; a test loads policies, the other specifications."""
+    with of_a_site() as appliance:
+        yield appliance.start()
 
 
 def sign(file: Path) -> None:
@@ -59,20 +69,23 @@ def in_force(appliance: Appliance) -> dict[str, Any] | None:
     return answer.json if answer.status == 200 else None
 
 
-def test_an_unsigned_policy_ends_the_start_before_anything_is_there(appliance: Appliance) -> None:
+def test_an_unsigned_policy_ends_the_start_before_anything_is_there() -> None:
     """In words that say what to do; no process, no state directory."""
-    Path(f"{appliance.policy_file}.sig").unlink()
-    with pytest.raises(AssertionError, match="ended"):
-        appliance.start()
-    assert isinstance(appliance.process, Process)
-    said = appliance.process.story()
-    assert f"{appliance.policy_file}:1:1: error: {NO_SIGNATURE}: sign it (rosrv sign FILE --key KEY)" in said
-    assert not appliance.state.exists()
+    with of_a_site() as appliance:
+        Path(f"{appliance.policy_file}.sig").unlink()
+        with pytest.raises(AssertionError, match="ended"):
+            appliance.start()
+        assert isinstance(appliance.process, Process)
+        said = appliance.process.story()
+        assert (
+            f"{appliance.policy_file}:1:1: error: {NO_SIGNATURE}: sign it (rosrv sign FILE --key KEY)" in said
+        )
+        assert not appliance.state.exists()
 
 
-def test_no_way_leads_past_the_signature_of_a_policy(appliance: Appliance) -> None:
+def test_no_way_leads_past_the_signature_of_a_policy(started: Appliance) -> None:
     """File, SIGHUP, REST, rollback and a crash: each asks for it, and the record of what is taken names the key."""
-    appliance.start()
+    appliance = started
     appliance.policy_file.write_text(OTHER)
     assert "it is not the text that" in appliance.rosrv("policy", "reload", check=False).stderr
     assert isinstance(appliance.process, Process)
@@ -96,9 +109,9 @@ def test_no_way_leads_past_the_signature_of_a_policy(appliance: Appliance) -> No
     assert [one["detail"]["signed_by"] for one in records] == [NAME] * 3
 
 
-def test_no_way_leads_past_the_signature_of_a_specification(appliance: Appliance) -> None:
+def test_no_way_leads_past_the_signature_of_a_specification(started: Appliance) -> None:
     """Command, folder and REST: each asks for it, and the record of what is taken names the key."""
-    appliance.start()
+    appliance = started
     file = appliance.directory / "monitors" / "count.rv"
     file.write_text(SPECIFICATION)
     for verb in (["load", str(file)], ["reload"]):
