@@ -75,35 +75,30 @@ def pid_of_master(uri: str) -> str:
         return str(master.getPid("/tester"))
 
 
-def test_one_line_says_that_nodes_may_connect(directory: Path) -> None:
-    """With `--json` it is the documented object, and the master named there answers."""
-    with up(directory, "--json") as running:
-        ready = running.wait_for(event="ready", timeout=60)
-        token = ready["token"]
-        changing = {"master": "-", "api": "-", "token": "-"}
-        assert ready | changing == {"event": "ready", "revision": 1} | changing
-        assert ready["api"].startswith("https://127.0.0.1:")
-        assert token.startswith("rosrv_")
-        assert pid_of_master(ready["master"]).startswith("[1, ")
-    assert running.events == [ready]
+def test_it_says_when_nodes_may_connect_and_ends_cleanly_in_time(directory: Path) -> None:
+    """One line for scripts, a sentence for people; SIGTERM and Ctrl-C: exit status 0 within five seconds, and the next
+    start on the same state is served.
+    """
 
-
-def test_a_person_gets_a_sentence(directory: Path) -> None:
-    """Without `--json` the line is for people: what to export, and where the state is."""
-    with up(directory) as running:
-        line = running.wait_for_text("Nodes may connect", timeout=60)
-    assert "ROS_MASTER_URI=http://127.0.0.1:" in line
-    assert str(directory / "state") in line
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_it_ends_cleanly_in_time(directory: Path, number: signal.Signals) -> None:
-    """Exit status 0 within five seconds, and the next start on the same state is served."""
-    with up(directory, "--json") as running:
-        running.wait_for(event="ready", timeout=60)
+    def end(running: Process, number: signal.Signals) -> None:
         began = time.monotonic()
         assert running.stop(with_signal=number) == 0
         assert time.monotonic() - began < allowed(5)
+
+    with up(directory, "--json") as running:
+        ready = running.wait_for(event="ready", timeout=60)
+        changing = {"master": "-", "api": "-", "token": "-"}
+        assert ready | changing == {"event": "ready", "revision": 1} | changing
+        assert ready["api"].startswith("https://127.0.0.1:")
+        assert ready["token"].startswith("rosrv_")
+        assert pid_of_master(ready["master"]).startswith("[1, ")
+        end(running, signal.SIGTERM)
+    assert running.events == [ready]
+    with up(directory) as running:
+        line = running.wait_for_text("Nodes may connect", timeout=60)
+        end(running, signal.SIGINT)
+    assert "ROS_MASTER_URI=http://127.0.0.1:" in line
+    assert str(directory / "state") in line
     with up(directory, "--json") as again:
         again.wait_for(event="ready", timeout=60)
 
