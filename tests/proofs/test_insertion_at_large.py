@@ -21,6 +21,6 @@ BOUNDS = [
 @pytest.mark.parametrize("bounds", BOUNDS, ids=str)
 def test_every_order_keeps_what_is_promised(tmp_path: Path, bounds: Bounds) -> None:
     """No state that the model can reach breaks a property, and there are many."""
-    found = search(tmp_path, bounds)
+    found = search(tmp_path, bounds, large=True)
     assert found.broken == ""
     assert found.states > 50_000

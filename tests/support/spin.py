@@ -65,16 +65,20 @@ class Found:
     states: int
 
 
-def search(folder: Path, bounds: Bounds, mutant: str = "", model: Path = MODEL) -> Found:
-    """Look at every state that the model can reach, in `folder`. Fails when they are more than fit into memory."""
+def search(
+    folder: Path, bounds: Bounds, mutant: str = "", model: Path = MODEL, *, large: bool = False
+) -> Found:
+    """Look at every state that the model can reach, in `folder`. Fails when they are more than fit into memory.
+
+    `large`: so many that a program that is fast is worth the time that it takes to be made (four seconds).
+    """
     spin, compiler = need_program("spin", "spin"), need_program("gcc", "g++")
     wrong = [f"-DMUTANT_{mutant}"] if mutant else []
     _run(folder, spin, "-a", *bounds.defined, *wrong, str(model))
-    # What is found at once is not worth a program that is made fast.
     _run(
         folder,
         compiler,
-        "-O0" if mutant else "-O1",
+        "-O1" if large else "-O0",
         "-w",
         "-DSAFETY",
         "-DCOLLAPSE",
