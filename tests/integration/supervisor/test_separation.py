@@ -1,6 +1,7 @@
 """What each process's user may read and write of the state directory, tried as that user."""
 
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -78,26 +79,22 @@ def test_who_is_ended_first_when_memory_ends(appliance: Appliance) -> None:
     assert scores["rosmaster"] == scores["signer"] == own
 
 
-def test_nothing_in_a_part_is_run_at_the_next_start() -> None:
+def test_nothing_in_a_part_is_run_at_the_next_start(appliance: Appliance) -> None:
     """Code that a fallen process, or a backup, put where Python looks in a user's home is not loaded by any process."""
-    need_root()
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
-    running = Appliance(options=("--api", "127.0.0.1:0"))
-    try:
-        running.start()
-        parts = [path for path in running.state.iterdir() if path.is_dir() and path.name != "run"]
-        assert {path.name for path in parts} >= {"rosmaster", "control", "signer", "relay", "api"}
-        assert running.stop() == 0
-        for part in parts:
-            packages = part / ".local" / "lib" / version / "site-packages"
-            packages.mkdir(parents=True)
-            (packages / "planted.pth").write_text(
-                f"import os; os.close(os.open({str(part / 'ran')!r}, os.O_CREAT))\n"
-            )
-            for path in (*packages.parents, packages, packages / "planted.pth"):
-                if part in path.parents:
-                    os.chown(path, part.stat().st_uid, part.stat().st_gid)
-        running.start()
-        assert [path.name for path in parts if (path / "ran").exists()] == []
-    finally:
-        running.close()
+    parts = [path for path in appliance.state.iterdir() if path.is_dir() and path.name != "run"]
+    assert {path.name for path in parts} >= {"rosmaster", "control", "signer", "relay", "api"}
+    assert appliance.stop() == 0
+    for part in parts:
+        packages = part / ".local" / "lib" / version / "site-packages"
+        packages.mkdir(parents=True)
+        (packages / "planted.pth").write_text(
+            f"import os; os.close(os.open({str(part / 'ran')!r}, os.O_CREAT))\n"
+        )
+        for path in (*packages.parents, packages, packages / "planted.pth"):
+            if part in path.parents:
+                os.chown(path, part.stat().st_uid, part.stat().st_gid)
+    appliance.start()
+    assert [path.name for path in parts if (path / "ran").exists()] == []
+    for part in parts:
+        shutil.rmtree(part / ".local")
