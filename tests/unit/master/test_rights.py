@@ -31,6 +31,8 @@ from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registry import Incarnation, Kind, Registry, new_key
 from appliance.master.graph.revocation import CALLS
 from appliance.policy import Live, Policy, compile_policy, diff, explain, run_cases
+from appliance.policy.actions import VERBS
+from appliance.policy.commands import COMMANDS
 from appliance.policy.learn import Observation, learn
 from appliance.policy.live import may_keep
 from appliance.policy.model import Category, Decision, Request
@@ -77,15 +79,7 @@ GIVES_UP = {
     "unregisterService": Kind.SERVICE,
     "unsubscribeParam": Kind.PARAMETER,
 }
-VERBS = {
-    Category.PUBLISH: "publish",
-    Category.SUBSCRIBE: "subscribe",
-    Category.OFFER: "offer",
-    Category.CALL: "call",
-    Category.COMMAND: "command",
-    Category.READ: "read",
-    Category.WRITE: "write",
-}
+SAID = {category: verb for verb, category in VERBS.items()}
 
 
 @pytest.fixture
@@ -151,7 +145,7 @@ def deeds(call: Call[Any]) -> list[Request]:
 def case_passes(policy: Policy, request: Request, allowed: bool) -> bool:
     """Whether a case that expects this answer passes."""
     word = "allow" if allowed else "deny"
-    deed = f"{VERBS[request.category]} {request.resource}"
+    deed = f"{SAID[request.category]} {request.resource}"
     text = f"cases:\n- host: {HOST}\n  node: {NAME}\n  {word}: ['{deed}']\n"
     return all(one.passed for one in run_cases(policy, text, "cases"))
 
@@ -210,6 +204,12 @@ def test_what_was_learned_from_a_call_lets_it_pass(call: Call[Any], tree: dict[s
     assert gate_says(policy, call, tree).allowed
     other = Request(ipaddress.ip_address("10.0.0.66"), NAME, call.category, deeds(call)[0].resource)
     assert not explain(policy, other).allowed
+
+
+def test_every_command_can_be_granted() -> None:
+    """`[Commands]` knows the name of each call that it decides, and no name of which there is no call."""
+    named = {call.policy_name for call in ROWS if call.category is Category.COMMAND}
+    assert named | {"lookupService"} == COMMANDS
 
 
 def test_a_call_that_makes_a_node_binds_its_name() -> None:
