@@ -16,6 +16,8 @@ import time
 from typing import Annotated
 
 from fastapi import Header, Request, Response
+from msgspec import convert
+from msgspec.structs import asdict
 
 from appliance.api.hosts import SLOW_SECONDS, OneName
 from appliance.api.hosts_models import Enrolled, Enrolment, Renewal
@@ -80,20 +82,7 @@ def _add_enrolment(router: Routes, services: Services) -> None:
         if "application/gzip" in accept:
             return Response(archive(kit), media_type="application/gzip")
         files = {path: text for path, text, _mode in members(kit)}
-        return answer(
-            Enrolled(
-                name=parts.name,
-                address=parts.address,
-                appliance=parts.appliance,
-                master=parts.master,
-                serial=parts.serial,
-                expires=parts.expires,
-                certificate=parts.certificate,
-                authority=parts.authority,
-                warning=parts.warning,
-                files=files,
-            )
-        )
+        return answer(convert(asdict(parts) | {"files": files}, Enrolled))
 
 
 def _add_renewal(router: Routes, services: Services) -> None:

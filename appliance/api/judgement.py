@@ -5,12 +5,13 @@ Everything is a pure function of texts; it runs in a thread, and a stranger's lo
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import msgspec
 
 from appliance.api.denials import asked_of, is_denial
+from appliance.api.policy_models import Change, Ended, Report
 from appliance.api.problems import Finding, ProblemError
 from appliance.audit.record import Record
 from appliance.audit.why import lines_of
@@ -19,8 +20,6 @@ from appliance.channel.answers.graph import Registration
 from appliance.channel.answers.policy import Granted, PolicyKnown, Why
 from appliance.policy import (
     Category,
-    Difference,
-    Ending,
     Explanation,
     Judged,
     Known,
@@ -43,17 +42,11 @@ _GRANTED = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Judgement:
-    """A policy that can be taken: its warnings, what is live and would be decided differently, and what of it ends."""
+def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterable[Registration]) -> Report:
+    """What a new text would do that is loaded in the place of the policy in force.
 
-    warnings: list[Finding]
-    changes: list[Difference]
-    ends: list[Ending]
-
-
-def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterable[Registration]) -> Judgement:
-    """Judge a new text beside the policy in force. Raises `ProblemError` with every finding when it is refused."""
+    Raises `ProblemError` with every finding when it is refused.
+    """
     known = Known.of(msgspec.structs.asdict(current))
     before = compile_policy(current.text, file=current.file, hosts=known.hosts, robot=known.robot)
     try:
@@ -62,7 +55,16 @@ def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterabl
         raise _refused(error) from error
     live = [Live.of(msgspec.structs.asdict(row)) for row in registrations]
     changes = diff(before, policy, (request for thing in live for request in thing.requests()))
-    return Judgement(_findings_of(policy.warnings), changes, endings(policy, live))
+    return Report(
+        loaded=False,
+        revision=current.revision,
+        warnings=_findings_of(policy.warnings),
+        changes=[
+            Change(**one.request.fields(), now=one.old.word, then=one.new.word, reason=one.new.reason)
+            for one in changes
+        ],
+        ends=[Ended(**asdict(end)) for end in endings(policy, live)],
+    )
 
 
 def granted(record: Record, current: PolicyKnown) -> Granted:

@@ -185,19 +185,7 @@ async def _tried(services: Services, order: admin.MonitorLoad, bearer: Bearer) -
         text = f"the monitors are at {loaded.tag}, not at {order.expected}: look at them first"
         raise _stale(text, loaded.tag)
     async with services.judging:
-        draft = await asyncio.to_thread(judge, loaded, order)
-    return tagged(
-        Replaced(
-            loaded=False,
-            revision=loaded.revision,
-            tag=loaded.tag,
-            added=draft.added,
-            changed=draft.changed,
-            removed=draft.removed,
-            warnings=draft.warnings,
-            monitors=draft.monitors,
-        )
-    )
+        return tagged(await asyncio.to_thread(judge, loaded, order))
 
 
 async def _replaced(

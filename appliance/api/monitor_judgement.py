@@ -7,10 +7,9 @@ api that nobody asks about monitors starts without it.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from appliance.api.monitor_models import EventShown, PropertyShown
+from appliance.api.monitor_models import EventShown, PropertyShown, Replaced
 from appliance.api.problems import Finding, ProblemError
 from appliance.channel.admin import MonitorLoad
 from appliance.channel.answers.monitors import Monitors
@@ -22,18 +21,7 @@ if TYPE_CHECKING:
 _PLACE = re.compile(r"(?s)(.*?):([0-9]+):([0-9]+): (error|warning): (.*)")
 
 
-@dataclass(frozen=True, slots=True)
-class Draft:
-    """Specifications without errors: files added, changed and removed, the lint, the monitors there would be."""
-
-    added: list[str]
-    changed: list[str]
-    removed: list[str]
-    warnings: list[Finding]
-    monitors: list[str]
-
-
-def judge(before: Monitors, order: MonitorLoad) -> Draft:
+def judge(before: Monitors, order: MonitorLoad) -> Replaced:
     """What loading these would do to what is in force. Raises `ProblemError` with every finding."""
     from appliance.specifications.files import Sources, SpecificationsRefusedError, check  # noqa: PLC0415  the compiler: see the head
 
@@ -46,7 +34,16 @@ def judge(before: Monitors, order: MonitorLoad) -> Draft:
             f"refused; revision {before.revision} of the specifications stays in force", error.findings
         ) from error
     added, changed, removed = following.difference(present)
-    return Draft(added, changed, removed, findings_of(list(checked.warnings)), list(checked.monitors))
+    return Replaced(
+        loaded=False,
+        revision=before.revision,
+        tag=before.tag,
+        added=added,
+        changed=changed,
+        removed=removed,
+        warnings=findings_of(list(checked.warnings)),
+        monitors=list(checked.monitors),
+    )
 
 
 def findings_of(texts: list[str]) -> list[Finding]:

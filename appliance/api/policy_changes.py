@@ -4,15 +4,15 @@ Loading is for admins, the rest for operators. Every change needs `If-Match` wit
 """
 
 import asyncio
-from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Query
+from msgspec.structs import replace
 
 from appliance.api.access import Bearer, Role
 from appliance.api.dry_runs import DryRun
-from appliance.api.judgement import Judgement, judge_change
-from appliance.api.policy_models import Change, Ended, PolicyText, Report, Rollback
+from appliance.api.judgement import judge_change
+from appliance.api.policy_models import PolicyText, Report, Rollback
 from appliance.api.preconditions import IfMatch, expected_revision
 from appliance.api.problems import ProblemError
 from appliance.api.roles import Operator, ask
@@ -93,7 +93,7 @@ async def _load(services: Services, order: admin.PolicyLoad, bearer: Bearer, *, 
     live = (await ask(services.control, admin.RegistrationsWanted(), bearer)).registrations
     try:
         async with services.judging:
-            judgement = await asyncio.to_thread(judge_change, order, current, live)
+            report = await asyncio.to_thread(judge_change, order, current, live)
     except ProblemError as refusal:
         if dry_run:
             raise
@@ -102,30 +102,10 @@ async def _load(services: Services, order: admin.PolicyLoad, bearer: Bearer, *, 
             loaded = await ask(services.control, order, bearer)
         except ProblemError as said:
             raise refusal if said.kind == "refused" else said from None
-        judgement = Judgement([], [], [])
+        report = Report(loaded=False, revision=0, warnings=[], changes=[], ends=[])
     else:
         if dry_run:
-            return _report(judgement, loaded=False, revision=current.revision)
+            return report
         loaded = await ask(services.control, order, bearer)
-    return _report(
-        judgement,
-        loaded=True,
-        revision=loaded.revision,
-        replaced=loaded.replaced,
-        revoked=loaded.revoked,
-        confirm_by=loaded.confirm_by,
-    )
-
-
-def _report(judgement: Judgement, **known: Any) -> Report:
-    changes = [
-        Change(
-            **change.request.fields(),
-            now=change.old.word,
-            then=change.new.word,
-            reason=change.new.reason,
-        )
-        for change in judgement.changes
-    ]
-    ends = [Ended(**asdict(end)) for end in judgement.ends]
-    return Report(**known, warnings=judgement.warnings, changes=changes, ends=ends)
+    told = {name: getattr(loaded, name) for name in ("revision", "replaced", "revoked", "confirm_by")}
+    return replace(report, loaded=True, **told)

@@ -17,8 +17,8 @@ from appliance.cli import completion
 from appliance.cli.admin_socket import AdminSocket
 from appliance.cli.audit.errors import Errors, fail
 from appliance.cli.output import Json, say, say_json, usage_error
+from appliance.cli.rest.orders import RestWay
 from appliance.cli.rest.session import ProblemError
-from appliance.cli.rest.way import RestWay
 from appliance.cli.running import Appliance, speaks
 from appliance.evidence import verify as verifier_module
 from appliance.evidence.bundle import VERIFIER, BundleError, Kept, Span, export

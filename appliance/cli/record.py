@@ -33,7 +33,7 @@ from appliance.recorder.timeline import (
 )
 
 if TYPE_CHECKING:
-    from appliance.cli.rest.way import RestWay
+    from appliance.cli.rest.orders import RestWay
 
 _Id = Annotated[str, typer.Argument(metavar="ID", show_default=False, autocompletion=completion.recordings)]
 _SECOND = 1_000_000_000

@@ -23,7 +23,8 @@ from appliance.cli.output import Json, printable, say_json, usage_error
 if TYPE_CHECKING:
     from appliance.cli.audit.rest import RestLog
     from appliance.cli.audit.source import FileLog
-    from appliance.cli.rest.way import RestWay
+    from appliance.cli.rest.orders import RestWay
+    from appliance.cli.rest.session import RestClient
 
 DEFAULT_STATE = Path("/var/lib/rosrv")  # as appliance.config has it, which is not imported for every verb
 TOKEN = "ROSRV_TOKEN"  # noqa: S105  the name of the variable that has it
@@ -69,6 +70,12 @@ class Appliance:
     said: bool = False
     place: str | None = None
     as_json: bool = False
+
+    @property
+    def rest(self) -> "RestClient":
+        """What calls REST, of an appliance that has a `place`."""
+        assert not isinstance(self.way, AdminSocket)  # noqa: S101  it has none
+        return self.way.client
 
     def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
         """Ask the running appliance one thing. Raises `NotRunningError`."""
@@ -149,7 +156,7 @@ def _chosen(context: typer.Context, state: Path, api: str | None, authority: Pat
         if "api_ca" in typed:
             raise usage_error("--api-ca is for --api URL, which is not given")
         return Appliance(AdminSocket(state), said=said["state"] in ("COMMANDLINE", "ENVIRONMENT"))
-    from appliance.cli.rest.way import RestWay  # noqa: PLC0415  httpx is not imported for the socket
+    from appliance.cli.rest.orders import RestWay  # noqa: PLC0415  httpx is not imported for the socket
 
     try:
         way = RestWay(api, os.environ.get(TOKEN), authority)

@@ -135,13 +135,11 @@ def _record(appliance: Appliance, record: str) -> Record:
 
 def _over_rest(appliance: Appliance, record: str, what: str) -> dict[str, Any]:
     from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
-    from appliance.cli.rest.way import RestWay  # noqa: PLC0415  as above
 
-    assert isinstance(appliance.way, RestWay)  # noqa: S101  the other way to an appliance
     if not record.isalnum():
         raise usage_error(f"{record} is no id of a record")
     try:
-        return appliance.way.client.call("GET", f"/v1/audit/{record}/{what}")
+        return appliance.rest.call("GET", f"/v1/audit/{record}/{what}")
     except ProblemError as problem:
         typer.echo(f"rosrv {'audit' if what == 'why' else 'policy'}: {problem.lines[0]}", err=True)
         raise typer.Exit(1) from None

@@ -41,12 +41,10 @@ def try_policy(
 
 def _by_dry_run(appliance: Appliance, file: Path) -> Trial:
     from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
-    from appliance.cli.rest.way import RestWay  # noqa: PLC0415  as above
 
-    assert isinstance(appliance.way, RestWay)  # noqa: S101  the other way to an appliance
     query, text = {"dry_run": "1"}, {"text": read_text(file), "signature": read_signature(file)}
     try:
-        report = appliance.way.client.call("POST", "/v1/policy", params=query, body=text, order=False)
+        report = appliance.rest.call("POST", "/v1/policy", params=query, body=text, order=False)
     except ProblemError as problem:
         if problem.findings is None:
             replace(appliance, as_json=False).body_or_exit(AdminAnswer(False, error=problem.lines[0]))

@@ -1,23 +1,50 @@
 """What operators' tools ask, as calls of REST; the answers are those of the admin socket."""
 
-from typing import Any, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import quote
 
 import msgspec
 
 from appliance.channel import admin
-from appliance.channel.admin import A, AdminRequest
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble
 from appliance.channel.answers.graph import Graph, Registration, Registrations
 from appliance.channel.operations import PARAMETERS, Operation, operation_of
-from appliance.cli.admin_socket import NotRunningError
-from appliance.cli.rest.session import RestClient
+from appliance.cli.admin_socket import NotRunningError, encoded
+from appliance.cli.rest.session import ProblemError, RestClient
+
+if TYPE_CHECKING:
+    from appliance.cli.audit.rest import RestLog
 
 
-def carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
+class RestWay:
+    """The appliance at a URL: the same questions and answers as over its socket."""
+
+    def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
+        """Raises ValueError when it is no place to send a token to."""
+        self.client = RestClient(url, token, authority)
+
+    def ask(self, request: AdminRequest[A]) -> AdminAnswer[A]:
+        """Ask one thing. Raises `NotRunningError`."""
+        encoded(request)  # what cannot be written over the socket is not asked here either
+        try:
+            return AdminAnswer(True, _carry_out(self.client, request))
+        except ProblemError as problem:
+            trouble: Trouble = "unknown" if problem.status == 404 else ""
+            return AdminAnswer(False, error=problem.lines[0], findings=problem.lines[1:], trouble=trouble)
+
+    def audit(self) -> "RestLog":
+        """Its audit log."""
+        from appliance.cli.audit.rest import RestLog  # noqa: PLC0415  only for the verbs that read it
+
+        return RestLog(self.client)
+
+
+def _carry_out(rest: RestClient, request: AdminRequest[A]) -> A:
     """Ask over REST. Raises `NotRunningError` for what is not asked there."""
     asked: Any = request  # of which kind is found out here
     if isinstance(asked, admin.RegistrationsWanted):
-        return cast(A, _registrations(carry_out(rest, admin.GraphWanted())))
+        return cast(A, _registrations(_carry_out(rest, admin.GraphWanted())))
     operation = operation_of(request)
     if operation is None or not operation.path or type(request) in _ONLY_THERE:
         raise NotRunningError(f"{rest.url}: {_ONLY_THERE.get(type(request), _UNASKED)}")
