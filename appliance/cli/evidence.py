@@ -20,6 +20,7 @@ from appliance.cli.output import Json, say, say_json, usage_error
 from appliance.cli.rest.orders import RestWay
 from appliance.cli.rest.session import ProblemError
 from appliance.cli.running import Appliance, speaks
+from appliance.cli.spans import Since, Until
 from appliance.evidence import verify as verifier_module
 from appliance.evidence.bundle import VERIFIER, BundleError, Kept, Span, export
 from appliance.fingerprints import fingerprint
@@ -40,10 +41,8 @@ def export_evidence(
     ] = None,
     *,
     output: Annotated[Path, typer.Option("--output", "-o", help="File (ZIP), must not exist")],
-    since: Annotated[
-        str | None, typer.Option("--since", help="From this moment: 1h (ago), a date, or RFC 3339")
-    ] = None,
-    until: Annotated[str | None, typer.Option("--until", help="Before this moment")] = None,
+    since: Since = None,
+    until: Until = None,
 ) -> None:
     """Write what the log has of a time, and what was in force, as a bundle that proves itself anywhere.
 

@@ -8,8 +8,8 @@ from typing import Any
 import structlog
 
 from appliance.channel import messages
+from appliance.channel.answers.status import FirewallState, ProcessInfo
 from appliance.channel.channel import Channel, ChannelClosedError
-from appliance.control.surroundings import Surroundings
 
 ROUTES_AT_ONCE = 32  # strangers make control ask, and the supervisor takes only so many questions
 
@@ -17,6 +17,19 @@ Heard = Callable[[Any, tuple[int, ...]], None]
 """Is given a message of the supervisor and the descriptors that came with it."""
 
 _log = structlog.get_logger()
+
+
+class Surroundings:
+    """What the supervisor told control last; `probe` is empty before the first, then `passed` or the reason.
+
+    `master` is where nodes find their master, as they are told; empty before control is ready.
+    """
+
+    def __init__(self) -> None:
+        self.processes: list[ProcessInfo] = []
+        self.firewall = messages.FirewallReported("unknown", FirewallState())
+        self.probe = ""
+        self.master = ""
 
 
 class ControlLifeline:

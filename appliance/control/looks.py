@@ -17,11 +17,11 @@ from appliance.channel.answers.monitors import Monitors
 from appliance.channel.answers.status import AuditState, ClockState, PolicyState, RecorderState, Status
 from appliance.control.assembly import Parts
 from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.control.lifeline import Surroundings
 from appliance.control.measures import measures_of
 from appliance.control.monitor_states import monitors_of, monitors_status
 from appliance.control.overview import graph_of
 from appliance.control.policies import Policies
-from appliance.control.surroundings import Surroundings
 from appliance.hosts.hosts import Hosts
 from appliance.inventory import inventory
 from appliance.master.graph.registry import Kind, Life

@@ -13,6 +13,7 @@ from appliance.audit.query import Filter
 from appliance.audit.record import Severity
 from appliance.cli.audit.errors import Errors
 from appliance.cli.running import Appliance
+from appliance.cli.spans import Since, Until
 
 _P = ParamSpec("_P")
 
@@ -26,10 +27,8 @@ def _filter(
     would_deny: Annotated[
         bool, typer.Option("--would-deny", help="Only what a trial policy would have denied")
     ] = False,
-    since: Annotated[
-        str | None, typer.Option("--since", help="From this moment: 1h (ago), a date, or RFC 3339")
-    ] = None,
-    until: Annotated[str | None, typer.Option("--until", help="Before this moment")] = None,
+    since: Since = None,
+    until: Until = None,
     topic: Annotated[
         str | None,
         typer.Option("--topic", "--resource", help="Topic, service, parameter, call; a glob: '/cmd_*'"),

@@ -16,6 +16,7 @@ from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.output import counted, printable, say_json
 from appliance.cli.policy.input import Robot, networks_of, request_of, usage_error
 from appliance.cli.running import Appliance, speaks
+from appliance.cli.spans import Since
 from appliance.policy import Category, PolicyError, compile_policy
 from appliance.policy.learn import Learned, Observation, learn
 
@@ -26,9 +27,7 @@ _OWN_NODE = "the appliance's own node"
 def learn_policy(
     appliance: Appliance,
     *,
-    since: Annotated[
-        str | None, typer.Option("--since", help="From this moment: 1h (ago), a date, or RFC 3339")
-    ] = None,
+    since: Since = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
     robot: Robot = None,
     as_json: Annotated[

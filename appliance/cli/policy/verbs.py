@@ -24,12 +24,13 @@ from appliance.cli.policy.input import (
     requests_of_file,
     usage_error,
 )
-from appliance.cli.policy.output import decision_fields, say_finding
 from appliance.cli.policy.trial import Trial, try_policy
 from appliance.cli.running import Appliance, speaks
 from appliance.policy import (
     Category,
+    Decision,
     Difference,
+    Finding,
     Judged,
     PolicyError,
     Request,
@@ -59,7 +60,7 @@ def check(appliance: Appliance, file: _File, *, robot: Robot = None, enrolled: E
     findings = trial.findings
     errors = sum(finding.severity is Severity.ERROR for finding in findings)
     for finding in findings:
-        say_finding(finding, as_json=appliance.as_json)
+        _say_finding(finding, as_json=appliance.as_json)
     if not appliance.as_json:
         warnings = len(findings) - errors
         verdict = f"{counted(errors, 'error')}: the file is refused" if errors else f"{file} is right"
@@ -77,6 +78,21 @@ def check(appliance: Appliance, file: _File, *, robot: Robot = None, enrolled: E
     if trial.ends and not appliance.as_json:
         say(f"{counted(len(trial.ends), 'live connection')} would end", "yellow")
     raise typer.Exit(1 if errors else 0)
+
+
+def _say_finding(finding: Finding, *, as_json: bool) -> None:
+    """Write an error or a warning."""
+    if as_json:
+        say_json(asdict(finding))
+    else:
+        say(str(finding), "red" if finding.severity == "error" else "yellow")
+
+
+def _decision_fields(decision: Decision) -> dict[str, object]:
+    """A decision as the audit log writes it."""
+    rule = decision.rule
+    place = {"section": rule.section, "key": rule.key, "file": rule.file, "line": rule.line} if rule else None
+    return {"decision": decision.word, "rule": place, "reason": decision.reason}
 
 
 def _tried(appliance: Appliance, file: Path, robot: list[str] | None, enrolled: list[str] | None) -> Trial:
@@ -162,7 +178,7 @@ def explain_request(
 def _explanation_fields(explanation: Explanation) -> dict[str, object]:
     fields: dict[str, object] = {
         **explanation.request.fields(),
-        **decision_fields(explanation.decision),
+        **_decision_fields(explanation.decision),
         "told": explanation.told,
         "through": list(explanation.through),
         "lost": [
@@ -208,7 +224,7 @@ def test(
         if as_json:
             place = {"file": result.file, "line": result.line, "column": result.column}
             expected = {"passed": result.passed, "expected": "allow" if result.expected else "deny"}
-            say_json({**place, **expected, **result.request.fields(), **decision_fields(result.decision)})
+            say_json({**place, **expected, **result.request.fields(), **_decision_fields(result.decision)})
         else:
             say(str(result), "red")
     if not as_json:
@@ -273,8 +289,8 @@ def _difference_fields(difference: Difference) -> dict[str, object]:
     return {
         **difference.request.fields(),
         "count": difference.count,
-        "old": decision_fields(difference.old),
-        "new": decision_fields(difference.new),
+        "old": _decision_fields(difference.old),
+        "new": _decision_fields(difference.new),
     }
 
 
