@@ -24,6 +24,7 @@ from appliance.channel.messages import Message
 _LENGTH = struct.Struct(">I")
 _RECEIVE_SIZE = 262_144
 _MAX_DESCRIPTORS = 64
+_TOGETHER = 65_536  # bytes of frames that are written at once
 _MAX_UNCLAIMED = 65_536
 _MAX_READS = 64  # in one go, so that an end that never stops writing leaves time for others
 
@@ -65,8 +66,11 @@ class Channel:
         """Whether `flush` has something left to write."""
         return bool(self._outgoing)
 
-    def send(self, message: Message, descriptors: tuple[int, ...] = ()) -> None:
-        """Queue a message and write what the socket takes; descriptors are duplicated, the caller keeps his."""
+    def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
+        """Queue a message and write what the socket takes; descriptors are duplicated, the caller keeps his.
+
+        `soon`: of an attached channel it is written at the end of the loop's turn, with all that is sent until then.
+        """
         if len(descriptors) != message.descriptors:
             raise ValueError(f"{type(message).__name__} travels with {message.descriptors} descriptors")
         body = self._encoder.encode(message)
@@ -78,13 +82,15 @@ class Channel:
         self._backlog += len(body) + _LENGTH.size
         if self._loop is None:
             self.flush()
-        else:
+        elif not soon:
             self._flush_attached()
+        elif len(self._outgoing) == 1:  # else it is to be written already
+            self._loop.call_soon(self._flush_attached)
 
     def flush(self) -> None:
         """Write what the socket takes now. Raises `ChannelClosedError` when the other end is gone."""
         while self._outgoing:
-            data, descriptors = self._outgoing[0]
+            data, descriptors = self._next()
             try:
                 sent = (
                     socket.send_fds(self._socket, [data], descriptors)
@@ -103,6 +109,16 @@ class Channel:
                 break
             self._outgoing.popleft()
         self._watch_writable()
+
+    def _next(self) -> tuple[bytes, list[int]]:
+        """What is to be written next: frames without descriptors together, in the place of the first."""
+        frames, size = [], 0
+        while self._outgoing and not self._outgoing[0][1] and size < _TOGETHER:
+            frames.append(self._outgoing.popleft()[0])
+            size += len(frames[-1])
+        if frames:
+            self._outgoing.appendleft((b"".join(frames), []))
+        return self._outgoing[0]
 
     def receive(self) -> list[tuple[Any, tuple[int, ...]]]:
         """Read what has arrived: whole messages with their descriptors, which the caller now owns.
@@ -196,6 +212,8 @@ class Channel:
             self._loop.remove_writer(self.fileno())
 
     def _flush_attached(self) -> None:
+        if not self._outgoing:  # all was written, or the channel closed, before the turn ended
+            return
         try:
             self.flush()
         except ChannelClosedError:

@@ -233,7 +233,7 @@ class _Link:
     def attach(self, *_given: object) -> None:
         """As `Channel`."""
 
-    def send(self, message: messages.Message, _descriptors: tuple[int, ...] = ()) -> None:
+    def send(self, message: messages.Message, _descriptors: tuple[int, ...] = (), **_when: bool) -> None:
         """As `Channel`."""
         if not isinstance(message, messages.StateBegan | messages.StateEnded | messages.SpecificationsStated):
             self.told.append(message)

@@ -149,7 +149,7 @@ class Relay:
     def close(self) -> None:
         """As `Channel`."""
 
-    def send(self, message: messages.Message, _descriptors: tuple[int, ...] = ()) -> None:
+    def send(self, message: messages.Message, _descriptors: tuple[int, ...] = (), **_when: bool) -> None:
         """As `Channel`."""
         if isinstance(message, messages.GrantInstalled):
             self._world.check_grant(message.topic, message.host, message.caller_id)

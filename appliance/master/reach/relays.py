@@ -66,12 +66,18 @@ class RelayPost:
 
         channel.attach(asyncio.get_running_loop(), received, closed)
 
-    def send(self, message: messages.Message, descriptors: tuple[int, ...] = ()) -> bool:
-        """Tell the relay; False when it is not there."""
+    def send(
+        self, message: messages.Message, descriptors: tuple[int, ...] = (), *, soon: bool = False
+    ) -> bool:
+        """Tell the relay; False when it is not there.
+
+        `soon`: with what it is told in the same turn of the loop, or before the next thing that is not. Nobody connects
+        to what a relay carries without a grant, which is told at once.
+        """
         if self._channel is None:
             return False
         try:
-            self._channel.send(message, descriptors)
+            self._channel.send(message, descriptors, soon=soon)
         except ChannelClosedError:
             return False  # its end is reported by the loop
         return True
@@ -249,11 +255,13 @@ class RelayControl:
                     incarnation.key, incarnation.name, str(incarnation.host), incarnation.of_monitors
                 ),
                 (listening.fileno(),),
+                soon=True,
             )
         if kind is Kind.PUBLICATION:
-            post.send(self._publication(incarnation, resource, detail))
+            post.send(self._publication(incarnation, resource, detail), soon=True)
         else:
-            post.send(messages.ServicePlaced(incarnation.key, resource, str(incarnation.host), int(detail)))
+            placed = messages.ServicePlaced(incarnation.key, resource, str(incarnation.host), int(detail))
+            post.send(placed, soon=True)
 
     def place_grant(self, row: PermissionRow) -> None:
         """A subscriber or client is let in."""
@@ -401,9 +409,9 @@ def _flow(rate: Rate) -> messages.FlowLimit:
 
 def _withdraw(post: RelayPost, incarnation: Incarnation, kind: Kind, resource: str) -> None:
     if kind is Kind.PUBLICATION:
-        post.send(messages.PublicationWithdrawn(incarnation.key, resource))
+        post.send(messages.PublicationWithdrawn(incarnation.key, resource), soon=True)
     else:
-        post.send(messages.ServiceWithdrawn(incarnation.key, resource))
+        post.send(messages.ServiceWithdrawn(incarnation.key, resource), soon=True)
 
 
 def _revoke(post: RelayPost, row: PermissionRow) -> None:

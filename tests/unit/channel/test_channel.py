@@ -56,6 +56,34 @@ def test_messages_arrive_in_order_with_their_descriptors(pair: Pair) -> None:
                 assert names[sock.getsockname()] == message.name
 
 
+def test_what_is_sent_soon_leaves_together_and_before_what_is_not(pair: Pair) -> None:
+    """It waits for the end of the turn, or for the next message that does not; order and descriptors stay."""
+    here, there = pair
+
+    async def scene() -> list[list[Message]]:
+        here.attach(asyncio.get_running_loop(), lambda _message, _descriptors: None, lambda: None)
+
+        def seen() -> list[Message]:
+            return [message for message, _descriptors in there.receive()]
+
+        with socket.create_server(("127.0.0.1", 0)) as sock:
+            here.send(Ping(1), soon=True)
+            here.send(SocketKept("first"), (sock.fileno(),), soon=True)
+            here.send(Ping(2), soon=True)
+        before = seen()
+        await asyncio.sleep(0)
+        at_end = seen()
+        here.send(Ping(3), soon=True)
+        here.send(Ping(4))
+        at_once = seen()
+        here.send(Ping(5), soon=True)
+        here.close()
+        await asyncio.sleep(0)  # what was not written is given up with the channel
+        return [before, at_end, at_once]
+
+    assert asyncio.run(scene()) == [[], [Ping(1), SocketKept("first"), Ping(2)], [Ping(3), Ping(4)]]
+
+
 def test_a_message_must_come_with_its_descriptors(pair: Pair) -> None:
     """Who sends too many or too few is told at once; who receives too few refuses the link."""
     here, there = pair

@@ -75,7 +75,7 @@ class Link:
         """As `Channel`."""
         self.say, self.end = received, closed
 
-    def send(self, message: messages.Message, descriptors: tuple[int, ...] = ()) -> None:
+    def send(self, message: messages.Message, descriptors: tuple[int, ...] = (), **_when: bool) -> None:
         """As `Channel`."""
         self.told.append((message, descriptors))
 
