@@ -6,6 +6,7 @@ restored, the listeners serve, the first reconcile round makes ROSMaster whole, 
 
 import asyncio
 import contextlib
+import gc
 import socket
 import sys
 from collections.abc import Callable
@@ -65,6 +66,7 @@ from appliance.store.state import StateStore
 _log = structlog.get_logger()
 _OWN, _ADMIN = "own", "admin"
 _SWITCH_SECONDS = 0.001
+_GARBAGE = 10_000  # objects more than at the last look for garbage: records that wait for the log are none
 _SAVE_SECONDS = 1.0
 _WARNINGS = 100  # of the policy, that a start tells
 _RESERVED_SHARES = AUDIT_RESERVE.bounds.whole // AUDIT_RESERVE.bounds.host  # of a host, in the disk's reserve
@@ -75,6 +77,7 @@ def main(lifeline_fd: int, config_path: Path) -> None:
     settings = load_resolved(config_path)
     # The loop waits no longer than this for a thread (audit log, store, large values) in the middle of Python code.
     sys.setswitchinterval(_SWITCH_SECONDS)
+    gc.set_threshold(_GARBAGE)
     uvloop.run(_Control(settings, lifeline_fd).run())
 
 
