@@ -89,7 +89,7 @@ class Budget:
 
     def owing(self, host: str) -> str:
         """Why calls of this host have to wait, in words for it; empty when they need not."""
-        if self._left is None and not self._changes and not self.owed.held(host):
+        if self._left is None and not self._changes and self._is_usual(host):
             return ""
         self._pay()
         self.owed.bounds = self._plenty if self._left is None else self._scarce
@@ -101,6 +101,12 @@ class Budget:
             return 0.0
         over = (self.owed.held(host) - self.owed.bounds.host) / self._pace
         return min(_LONGEST_PAUSE_SECONDS, max(_PAID_EVERY_SECONDS, over))
+
+    def _is_usual(self, host: str) -> bool:
+        """Whether a look at what all owe together shows that this host need not wait, and nothing is to be paid yet."""
+        if not self.owed.held(host):
+            return True
+        return self.owed.total <= self._plenty.host and self._clock() - self._paid < _PAID_EVERY_SECONDS
 
     @property
     def _pace(self) -> int:

@@ -9,6 +9,7 @@ the last colon.
 import ipaddress
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 
 from appliance.ros.errors import InvalidUriError
 
@@ -34,6 +35,7 @@ class NodeUri:
     path: str
 
 
+@lru_cache(4096)  # a node says its own with every call
 def parse_node_uri(text: str) -> NodeUri:
     """Parse the URI of a node's XML-RPC API; raises `InvalidUriError`."""
     return _parse(text, "http", "node API", "http://host:port/")

@@ -33,10 +33,10 @@ class Bulk:
         self.taken = False
         self.large = False  # whether the request itself is
 
-    async def __aenter__(self) -> Self:
+    def __enter__(self) -> Self:
         return self
 
-    async def __aexit__(self, *_error: object) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.give_back()
 
     async def take(self) -> None:

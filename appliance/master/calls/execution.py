@@ -160,7 +160,7 @@ class Execution:
         denied = self._recorded(attempt, decision)
         if denied is not None and verb is Verb.UNREGISTER:
             self._enactor.carry_out(given_up(self._registry, attempt))
-        obstacle = await self._obstacle()
+        obstacle = await self._obstacle() if self._trail.strict else None
         if obstacle is not None:
             return [0, obstacle, attempt.call.denial]
         if denied is not None:
@@ -176,7 +176,7 @@ class Execution:
         answers: list[Value] = [
             self._recorded(one, decision) for one, decision in zip(run, decisions, strict=True)
         ]
-        obstacle = await self._obstacle()
+        obstacle = await self._obstacle() if self._trail.strict else None
         writes: list[int] = []
         for place, (attempt, denied) in enumerate(zip(run, answers, strict=True)):
             if denied is not None:
@@ -224,7 +224,7 @@ class Execution:
 
     async def _obstacle(self) -> str | None:
         """What a caller is told when its record must be on disk before the answer, and cannot be."""
-        if not self._trail.strict or await self._trail.durable() is None:
+        if await self._trail.durable() is None:
             return None
         return f"denied: {NOT_RECORDED}"
 

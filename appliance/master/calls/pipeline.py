@@ -63,7 +63,7 @@ class Pipeline:
             await self._addresses.learn(request.peer)
             caller = Caller(request.peer, "", request.arrived, own=own, target=target)
             before = self.repetitions.state
-            async with Bulk(self._bulk, caller.peer.host) as bulk:
+            with Bulk(self._bulk, caller.peer.host) as bulk:
                 call, answer = await self._serve(Visit(table, caller, bulk), request.body)
             if call is not None and not own and target is None:
                 self.repetitions.note(table, request, call, answer, before=before)

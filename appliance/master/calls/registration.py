@@ -4,8 +4,6 @@ A registration outlasts control before its node is told of it (the store writes 
 twice, and ROSMaster, which knows the rest, can die in the same moment as control.
 """
 
-import contextlib
-from collections.abc import AsyncIterator
 from dataclasses import dataclass
 
 from appliance.master.caller import Answer, ApiUri, Caller
@@ -18,7 +16,7 @@ from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
 from appliance.master.reach.faces import Faces
 from appliance.master.reach.relays import RelayControl
 from appliance.master.rosmaster import RosMaster
-from appliance.master.upkeep.arrivals import Arrivals, making_room_for_nobody
+from appliance.master.upkeep.arrivals import Arrivals, MakingRoomForNobody
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import NO_SERVICE, stand_in
 
@@ -42,7 +40,7 @@ class RegistrationCalls:
         self, caller: Caller, topic: str, topic_type: str, caller_api: ApiUri
     ) -> Answer:
         """`registerPublisher(caller_id, topic, topic_type, caller_api)` → the subscribers' (outer) URIs."""
-        async with self._registering(caller, caller_api) as node:
+        with await self._registering(caller, caller_api) as node:
             inner = self.faces.inner_uri(node)
             answer = await self.rosmaster.call(
                 "registerPublisher", caller.caller_id, topic, topic_type, inner
@@ -57,7 +55,7 @@ class RegistrationCalls:
         self, caller: Caller, topic: str, topic_type: str, caller_api: ApiUri
     ) -> Answer:
         """`registerSubscriber(caller_id, topic, topic_type, caller_api)` → the publishers' (outer) URIs."""
-        async with self._registering(caller, caller_api) as node:
+        with await self._registering(caller, caller_api) as node:
             inner = self.faces.inner_uri(node)
             answer = await self.rosmaster.call(
                 "registerSubscriber", caller.caller_id, topic, topic_type, inner
@@ -71,7 +69,7 @@ class RegistrationCalls:
         self, caller: Caller, service: str, service_api: ApiUri, caller_api: ApiUri
     ) -> Answer:
         """`registerService(caller_id, service, service_api, caller_api)`."""
-        async with self._registering(caller, caller_api) as node:
+        with await self._registering(caller, caller_api) as node:
             inner = self.faces.inner_uri(node)
             answer = await self.rosmaster.call(
                 "registerService", caller.caller_id, service, stand_in(node), inner
@@ -84,7 +82,7 @@ class RegistrationCalls:
 
     async def subscribe_param(self, caller: Caller, caller_api: ApiUri, key: str) -> Answer:
         """`subscribeParam(caller_id, caller_api, key)`."""
-        async with self._registering(caller, caller_api) as node:
+        with await self._registering(caller, caller_api) as node:
             told = (caller.caller_id, self.faces.inner_uri(node), key)
             answer = await self.rosmaster.call("subscribeParam", *told)
             hidden = self.rights.hidden(caller, "subscribeParam", key, answer)
@@ -151,8 +149,7 @@ class RegistrationCalls:
         meant = holder is not None and (holder.host, holder.outer_port) == (caller.peer.host, api.uri.port)
         return holder if meant else None
 
-    @contextlib.asynccontextmanager
-    async def _registering(self, caller: Caller, api: ApiUri) -> AsyncIterator[Incarnation]:
+    async def _registering(self, caller: Caller, api: ApiUri) -> MakingRoomForNobody:
         """The incarnation that registers, which makes room for nobody meanwhile.
 
         A new one takes the room of one of its host's that has nothing or is gone.
@@ -160,9 +157,7 @@ class RegistrationCalls:
         spare = self.gate.to_make_room(caller, api)
         if spare is not None:
             self.enactor.carry_out(self.graph.forgotten(spare))
-        incarnation = await self.arrivals.incarnation_for(caller, api)
-        with making_room_for_nobody(incarnation):
-            yield incarnation
+        return MakingRoomForNobody(await self.arrivals.incarnation_for(caller, api))
 
 
 def given_up(registry: Registry, denied: Attempt) -> list[Durable]:

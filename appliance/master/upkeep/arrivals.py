@@ -4,9 +4,7 @@ Who is coming makes room for nobody: else two that come at once, where there is 
 other for ever.
 """
 
-import contextlib
 import time
-from collections.abc import Iterator
 
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.graph.graph import Graph
@@ -58,14 +56,14 @@ class Arrivals:
         if incarnation is not None and incarnation.life is Life.SHADOW:
             if self._registry.holder(incarnation.name) is None:
                 # It was away and adds to what it had, before anybody saw that it is back.
-                with making_room_for_nobody(incarnation):
+                with MakingRoomForNobody(incarnation):
                     await self._liveness.revive(incarnation)
                 return incarnation
             # Another took its name meanwhile: it begins anew.
             self._enactor.carry_out(self._graph.forgotten(incarnation))
         incarnation = self._make(caller, api)
         try:
-            with making_room_for_nobody(incarnation):
+            with MakingRoomForNobody(incarnation):
                 await self._faces.open(incarnation)
         except NoPortError:
             self._enactor.carry_out(self._graph.forgotten(incarnation))
@@ -103,11 +101,17 @@ class Arrivals:
                 self._enactor.carry_out(self._graph.forgotten(spare))
 
 
-@contextlib.contextmanager
-def making_room_for_nobody(incarnation: Incarnation) -> Iterator[None]:
-    """A registering call of it is under way."""
-    incarnation.calls += 1
-    try:
-        yield
-    finally:
-        incarnation.calls -= 1
+class MakingRoomForNobody:
+    """A registering call of an incarnation is under way."""
+
+    __slots__ = ("_incarnation",)
+
+    def __init__(self, incarnation: Incarnation) -> None:
+        self._incarnation = incarnation
+
+    def __enter__(self) -> Incarnation:
+        self._incarnation.calls += 1
+        return self._incarnation
+
+    def __exit__(self, *_error: object) -> None:
+        self._incarnation.calls -= 1

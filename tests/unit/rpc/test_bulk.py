@@ -33,7 +33,7 @@ def test_room_for_one_of_a_host_and_two_in_all() -> None:
         go = asyncio.Event()
 
         async def request(host: Any) -> None:
-            async with Bulk(turns, host) as bulk:
+            with Bulk(turns, host) as bulk:
                 await bulk.take()
                 await bulk.take()  # again is nothing more
                 inside.append(host)
@@ -57,14 +57,14 @@ def test_room_comes_back_after_a_failure() -> None:
     async def scene() -> None:
         turns = bulk_turns(lambda _host: Standing.REGISTERED)
         for _ in range(3):
-            with pytest.raises(KeyError):
-                async with Bulk(turns, HOSTS[0]) as bulk:
-                    await bulk.take()
-                    raise KeyError
-            async with Bulk(turns, HOSTS[0]):
+            with pytest.raises(KeyError), Bulk(turns, HOSTS[0]) as bulk:
+                await bulk.take()
+                raise KeyError
+            with Bulk(turns, HOSTS[0]):
                 pass
-        async with asyncio.timeout(20), Bulk(turns, HOSTS[0]) as bulk:
-            await bulk.take()
+        with Bulk(turns, HOSTS[0]) as bulk:
+            async with asyncio.timeout(20):
+                await bulk.take()
             assert bulk.taken
 
     asyncio.run(scene())
