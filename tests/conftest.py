@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -100,11 +101,16 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
 
 @pytest.hookimpl(trylast=True)  # pytest-rerunfailures has called its other half by then
 def pytest_configure(config: pytest.Config) -> None:
-    """Give each worker of pytest-xdist a loopback of its own, as root.
+    """Have programs listen to SIGINT; give each worker of pytest-xdist a loopback of its own, as root.
+
+    What a script starts in the background ignores SIGINT, and so does every program that it starts: tests that
+    interrupt one would wait for its end until their limit.
 
     A node that a test killed is remembered by its master with a port; on a common loopback the next node that takes
     this port may be another worker's. It would answer for the dead one, or be told to shut down in its place.
     """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(config, "workerinput") or not has_privileges():
         return
     namespace = Namespace(f"rosrv-test-worker.{os.getpid()}").create()
