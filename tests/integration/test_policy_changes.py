@@ -88,7 +88,9 @@ def test_a_node_that_stood_still_over_a_reload_has_lost_what_the_policy_took(
     config = tmp_path / "appliance.yaml"
     config.write_text("liveness: {interval: 0.5, silent: 2}\n")
     with (
-        Appliance(lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config))) as appliance,
+        Appliance(
+            lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config), "--api", "off")
+        ) as appliance,
         RosSession(appliance.master_uri, tmp_path, robot) as ros,
     ):
         listener = ros.listener("rospy", "/chatter")

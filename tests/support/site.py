@@ -7,7 +7,7 @@ the other one that the robot does not notice.
 from pathlib import Path
 from typing import Self
 
-from examples.landshark.lab import Lab
+from examples.landshark.lab import Host, Lab
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.rosmaster import PlainMaster
 
@@ -43,6 +43,9 @@ class Site(MasterSite):
         self.robot = lab.host("robot", "10.77.0.10/24")
         self.ocu = lab.host("ocu", "10.77.0.20/24")
         middle = lab.host("master", "10.77.0.2/24")
-        super().__init__(
-            mode, PlainMaster(home, middle) if mode == "plain" else Appliance(middle, policy=policy)
-        )
+        super().__init__(mode, PlainMaster(home, middle) if mode == "plain" else for_nodes(middle, policy))
+
+
+def for_nodes(host: Host | None = None, policy: str = OPEN_POLICY) -> Appliance:
+    """An appliance as nodes see it: without REST."""
+    return Appliance(host, policy=policy, options=("--api", "off"))

@@ -8,18 +8,17 @@ import pytest
 
 from tests.integration.conformance.fake_nodes import FakeNodes
 from tests.integration.conformance.side_by_side import BothMasters, MasterSide
-from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import need_root, needs
 from tests.support.rosmaster import PlainMaster, await_node
-from tests.support.site import MasterSite
+from tests.support.site import MasterSite, for_nodes
 
 
 class LocalSite(MasterSite):
     """A master of one mode on 127.0.0.1."""
 
     def __init__(self, mode: str, home: Path) -> None:
-        super().__init__(mode, PlainMaster(home) if mode == "plain" else Appliance(policy=OPEN_POLICY))
+        super().__init__(mode, PlainMaster(home) if mode == "plain" else for_nodes())
 
     def __enter__(self) -> Self:
         super().__enter__()

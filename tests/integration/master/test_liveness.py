@@ -26,7 +26,7 @@ def test_what_publishes_for_monitors_is_there_behind_the_firewall(
     """A node whose port refuses is lost; the appliance's own publisher, which the firewall hides, is not."""
     config = tmp_path / "appliance.yaml"
     config.write_text("liveness: {interval: 0.1}\n")
-    options = ("--config", str(config), "--monitors", str(MONITORS))
+    options = ("--config", str(config), "--monitors", str(MONITORS), "--api", "off")
     with Appliance(lab.host("appliance", "10.77.0.2/24"), options=options) as appliance:
 
         def register() -> None:
@@ -51,7 +51,9 @@ def test_a_dead_node_is_noticed_beside_a_guests_silent_ones(lab: Lab, robot: Hos
     guest = lab.host("guest", "10.77.0.66/24")
     config = tmp_path / "appliance.yaml"
     config.write_text("liveness: {interval: 2, silent: 300}\n")
-    with Appliance(lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config))) as appliance:
+    with Appliance(
+        lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config), "--api", "off")
+    ) as appliance:
         with guest.entered():
             silent = socket.create_server(("10.77.0.66", 4000), backlog=1024)
 
@@ -83,7 +85,9 @@ def test_a_subscriber_that_stood_still_for_a_moment_hears_of_who_came(
     config = tmp_path / "appliance.yaml"
     config.write_text("limits: {node_call_seconds: 0.5}\nliveness: {interval: 1, silent: 120}\n")
     with (
-        Appliance(lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config))) as appliance,
+        Appliance(
+            lab.host("appliance", "10.77.0.2/24"), options=("--config", str(config), "--api", "off")
+        ) as appliance,
         RosSession(appliance.master_uri, tmp_path, robot) as ros,
     ):
         listener = ros.listener(client, "/chatter")
