@@ -29,12 +29,12 @@ class Counts:
         self.place = place
         self.begun = False
         """Whether somebody has been told that something is counted."""
+        self.changed: dict[int, int] = {}
+        """Where walks add up what was changed (`Prepared`)."""
         self._clear()
 
     def add(self, walked: Walked, time: int) -> int:
-        """Count a walk; how many messages it dropped."""
-        for who, count in walked.changed:
-            self._changed[who] = self._changed.get(who, 0) + count
+        """Count what a walk dropped; how many messages."""
         for number, count in enumerate(walked.dropped):
             if count:
                 self._dropped[number] += count
@@ -50,14 +50,14 @@ class Counts:
         """
         happened = self.walker.happened()
         counts = [Count(*each) for each in zip(happened, self._dropped, self._last_drop, strict=True)]
-        changed = {self.walker.writers(who): count for who, count in self._changed.items()}
+        changed = {self.walker.writers(who): count for who, count in self.changed.items()}
         told = self._told
         self._clear()
         return counts, changed, told
 
     def _clear(self) -> None:
         self.begun = False
-        self._changed: dict[int, int] = {}
+        self.changed.clear()
         self._dropped = [0] * len(self.walker.events)
         self._last_drop = [0] * len(self.walker.events)
         self._told = [Told(0, 0)] * len(self.walker.verdicts)

@@ -52,16 +52,14 @@ _NEVER = (1 << 63) - 1  # comes after every time, so that output is due
 class Walked(NamedTuple):
     """What a walk has done.
 
-    `position` is where the first message begins that is left; `run` where what goes on unchanged begins (behind the
-    last dropped message). `dropped` are counts for each of the walker's events, if any was; `changed` has a set of
-    events (see `Walker.writers`) and how many messages they changed together, for each run of such messages. `told` are
-    counts for each of the walker's verdicts, if there was any. `sooner`: something is due earlier than it was.
+    `position` is where the first message begins that is left; `run` where what goes on in its buffer begins (behind the
+    last dropped message). `dropped` are counts for each of the walker's events, if any was, `told` for each of its
+    verdicts, if there was any. `sooner`: something is due earlier than it was.
     """
 
     position: int
     run: int
     dropped: Sequence[int]
-    changed: Sequence[tuple[int, int]]
     told: Sequence[int] = ()
     sooner: bool = False
 
@@ -69,13 +67,14 @@ class Walked(NamedTuple):
 class Prepared(NamedTuple):
     """What holds for all walks of a topic until the engine, or anything else, has done something: the sender of
     the messages; bits of `told` (and whether no message may be changed), `enabled` and `counted`, as the module takes
-    them.
+    them; and where walks add up how many messages a set of events (see `Walker.writers`) has changed.
     """
 
     source: int
     told: int
     enabled: int
     counted: int
+    changed: dict[int, int]
 
 
 class Due(Protocol):
@@ -122,7 +121,7 @@ class Home:
             self._enter()
         self.prepared = prepared
         self.machine.refuel(FUEL)
-        _PREPARED.pack_into(self._memory, self._source, prepared.source << 32, *prepared[1:])
+        _PREPARED.pack_into(self._memory, self._source, prepared.source << 32, *prepared[1:4])
 
     def _enter(self) -> None:
         states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
@@ -221,19 +220,26 @@ class Walker:
         return True
 
     def prepare(
-        self, *, loud: bool, told: Sequence[bool], counted: Sequence[bool] = (), source: int = 0
+        self,
+        *,
+        loud: bool,
+        told: Sequence[bool],
+        counted: Sequence[bool] = (),
+        source: int = 0,
+        changed: dict[int, int] | None = None,
     ) -> Prepared:
         """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none,
         `counted` for each verdict whether there may be more. Good until the engine is asked for anything.
         """
         bits = sum(1 << number for number, one in enumerate(told) if one) - (LOUD if loud else 0)
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
-        return Prepared(source, bits, enabled, sum(1 << number for number, one in enumerate(counted) if one))
+        only = sum(1 << number for number, one in enumerate(counted) if one)
+        return Prepared(source, bits, enabled, only, {} if changed is None else changed)
 
     def walk(  # noqa: PLR0917  called for every batch: keywords would cost a tenth of it
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
     ) -> Walked | None:
-        """Take messages from `position` on, as many as need nothing special. None: all, and they go on as they came.
+        """Take messages from `position` on, as many as need nothing special. None: all, and all go on in their buffer.
 
         Only while the walker is `ready` and nothing of the set is due. `view` has whole frames and can be written: the
         beginning of `Walks.area`, or others. What goes on before a dropped message is appended to `pieces`.
@@ -244,28 +250,34 @@ class Walker:
             self._home.prepare(prepared)
         frames = self._frames
         end = frames + len(view)
-        begun = run
-        changed: list[tuple[int, int]] = []
+        begun, said = run, 0
         while True:
             try:
                 answer = self._call(frames + position, end, time_ns) or 0
             except MachineTrap:
                 answer = self._stopped()
-            if answer == end and run == begun and not changed:
-                return None
-            position = (answer & _ADDRESS) - frames
+            said |= answer
             if answer >= LEFT:
                 self._undo()
-            for first, following in self._carry_out(answer >> 32 & 0xFFFFFF, changed):
-                if first > run:
-                    pieces.append(view[run:first])
-                run = following
+            effects = (answer >> 32 & 0xFFFFFF) * _EFFECT.size
+            if effects:
+                for who, what in _EFFECT.iter_unpack(self._memory[self._effects : self._effects + effects]):
+                    if who != -1:
+                        prepared.changed[who] = prepared.changed.get(who, 0) + what
+                        continue
+                    first = (what & _ADDRESS) - frames
+                    if first > run:
+                        pieces.append(view[run:first])
+                    run = (what >> 32) - frames
+            if answer & _ADDRESS == end and run == begun and said < TOLD:
+                return None
+            position = (answer & _ADDRESS) - frames
             sooner = bool(answer & SOONER)
             if answer >= LEFT or position == len(view) or sooner:
                 if sooner:
                     self._home.hasten()
-                dropped, told = self._counted() if run != begun or answer & TOLD else ((), ())
-                return Walked(position, run, dropped, changed, told, sooner)
+                dropped, told = self._counted() if run != begun or said & TOLD else ((), ())
+                return Walked(position, run, dropped, told, sooner)
 
     def take(self, message: Buffer, time_ns: int, source: int = 0) -> Sequence[str] | None:
         """Take a message of which nothing is to be told but which events happened: they. None if it is left.
@@ -288,7 +300,7 @@ class Walker:
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
     ) -> Walked:
         area = self._memory[self._frames : self._frames + BEGINNING]
-        changed: list[tuple[int, int]] = []
+        each = prepared._replace(changed={})
         dropped: Sequence[int] = ()
         told: Sequence[int] = ()
         sooner = False
@@ -297,35 +309,23 @@ class Walker:
             size = min(following - position, BEGINNING)
             area[:size] = view[position : position + size]
             _LENGTH.pack_into(area, 0, size - 4)
-            walked = self.walk(area[:size], 0, 0, [], time_ns, prepared)
-            if walked is None:
-                position = following
-                continue
-            if not walked.position:
-                break
-            sooner = walked.sooner
-            told = _sums(told, walked.told)
-            if walked.changed:
+            walked = self.walk(area[:size], 0, 0, [], time_ns, each)
+            for who in each.changed:
                 view[position + 4 : position + size] = area[4:size]
-                changed += walked.changed
-            elif walked.run:
-                if position > run:
-                    pieces.append(view[run:position])
-                run = following
-                dropped = _sums(dropped, walked.dropped)
+                prepared.changed[who] = prepared.changed.get(who, 0) + 1
+            each.changed.clear()
+            if walked is not None:
+                if not walked.position:
+                    break
+                sooner = walked.sooner
+                told = _sums(told, walked.told)
+                if walked.run:
+                    if position > run:
+                        pieces.append(view[run:position])
+                    run = following
+                    dropped = _sums(dropped, walked.dropped)
             position = following
-        return Walked(position, run, dropped, changed, told, sooner)
-
-    def _carry_out(self, count: int, changed: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Note what was changed; from where to where frames were dropped."""
-        dropped = []
-        effects = self._memory[self._effects : self._effects + count * _EFFECT.size]
-        for who, what in _EFFECT.iter_unpack(effects):
-            if who == -1:
-                dropped.append(((what & _ADDRESS) - self._frames, (what >> 32) - self._frames))
-            else:
-                changed.append((who, what))
-        return dropped
+        return Walked(position, run, dropped, told, sooner)
 
     def _stopped(self) -> int:
         """What the module would have answered where it was stopped: the message that it looked at is left."""

@@ -169,15 +169,16 @@ class Lane:
         """Ask once what holds for all batches until something happens."""
         telling, place = self._middle.telling, self._place
         prepared, counts = self._prepared, self._counts
+        if counts is None or counts.walker is not walker:
+            counts = self._counts = Counts(walker, place)
         if prepared is None or self._sight is not self._middle.sight or self._walker is not walker:
             prepared = self._prepared = walker.prepare(
                 loud=walker.changes and telling.shows(place),
                 told=[not telling.hides_drop(one, place) for one in walker.monitors] if walker.drops else (),
                 counted=[telling.hides_verdict(one, place) for one in walker.verdicts],
                 source=self._source,
+                changed=counts.changed,
             )
-        if counts is None or counts.walker is not walker:
-            counts = self._counts = Counts(walker, place)
         self._walker, self._sight = walker, self._middle.sight
         self._until = (_NEVER if monitors.next_due is None else monitors.next_due) if walker.brief else 0
         return prepared, counts

@@ -691,8 +691,9 @@ def test_a_walk_stops_before_what_is_to_be_told() -> None:
     walked = walker.walk(view, 0, 0, [], 5, walker.prepare(loud=True, told=[False]))
     assert walked is not None
     assert (bytes(view), walked.position) == (given, 0)
-    walked = walker.walk(view, 0, 0, [], 5, walker.prepare(loud=False, told=[True]))
+    prepared = walker.prepare(loud=False, told=[True])
+    walked = walker.walk(view, 0, 0, [], 5, prepared)
     assert walked is not None
     assert bytes(view) == frames([plain(7)] * 3 + [plain()] * 3)
-    assert (walked.position, [*walked.changed]) == (3 * size, [(1, 3)])
+    assert (walked.position, prepared.changed) == (3 * size, {1: 3})
     assert fed.state() == ["n 3"]
