@@ -21,7 +21,9 @@ READ = select.EPOLLIN
 WRITE = select.EPOLLOUT
 HANGUP = select.EPOLLRDHUP
 
-_EVENTS_PER_TURN = 256
+_EVENTS_PER_TURN = (
+    64  # Python takes memory for so many each time: for more of them not from where that is quick
+)
 _LONGEST_WAIT = 3600.0
 
 Handler = Callable[[int], None]
@@ -90,11 +92,16 @@ class Loop:
 
     def turn(self, longest: float) -> None:
         """Wait for at most `longest` seconds, then call what is due."""
-        for descriptor, events in self._epoll.poll(self._wait(longest), _EVENTS_PER_TURN):
+        timers = self._timers
+        if timers:
+            left = timers[0][0] - self.clock()
+            if left < longest:
+                longest = left if left > 0 else 0
+        for descriptor, events in self._epoll.poll(longest, _EVENTS_PER_TURN):
             handler = self._handlers.get(descriptor)
             if handler is not None:
                 handler(events)
-        if self._timers:
+        if timers and timers[0][0] <= self.clock():
             self._call_due()
         if self._discarded:
             self._close_discarded()
@@ -104,13 +111,6 @@ class Loop:
         self._close_discarded()
         self._handlers.clear()
         self._epoll.close()
-
-    def _wait(self, longest: float) -> float:
-        while self._timers and self._timers[0][2].callback is None:
-            heapq.heappop(self._timers)
-        if not self._timers:
-            return longest
-        return min(longest, max(0.0, self._timers[0][0] - self.clock()))
 
     def _call_due(self) -> None:
         now = self.clock()

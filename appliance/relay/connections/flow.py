@@ -104,9 +104,8 @@ class PublicationFlow:
         self._own: Flow | None = None
         self._together: Flow | None = None
         self._waiting: Batch | None = None
-
-    def __bool__(self) -> bool:
-        return self._own is not None or self._together is not None
+        self.limits = False
+        """Whether there are any."""
 
     def set(self, own: FlowLimit, together: Flow | None, now: float) -> None:
         """These are the limits from now on."""
@@ -115,6 +114,7 @@ class PublicationFlow:
         elif own != UNLIMITED:
             self._own = Flow(own, now)
         self._together = together
+        self.limits = self._own is not None or together is not None
 
     def passing(self, batch: Batch, now: float, *, latching: bool) -> Batch | None:
         """The first messages of a batch, as many as may pass; None when none may."""

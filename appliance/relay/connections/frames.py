@@ -16,9 +16,8 @@ subscribers have been sent always ends with a frame.
 
 import mmap
 import struct
-from collections.abc import Callable
-from functools import lru_cache
-from math import ceil
+from math import ceil, gcd
+from typing import Literal
 
 from appliance.relay.connections.memory import HostShare
 from appliance.ros.errors import LimitExceededError
@@ -31,7 +30,7 @@ SCRATCH = 512 << 10
 _KEEP_AREA = 8 << 20  # a frame of a camera: memory that is new for each one costs four times the rest
 
 _MANY = 4  # frames
-_BLOCK = 64  # of them
+_COLUMNS: dict[int, Literal["B", "H", "I"]] = {1: "B", 2: "H", 4: "I"}  # formats of so many bytes
 
 _LENGTH = struct.Struct("<I")
 _unpack_length = _LENGTH.unpack_from
@@ -107,7 +106,10 @@ class Batch:
 
 
 class Scratch:
-    """Where small frames are received; another area may be given between two reads."""
+    """Where small frames are received; another area may be given between two reads.
+
+    It begins with a page: the kernel copies faster from and to what is aligned.
+    """
 
     __slots__ = ("area",)
 
@@ -116,7 +118,7 @@ class Scratch:
 
     def move(self, area: memoryview | None) -> None:
         """From the next read on use this area, or (None) one of its own."""
-        self.area = memoryview(bytearray(SCRATCH)) if area is None else area
+        self.area = memoryview(mmap.mmap(-1, SCRATCH)) if area is None else area
 
 
 class FrameReceiver:
@@ -204,7 +206,7 @@ class FrameReceiver:
                 self._begin_area(need, buffer[position:end])
             else:
                 self._torn = bytes(buffer[position:end])
-        if self._area is None:
+        if self._area is None and len(self._torn) != self._counted:
             self._count(len(self._torn))
             if len(self._torn) > SMALL and self._share.exhausted:
                 raise _no_memory()
@@ -260,18 +262,12 @@ def equal_frames(buffer: memoryview, end: int) -> tuple[int, int]:
     whole = count * stride
     if end - whole >= 4 and _unpack_length(buffer, whole)[0] + 4 <= end - whole:
         return 0, 0  # a whole frame that is shorter follows
-    block = _BLOCK * stride
-    for start in range(0, whole, block):
-        unpack, alike = _lengths(stride, min(_BLOCK, (whole - start) // stride))
-        if unpack(buffer, start) != alike:
+    width = gcd(stride, 4)
+    column, step = buffer[:whole].cast(_COLUMNS[width]), stride // width
+    for part in range(4 // width):  # of each length, beside that of the frame before
+        if column[part + step :: step] != column[part:-step:step]:
             return 0, 0
     return stride, count
-
-
-@lru_cache(maxsize=256)
-def _lengths(stride: int, count: int) -> tuple[Callable[[memoryview, int], tuple[int, ...]], tuple[int, ...]]:
-    """What reads the lengths of so many frames one after the other, and what it reads if they are equal."""
-    return struct.Struct("<" + f"I{stride - 4}x" * count).unpack_from, (stride - 4,) * count
 
 
 def last_frame(view: memoryview) -> int:

@@ -54,6 +54,7 @@ class Subscriber:
         self._ended = ended
         self._share = context.memory.queues.of(host)
         self._outbox = Outbox(context.limits, self._share)
+        self._writing = False  # whether the loop says when the socket takes more
         self._stall = Stall(context.limits.stall_seconds)
         self._number = 0
         self._live = True
@@ -81,7 +82,7 @@ class Subscriber:
             return False
         if sent < len(data):
             self._outbox.begin(memoryview(data)[sent:])
-            self._loop.change(self._socket.fileno(), READ | WRITE)
+            self._write(True)
         return True
 
     def deliver(self, batch: Batch) -> int:
@@ -95,7 +96,7 @@ class Subscriber:
                 return 0
             batch = passing
         outbox = self._outbox
-        if outbox:
+        if self._writing:
             outbox.append(batch.keep(), batch.messages)
         else:
             view = batch.view
@@ -111,7 +112,7 @@ class Subscriber:
             if sent == len(view):
                 return 0
             outbox.append(batch.keep(), batch.messages, sent)
-            self._loop.change(self._socket.fileno(), READ | WRITE)
+            self._write(True)
         if self.behind_since is None and outbox.behind:
             self.behind_since = self._loop.clock()
         return 0
@@ -183,8 +184,13 @@ class Subscriber:
         outbox.advance(sent)
         if not outbox:
             self.behind_since = None
-            self._loop.change(self._socket.fileno(), READ)
+            self._write(False)
             self.topic.relieve()
+
+    def _write(self, on: bool) -> None:
+        """Write what waits as soon as the socket takes it, or nothing waits."""
+        self._writing = on
+        self._loop.change(self._socket.fileno(), READ | WRITE if on else READ)
 
     def _listen(self) -> None:
         try:

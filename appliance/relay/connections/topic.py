@@ -268,7 +268,7 @@ class RelayedTopic:
         self._next += batch.messages
         recording = self._recording
         if recording is None:
-            self._pass(batch, since)
+            (self._pass if self.flow.limits else self._admit)(batch, since)
             return
         # Recorded when subscribers have it, so that nothing is later; monitors may change it in place meanwhile.
         view = batch.view if self.through is None else memoryview(bytes(batch.view))
@@ -279,9 +279,7 @@ class RelayedTopic:
 
     def _pass(self, batch: Batch, since: float) -> None:
         """What a limit lets pass goes on."""
-        passing: Batch | None = batch
-        if self.flow:
-            passing = self.flow.passing(batch, self._clock(), latching=self._latching)
+        passing = self.flow.passing(batch, self._clock(), latching=self._latching)
         if passing is not None:
             self._admit(passing, since)
 

@@ -145,7 +145,7 @@ def module_of(
                 continue
             walks.append(walk.code())
             feeds[topic] = walk.feed(f"feed {len(feeds)}")
-    frames = writer.take(AREA + _SLACK)
+    frames = -(-writer.take(0) // _PAGE) * _PAGE  # the kernel copies faster from and to what is aligned
     memory = -(-(frames + AREA + _SLACK) // _PAGE) * _PAGE
     code = _assembled(writer, walks, feeds, tables, memory)
     return FeedModule(code, memory, frames, effects, feeds, cells, writer.throttles, writer.budgets)
