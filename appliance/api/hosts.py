@@ -185,17 +185,8 @@ async def _token(
     services: Services, name: str, asked: TokenWishes, expected: int | None, bearer: Bearer
 ) -> answers.EnrolmentToken:
     _wishes(asked)  # refuses what makes no sense
-    order = admin.HostToken(
-        name,
-        asked.endpoint,
-        asked.ports,
-        asked.open,
-        asked.token_seconds,
-        asked.days,
-        asked.address,
-        expected,
-        new=isinstance(asked, NewHost),
-    )
+    said = {field: getattr(asked, field) for field in TokenWishes.__struct_fields__}
+    order = admin.HostToken(name, **said, expected=expected, new=isinstance(asked, NewHost))
     return answered(await services.control.ask(order, bearer, SLOW_SECONDS))
 
 

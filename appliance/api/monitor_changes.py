@@ -68,9 +68,7 @@ def _add_texts(router: Routes, services: Services) -> None:
         """
         _may_load(bearer, dry_run=dry_run)
         expected = _expected(if_match, dry_run=dry_run)
-        order = admin.MonitorLoad(
-            new.files, new.definitions, new.note, expected, confirm_within, new.signatures
-        )
+        order = admin.MonitorLoad(**asdict(new), expected=expected, confirm_within=confirm_within)
         return await (_tried(services, order, bearer) if dry_run else _replaced(control, order, bearer))
 
     @router.put("/{name}", responses=_CHANGES | UNKNOWN)
@@ -91,14 +89,7 @@ def _add_texts(router: Routes, services: Services) -> None:
         expected = _expected(if_match, dry_run=dry_run)
         if not dry_run:
             order = admin.MonitorReplace(
-                name,
-                new.text,
-                new.definitions,
-                new.note,
-                expected,
-                confirm_within,
-                new.signature,
-                new.signatures,
+                name=name, **asdict(new), expected=expected, confirm_within=confirm_within
             )
             return await _replaced(control, order, bearer)
         file = await _file_of(control, name, bearer)

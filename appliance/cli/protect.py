@@ -8,7 +8,7 @@ done, or nothing answered.
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal, NoReturn
 from urllib.parse import urlsplit
 
@@ -167,17 +167,7 @@ def _check(checked: _Checked, running: Appliance, as_json: bool) -> None:
     opened = any(result.open for result in results)
     unknown = not all(result.answered and not result.untried for result in results)
     state: Literal["closed", "open", "unknown"] = "open" if opened else "unknown" if unknown else "closed"
-    addresses = [
-        {
-            "address": one.address,
-            "open": one.open,
-            "refused": one.refused,
-            "silent": one.silent,
-            "untried": one.untried,
-            "obstacle": one.obstacle or None,
-        }
-        for one in results
-    ]
+    addresses = [asdict(one) | {"obstacle": one.obstacle or None} for one in results]
     report = {
         "event": "check",
         "host": checked.host,

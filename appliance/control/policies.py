@@ -250,14 +250,8 @@ class Policies:
 
     def _described(self, row: RevisionRow) -> dict[str, Any]:
         """The fields of `PolicyRevision`."""
-        return {
-            "revision": row.revision,
-            "file": row.file,
-            "loaded": row.loaded,
-            "who": row.who,
-            "note": row.note,
-            "in_force": row.revision == self.revision,
-        }
+        known = {name: getattr(row, name) for name in ("revision", "file", "loaded", "who", "note")}
+        return known | {"in_force": row.revision == self.revision}
 
     @property
     def known(self) -> Known:

@@ -462,14 +462,8 @@ class Monitors:
 
     def _described(self, row: MonitorRevisionRow) -> dict[str, Any]:
         """The fields of `MonitorRevision`."""
-        return {
-            "revision": row.revision,
-            "loaded": row.loaded,
-            "who": row.who,
-            "note": row.note,
-            "in_force": row.revision == self.revision,
-            "names": list(sources_of(row).files),
-        }
+        known = {name: getattr(row, name) for name in ("revision", "loaded", "who", "note")}
+        return known | {"in_force": row.revision == self.revision, "names": list(sources_of(row).files)}
 
     def _states_of(self, checked: Checked) -> dict[str, Switch]:
         """What these monitors are, or would be; what shares variables with a monitor on trial is on trial, too."""

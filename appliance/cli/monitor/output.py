@@ -1,6 +1,7 @@
 """How the monitor verbs show things: findings, and what came of every message of a recording."""
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from typing import Any
 
 from appliance.audit.why import lines_of_why
@@ -18,16 +19,7 @@ def say_finding(finding: Finding, *, as_json: bool) -> None:
     if not as_json:
         say(str(finding), "red" if finding.severity == "error" else "yellow")
         return
-    place = finding.position
-    say_json(
-        {
-            "file": place.file,
-            "line": place.line,
-            "column": place.column,
-            "severity": finding.severity,
-            "text": finding.text,
-        }
-    )
+    say_json({**asdict(finding.position), "severity": finding.severity, "text": finding.text})
 
 
 def record(outcome: Outcome, index: int | None = None, topic: str | None = None) -> dict[str, object]:
@@ -79,13 +71,7 @@ def _place(source: int) -> dict[str, Any]:
 
 
 def _fault(fault: Fault) -> dict[str, object]:
-    return {
-        "file": fault.position.file,
-        "line": fault.position.line,
-        "column": fault.position.column,
-        "text": fault.text,
-        "values": dict(fault.values),
-    }
+    return {**asdict(fault.position), "text": fault.text, "values": dict(fault.values)}
 
 
 def lines(outcome: Outcome, index: int | None = None, topic: str | None = None) -> Iterator[str]:

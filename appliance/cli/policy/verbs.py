@@ -90,8 +90,7 @@ def _say_finding(finding: Finding, *, as_json: bool) -> None:
 
 def _decision_fields(decision: Decision) -> dict[str, object]:
     """A decision as the audit log writes it."""
-    rule = decision.rule
-    place = {"section": rule.section, "key": rule.key, "file": rule.file, "line": rule.line} if rule else None
+    place = asdict(decision.rule) if decision.rule else None
     return {"decision": decision.word, "rule": place, "reason": decision.reason}
 
 

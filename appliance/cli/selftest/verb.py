@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -48,8 +49,7 @@ def selftest(
         failed += found.outcome == "fail"
         warned += found.outcome == "warn"
         if as_json:
-            row = {"check": found.check, "outcome": found.outcome, "text": found.text, "advice": found.advice}
-            say_json(row)
+            say_json(asdict(found))
             sys.stdout.flush()
         else:
             text = Text(printable(found.text))
