@@ -18,7 +18,7 @@ from appliance.channel import admin
 from appliance.channel.answers.recordings import RecordedMessages, Recording, Timeline
 from appliance.cli import completion
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
-from appliance.cli.output import counted, printable, say, say_json, usage_error
+from appliance.cli.output import counted, printable, refused, say, say_json, usage_error
 from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
 from appliance.cli.topic import lines_of
@@ -261,13 +261,17 @@ def _bag(way: AdminSocket, recording: Recording) -> Path:
 
 
 def _asked(way: "RestWay", path: str, query: dict[str, Any], kind: type[_T]) -> _T:
-    """What REST answers. Ends the program with 2 when it refuses."""
+    """What REST answers. Ends the program with 2 where it makes no sense or none answers, 1 when it is refused."""
     from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
     given = {name: value for name, value in query.items() if value is not None}
     try:
         return msgspec.convert(way.client.call("GET", f"/v1/recordings/{path}", params=given), kind)
-    except (ProblemError, NotRunningError) as error:
+    except ProblemError as problem:
+        if problem.kind == "bad-input":
+            raise usage_error(str(problem)) from None
+        raise refused([f"rosrv: {problem}"]) from None
+    except NotRunningError as error:
         raise usage_error(str(error)) from None
 
 

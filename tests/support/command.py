@@ -12,10 +12,13 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 from appliance.cli import main
+from appliance.cli.lazy import Group, Verb, loaded
 
 ROSRV = str(Path(sys.executable).parent / "rosrv")
 _ONE_AT_A_TIME = threading.Lock()  # a process has one standard output
@@ -43,3 +46,18 @@ def rosrv(*arguments: str, **environment: str) -> subprocess.CompletedProcess[st
             status = end.code if isinstance(end.code, int) else int(end.code is not None)
     said, wrong = (one.buffer.getvalue().decode() for one in (out, err))
     return subprocess.CompletedProcess(command, status, said, wrong)
+
+
+def table() -> Iterator[tuple[str, Verb]]:
+    """Every entry of the table."""
+    for name, one in main.VERBS.items():
+        if isinstance(one, Group):
+            yield from ((f"{name} {inner}", verb) for inner, verb in one.verbs.items())
+        else:
+            yield name, one
+
+
+def commands() -> Iterator[tuple[str, Any]]:
+    """Every verb, loaded."""
+    for name, verb in table():
+        yield name, loaded(verb, name.split()[-1])

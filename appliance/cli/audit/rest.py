@@ -20,7 +20,7 @@ from appliance.cli.rest.session import ProblemError, RestClient
 
 _PATH = "/v1/audit"
 _PAGE = 1000
-_ID = re.compile("[0-9a-f]{1,20}")  # of a record, or its sequence; anything else is no record's
+ID = re.compile("[0-9a-f]{1,20}")  # of a record, or its sequence; anything else is no record's
 _VERIFY_SECONDS = 3600.0
 _SILENCE_SECONDS = 60.0  # a stream says something every 15 s
 _AGAIN_SECONDS = 1.0
@@ -51,7 +51,7 @@ class RestLog:
 
     def show(self, record_id: str, neighbours: int) -> Shown | None:
         """One record with its neighbours; None when there is none."""
-        if not _ID.fullmatch(record_id):
+        if not ID.fullmatch(record_id):
             return None
         try:
             with self._refusals():

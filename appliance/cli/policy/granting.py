@@ -1,7 +1,7 @@
 """`rosrv policy grant`: what would grant a request that was refused, as the smallest change of the policy in force."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import msgspec
 import typer
@@ -129,17 +129,24 @@ def _granted(appliance: Appliance, record: str) -> Granted:
 def _record(appliance: Appliance, record: str) -> Record:
     shown = appliance.audit().show(record, 0)
     if shown is None:
-        fail(f"no record with the id {record!a} is in the log", 1)
+        _unknown(record)
     return shown.entry.record
 
 
+def _unknown(record: str) -> NoReturn:
+    fail(f"no record with the id {record!a} is in the log", 1)
+
+
 def _over_rest(appliance: Appliance, record: str, what: str) -> dict[str, Any]:
+    from appliance.cli.audit.rest import ID  # noqa: PLC0415  as below
     from appliance.cli.rest.session import ProblemError  # noqa: PLC0415  httpx is not imported for the socket
 
-    if not record.isalnum():
-        raise usage_error(f"{record} is no id of a record")
-    try:
-        return appliance.rest.call("GET", f"/v1/audit/{record}/{what}")
-    except ProblemError as problem:
-        typer.echo(f"rosrv {'audit' if what == 'why' else 'policy'}: {problem.lines[0]}", err=True)
-        raise typer.Exit(1) from None
+    if not ID.fullmatch(record):
+        _unknown(record)
+    with Errors():
+        try:
+            return appliance.rest.call("GET", f"/v1/audit/{record}/{what}")
+        except ProblemError as problem:
+            if problem.status == 404:
+                _unknown(record)
+            fail(problem.lines[0], 1)

@@ -3,34 +3,19 @@
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
-from appliance.cli.lazy import Group, Verb, loaded
-from appliance.cli.main import VERBS, app
+from appliance.cli.lazy import loaded
+from appliance.cli.main import app
+from tests.support.command import commands, table
 
 ROOT = Path(__file__).parents[3]
 PAGES = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
 ROSRV = str(Path(sys.executable).parent / "rosrv")
-
-
-def table() -> Iterator[tuple[str, Verb]]:
-    """Every entry of the table."""
-    for name, one in VERBS.items():
-        if isinstance(one, Group):
-            yield from ((f"{name} {inner}", verb) for inner, verb in one.verbs.items())
-        else:
-            yield name, one
-
-
-def commands() -> Iterator[tuple[str, Any]]:
-    """Every verb, loaded."""
-    for name, verb in table():
-        yield name, loaded(verb, name.split()[-1])
 
 
 def test_the_table_says_what_the_verbs_say() -> None:
