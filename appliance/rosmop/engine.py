@@ -480,11 +480,11 @@ class MonitorSet:
         """What `process` says, by the walk where that takes the message: as in the relay."""
         walker = self.walker(topic)
         walks = walker is not None and self.walks(walker, time_ns)
-        events = walker.take(buffer, time_ns, sender.source) if walker is not None and walks else None
-        if events is None:
+        taken = walker.take(buffer, time_ns, sender.source) if walker is not None and walks else None
+        if taken is None:
             return self.process(topic, buffer, time_ns, sender)
         outcome = Outcome(buffer, time_ns)
-        outcome.events = events
+        outcome.events, outcome.log = taken
         return outcome
 
     def process_service(

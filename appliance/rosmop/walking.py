@@ -11,20 +11,21 @@ Invariants:
 """
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 from appliance.rosmop.compile.program import groups
 from appliance.rosmop.compile.specification import Compiled
-from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, POSITION, SOONER, TOLD, Feed, FeedModule, module_of
-from appliance.rosmop.ir.module import UNDO, Cells
+from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, SOONER, TOLD, Feed, FeedModule, module_of
+from appliance.rosmop.ir.module import POSITION, SURE, UNDO, Cells
+from appliance.rosmop.ir.output import HEAD
 from appliance.rosmop.ir.values import Values, struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
 from appliance.rosmop.outcomes import Verdict
-from appliance.rosmop.runtime.context import Context
+from appliance.rosmop.runtime.context import Context, LogLine, line_of
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
@@ -54,7 +55,8 @@ class Walked(NamedTuple):
 
     `position` is where the first message begins that is left; `run` where what goes on in its buffer begins (behind the
     last dropped message). `dropped` are counts for each of the walker's events, if any was, `told` for each of its
-    verdicts, if there was any. `sooner`: something is due earlier than it was.
+    verdicts, if there was any. `sooner`: something is due earlier than it was. `lines` were put out, each with where
+    the frame begins of the message that it is about.
     """
 
     position: int
@@ -62,6 +64,7 @@ class Walked(NamedTuple):
     dropped: Sequence[int]
     told: Sequence[int] = ()
     sooner: bool = False
+    lines: Sequence[tuple[int, LogLine]] = ()
 
 
 class Prepared(NamedTuple):
@@ -141,6 +144,10 @@ class Home:
         self.leave()
         self._due(anew=True)
 
+    def named(self, context: str) -> str:
+        """The monitor whose context has this name."""
+        return self._namespace[context].monitor  # type: ignore[no-any-return]  # a `Context`
+
     def leave(self) -> None:
         """Give it back to Python."""
         if not self._inside:
@@ -186,6 +193,8 @@ class Walker:
         """Whether messages may be changed."""
         self.brief = feed.brief
         """Whether the time that a message takes is little enough not to be counted."""
+        self._lines = [(line, home.named(line.context)) for line in module.lines] if feed.says else []
+        self._said = module.said
         self._monitors = tuple(dict.fromkeys(monitors))
         self._memory = home.machine.memory  # it does not grow
         self._owner = self._memory.obj
@@ -251,12 +260,14 @@ class Walker:
         frames = self._frames
         end = frames + len(view)
         begun, said = run, 0
+        lines: list[tuple[int, LogLine]] = []
         while True:
             try:
                 answer = self._call(frames + position, end, time_ns) or 0
             except MachineTrap:
                 answer = self._stopped()
             said |= answer
+            lines += self._put_out() if self._lines else ()
             if answer >= LEFT:
                 self._undo()
             effects = (answer >> 32 & 0xFFFFFF) * _EFFECT.size
@@ -269,7 +280,7 @@ class Walker:
                     if first > run:
                         pieces.append(view[run:first])
                     run = (what >> 32) - frames
-            if answer & _ADDRESS == end and run == begun and said < TOLD:
+            if answer & _ADDRESS == end and run == begun and said < TOLD and not lines:
                 return None
             position = (answer & _ADDRESS) - frames
             sooner = bool(answer & SOONER)
@@ -277,10 +288,13 @@ class Walker:
                 if sooner:
                     self._home.hasten()
                 dropped, told = self._counted() if run != begun or said & TOLD else ((), ())
-                return Walked(position, run, dropped, told, sooner)
+                return Walked(position, run, dropped, told, sooner, lines)
 
-    def take(self, message: Buffer, time_ns: int, source: int = 0) -> Sequence[str] | None:
-        """Take a message of which nothing is to be told but which events happened: they. None if it is left.
+    def take(
+        self, message: Buffer, time_ns: int, source: int = 0
+    ) -> tuple[Sequence[str], Sequence[LogLine]] | None:
+        """Take a message of which nothing is to be told but which events happened and what was put out: they. None if
+        it is left.
 
         Only as `walk`, and where nobody asks what has `happened`.
         """
@@ -294,7 +308,8 @@ class Walker:
         walked = self.walk(frame, 0, 0, [], time_ns, prepared)
         if walked is not None and not walked.position:
             return None
-        return tuple(name for (name,), count in zip(self.events, self.happened(), strict=True) if count)
+        events = tuple(name for (name,), count in zip(self.events, self.happened(), strict=True) if count)
+        return events, [line for _, line in walked.lines] if walked is not None else []
 
     def _walk_elsewhere(  # noqa: PLR0917  as `walk`
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
@@ -303,6 +318,7 @@ class Walker:
         each = prepared._replace(changed={})
         dropped: Sequence[int] = ()
         told: Sequence[int] = ()
+        lines: list[tuple[int, LogLine]] = []
         sooner = False
         while position < len(view) and not sooner:
             following = position + 4 + _LENGTH.unpack_from(view, position)[0]
@@ -319,13 +335,23 @@ class Walker:
                     break
                 sooner = walked.sooner
                 told = _sums(told, walked.told)
+                lines += [(position, line) for _, line in walked.lines]
                 if walked.run:
                     if position > run:
                         pieces.append(view[run:position])
                     run = following
                     dropped = _sums(dropped, walked.dropped)
             position = following
-        return Walked(position, run, dropped, told, sooner)
+        return Walked(position, run, dropped, told, sooner, lines)
+
+    def _put_out(self) -> Iterator[tuple[int, LogLine]]:
+        """What is put out, each line with where its frame begins."""
+        at, end = self._said, _LENGTH.unpack_from(self._memory, SURE)[0]
+        while at < end:
+            number, frame = HEAD.unpack_from(self._memory, at)
+            line, monitor = self._lines[number]
+            yield frame - self._frames, line_of(line.level, line.text(self._memory, at), monitor)
+            at += line.size
 
     def _stopped(self) -> int:
         """What the module would have answered where it was stopped: the message that it looked at is left."""

@@ -23,7 +23,7 @@ from appliance.relay.monitors.trials import Trials
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.context import BUDGET
-from appliance.rosmop.walking import Prepared, Walker
+from appliance.rosmop.walking import Prepared, Walked, Walker
 
 LONGEST = 2.0
 """Seconds of processor time that monitors may take until the loop comes to its timers again."""
@@ -153,6 +153,8 @@ class Lane:
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, walker, passage.time)
             return False
+        if walked is not None:
+            self._said(walked, passage)
         if began is not None:
             middle.spent += time.thread_time() - began
         if not counts.begun:
@@ -164,6 +166,18 @@ class Lane:
         if walked.sooner:
             middle.look_again()
         return passage.position == passage.end
+
+    def _said(self, walked: Walked, passage: Passage) -> None:
+        """Tell what was put out."""
+        monitors = self._middle.monitors
+        if monitors is None or not walked.lines:
+            return
+        head = HEAD if monitors.stamped(self._place[1]) else 0
+        for position, line in walked.lines:
+            first = position + 4
+            size = _unpack_length(passage.view, position)[0]
+            sighting = Sighting(passage, position, bytes(passage.view[first : first + min(size, head)]))
+            self._middle.telling.said(line, self._place, passage.time, sighting)
 
     def _prepare(self, monitors: MonitorSet, walker: Walker) -> tuple[Prepared, Counts]:
         """Ask once what holds for all batches until something happens."""

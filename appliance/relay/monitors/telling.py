@@ -16,7 +16,7 @@ from appliance.relay.monitors.places import NOWHERE, Place, Senders, Sighting
 from appliance.rosmop.explained import of_change, of_drop, of_fault, of_published, of_verdict
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.outcomes import Outcome, Verdict, bound, named
-from appliance.rosmop.runtime.context import Published
+from appliance.rosmop.runtime.context import LogLine, Published
 
 _EXPLAINED = 10
 
@@ -102,16 +102,7 @@ class Telling:
         self._verdicts(outcome, place, sighting)
         self._faults(outcome, place, sighting)
         for line in outcome.log:
-            self._observations.note(
-                f"{self._prefix}log",
-                line.monitor,
-                place,
-                outcome.time,
-                line.text,
-                distinction=f"{line.level} {line.text}",
-                detail={"level": line.level},
-                sighting=sighting,
-            )
+            self.said(line, place, outcome.time, sighting)
         for number, published in enumerate(outcome.published):
             self._observations.note(
                 f"{self._prefix}publish",
@@ -125,6 +116,19 @@ class Telling:
                 size=len(published.data),
             )
             self._publish(published)
+
+    def said(self, line: LogLine, place: Place, time: int, sighting: Sighting | None = None) -> None:
+        """Tell a line of output."""
+        self._observations.note(
+            f"{self._prefix}log",
+            line.monitor,
+            place,
+            time,
+            line.text,
+            distinction=f"{line.level} {line.text}",
+            detail={"level": line.level},
+            sighting=sighting,
+        )
 
     def changed(
         self, outcome: Outcome, place: Place, before: bytes, size: int, sighting: Sighting | None = None

@@ -29,13 +29,17 @@ from appliance.rosmop.ir.module import (
     ELSEWHERE,
     HAPPENED,
     NOW,
+    POSITION,
     RESET,
+    SAID,
+    SURE,
     UNDO,
     Cells,
     NotScalarError,
     Writer,
     Written,
 )
+from appliance.rosmop.ir.output import Line
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.ir.wasm import (
     ELSE,
@@ -56,8 +60,8 @@ from appliance.rosmop.ir.wasm import (
 from appliance.rosmop.runtime.context import BUDGET
 from appliance.rosmop.why import CLOCKED_ROOM, ENTRY, KEPT, NO_NUMBER, RING, RUNS, SEQ
 
-POSITION, EFFECT = 0, 4
-"""Where it stands which frame is looked at, and the address of the last effect."""
+EFFECT = 4
+"""Where the address of the last effect stands."""
 
 AREA = 512 << 10
 """Bytes of frames that are fed together: as many as one read takes."""
@@ -85,7 +89,8 @@ class Feed:
 
     `verdicts` have the place of an event, of its step of a property, and of the handler. `log` is where the log of
     patches begins, `undo` the addresses of variables and of what they held before the message that is left. `brief`:
-    it has no loops. `functions` are the numbers of those of the events in the module.
+    it has no loops, nor lines. `functions` are the numbers of those of the events in the module. `says`: it may put out
+    lines; all before the address at `SURE` are.
     """
 
     name: str
@@ -97,6 +102,7 @@ class Feed:
     undo: tuple[tuple[int, int], ...]
     brief: bool
     functions: Sequence[int]
+    says: bool
 
 
 @dataclass(frozen=True)
@@ -116,6 +122,9 @@ class FeedModule:
     throttles: Mapping[tuple[str, int], int]
     budgets: Mapping[str, int]
     """Where the budget of each specification stands, by its context."""
+    lines: Sequence[Line]
+    said: int
+    """Where lines of output are noted, by their places among the `lines`."""
 
 
 def module_of(
@@ -148,7 +157,18 @@ def module_of(
     frames = -(-writer.take(0) // _PAGE) * _PAGE  # the kernel copies faster from and to what is aligned
     memory = -(-(frames + AREA + _SLACK) // _PAGE) * _PAGE
     code = _assembled(writer, walks, feeds, tables, memory)
-    return FeedModule(code, memory, frames, effects, feeds, cells, writer.throttles, writer.budgets)
+    return FeedModule(
+        code,
+        memory,
+        frames,
+        effects,
+        feeds,
+        cells,
+        writer.throttles,
+        writer.budgets,
+        writer.lines,
+        writer.said,
+    )
 
 
 class _Tables:
@@ -213,6 +233,9 @@ class _Walk:
             for number, event in enumerate(events)
         ]
         functions = [*self._written, *self._run()]
+        self._says = any(written.says for written in functions)
+        if self._says and stamped and any(written.early for written in functions):
+            raise NotScalarError("output about a message whose header is changed")
         self._budgets = sorted({writer.budget(writer.functions[event.function].context) for event in events})
         self._counters = writer.take(16 * len(events) + 8 * len(self.verdicts))
         assigned = sorted(
@@ -251,8 +274,9 @@ class _Walk:
             self._counters,
             self._log,
             self._undo,
-            all(written.brief for written in (*self._written, *self._run())),
+            not self._says and all(written.brief for written in (*self._written, *self._run())),
             [written.number for written in self._written],
+            self._says,
         )
 
     def _run(self) -> list[Written]:
@@ -304,6 +328,7 @@ class _Walk:
         body = [
             store(I64, NOW, _get(_NOW)),
             store(I32, EFFECT, constant(I32, self._effects)),
+            store(I32, SAID, constant(I32, self._writer.said)) if self._says else b"",
             _set(_TOLD, load(I64, self._cells.source + 8)),
             _set(_ENABLED, load(I64, self._cells.source + 16)),
             *(_set(local, load(I32, self._state(number))) for number, local in self._states.items()),
@@ -341,6 +366,7 @@ class _Walk:
     def _begin(self) -> bytes:
         """Nothing has happened to the frame at hand: the runtime stops, if it does, at calls and where loops begin."""
         code = store(I32, POSITION, _get(_AT)) + store(I32, UNDO, constant(I32, self._log))
+        code += store(I32, SURE, load(I32, SAID)) if self._says else b""
         return code + b"".join(store(I64, kept, load(I64, address)) for address, kept in self._undo)
 
     def _frame(self) -> bytes:

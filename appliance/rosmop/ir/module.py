@@ -10,8 +10,10 @@ address of a table that says where each begins.
   bits (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`, `RESET`.
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
   it is taken back. Within a helper function it is a trap. Beyond are strings and vectors that are made, changed or
-  kept, whole messages, what is put out or published, recursion, `sin` and its like. An event of which no message can
+  kept, whole messages, what is published, recursion, `sin` and its like. An event of which no message can
   come past such a place has no module: `NotScalarError` names what is beyond.
+- A line of output is noted behind those before, where `SAID` points, and the message at hand stands at `POSITION`
+  (`output.py`).
 - A variable of the set stands at its address, in 8 bytes. Before a field is written, what stood there is noted in the
   log (address, size, bytes; 16 bytes each) that `UNDO` points behind.
 - What the form charges is taken from the budget of its specification, as everywhere.
@@ -25,6 +27,7 @@ from types import MappingProxyType
 from typing import Any
 
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.output import BYTES, HEAD, Line, is_text
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.ir.wasm import (
     ABS,
@@ -58,9 +61,16 @@ from appliance.rosmop.types.kinds import Type
 
 HAPPENED, DROPPED, CHANGED, ELSEWHERE, RESET = 1, 2, 4, 8, 16
 
-UNDO, NOW, FIRST = 8, 16, 24
-"""Where the end of the log and the time stand, and what is given out begins."""
+POSITION, UNDO, SAID, NOW, SURE, FIRST = 0, 8, 12, 16, 24, 32
+"""Where it stands which frame is looked at, where the log and the lines end, the time, and where the lines end of the
+messages before; and what is given out begins.
+"""
 
+LINES = 64 << 10
+"""Bytes for lines of output; a message whose line has no room is left."""
+
+EARLY = 16
+"""Bytes of a message: what is written into a header begins in them."""
 
 MOST_TEXTS = 256
 """Strings of an array that is read; one of more is left."""
@@ -118,7 +128,8 @@ class Cells:
 class Written:
     """A function that is written: its types and code; what it assigns, how many fields it writes, and whether it drops.
 
-    `brief`: without loops. `passes`: some message comes to its end.
+    `brief`: without loops. `passes`: some message comes to its end. `says`: it may put out lines. `early`: it may write
+    into the first bytes of the message, where a header is.
     """
 
     number: int
@@ -130,6 +141,8 @@ class Written:
     drops: bool
     brief: bool
     passes: bool
+    says: bool
+    early: bool
 
 
 class Writer:
@@ -146,7 +159,10 @@ class Writer:
         self.budgets: dict[str, int] = {}
         self.throttles: dict[tuple[str, int], int] = {}
         """Where it stands when output at a site of a specification was last due."""
+        self.lines: list[Line] = []
         self._used = FIRST
+        self.said = self.take(LINES)
+        """Where lines stand."""
 
     def size(self, kind: Type) -> int:
         """The bytes of every value of a type in a message. Raises `NotScalarError` where they differ."""
@@ -250,6 +266,8 @@ class _Body:
         self._writes = 0
         self._drops = False
         self._brief = True
+        self._says = False
+        self._early = False
         self._bits: tuple[tuple[str, int], ...] = ()
         """What is answered besides whether it happened: the local variables, and how far each is shifted."""
         if self._answers:
@@ -276,6 +294,8 @@ class _Body:
             self._drops,
             self._brief,
             self._depends,
+            self._says,
+            self._early,
         )
 
     # Parts
@@ -612,6 +632,7 @@ class _Body:
                 code += self._when(self._get(write.flag), self._elsewhere)
                 continue
             self._writes += 1
+            self._early = self._early or (write.at.base is None and write.at.offset < EARLY)
             code += self._when(self._get(write.flag), partial(self._put_field, write))
         return code
 
@@ -826,6 +847,41 @@ class _Body:
     def _now(self, _node: form.Now) -> bytes:
         return self._cell(0x29, NOW)
 
+    def _log(self, node: form.Log) -> bytes:
+        """Note the values of a line, and what line it is."""
+        line, number = Line(node, self._context), len(self._locals)
+        code, cost, stores = b"", constant(I64, line.cost), b""
+        for place, value in enumerate(line.values):
+            first, slot, size = self._slot(value, f"value {place} {number}", HEAD.size + 8 * place)
+            code, stores, cost = code + first, stores + slot, cost + size
+        code += self._cell(0x28, SAID) + self._set("line")
+        end = self._get("line") + constant(I32, line.size) + b"\x6a"
+        full = end + constant(I32, self._writer.said + LINES) + b"\x4b"
+        code += self._when(full, self._elsewhere) + self._spend(cost) + self._cell(0x36, SAID, end)
+        for offset, head in ((0, constant(I32, len(self._writer.lines))), (4, self._cell(0x28, POSITION))):
+            code += self._get("line") + head + b"\x36\x00" + unsigned(offset)
+        self._writer.lines.append(line)
+        self._says = True
+        return code + stores + constant(I32, 0)
+
+    def _slot(self, node: form.Expression, name: str, at: int) -> tuple[bytes, bytes, bytes]:
+        """What comes first; what puts a value into the line (of a string: its place and length); its cost."""
+        line, to = self._get("line"), unsigned(at)
+        if is_text(node):
+            first, place, count = self._elements(node)
+            first += place + self._set(name) + count + self._set(f"count of {name}", I64)
+            length = self._get(f"count of {name}", I64)
+            put = (
+                line + self._get(name) + b"\x36\x00" + to + line + length + b"\xa7\x36\x00" + unsigned(at + 4)
+            )
+            return first, put, length + constant(I64, BYTES) + b"\x80\x7c"
+        machine = machine_type(node.type)
+        first, value = self._value(node) + self._set(name, machine), self._get(name, machine)
+        if machine in (F32, F64):
+            return first, line + value + (b"\xbb" if machine == F32 else b"") + b"\x39\x00" + to, b""
+        wide = (b"\xac" if _is_signed(node.type) else b"\xad") if machine == I32 else b""
+        return first, line + value + wide + b"\x37\x00" + to, b""
+
     def _throttle(self, node: form.Throttle) -> bytes:
         """Output that is not due yet; Python puts out what is, and notes when."""
         seconds = self._value(node.seconds) + _to_floating(
@@ -1028,6 +1084,7 @@ class _Body:
         called = self._writer.function(function, parameters, result, function.context)
         self._assigned |= called.assigned
         self._brief = self._brief and called.brief
+        self._says = self._says or called.says
         return code + b"\x10" + unsigned(called.number)
 
 

@@ -3,9 +3,10 @@
 An event and its function in the module are equal if, for every message of up to `AREA` bytes and every state, the
 function leaves the message to Python (which then judges it anew), or
 
-- the form neither faults nor puts anything out,
+- the form neither faults nor publishes anything,
 - both say the same of whether the event happened, dropped the message, changed it,
-- and the bytes of the message, the variables and what is left of the budget are the same.
+- and the bytes of the message, the variables and what is left of the budget are the same. (What lines of output say is
+  not compared.)
 
 Where it leaves the message, the walk takes back what it has done: each variable that it has written stands among those
 that are taken back, and each byte in the log (`module_terms.py`).
@@ -127,7 +128,7 @@ class Validation:
         unknown = either(*meant.unknown.values())
         wrong = {
             "it looks beyond the message": done.outside,
-            "it goes on where the form faults or puts something out": both(opposite(left), meant.left),
+            "it goes on where the form faults or publishes": both(opposite(left), meant.left),
         }
         others = {
             "whether it happened": _bit(done.bits, _HAPPENED) != meant.happened,

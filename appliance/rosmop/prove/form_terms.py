@@ -15,6 +15,7 @@ from typing import Any
 import z3
 
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.output import BYTES, Line
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.prove.terms import (
     DOUBLE,
@@ -199,11 +200,17 @@ class Meaning:
     def _drop(self, _node: form.Drop, state: State) -> None:
         state.slots[_DROPPED] = z3.BoolVal(True)
 
-    def _acts(self, _node: form.Statement | form.Expression, state: State) -> None:
-        """What comes out of it, or is told, is for Python."""
+    def _publish(self, _node: form.Publish, state: State) -> None:
+        """What comes out of it is for Python."""
         self._leave_to_python(state, z3.BoolVal(True))
 
-    _publish = _log = _acts
+    def _log(self, node: form.Log, state: State) -> None:
+        """A line costs the most that it can; that the module keeps the right values for it is not looked at."""
+        line = Line(node, "")
+        cost = integer(line.cost, 64)
+        for value in (self._value(each, state) for each in line.values):
+            cost = cost + (z3.UDiv(value.count, integer(BYTES, 64)) if isinstance(value, _View) else 0)
+        self._spend(cost, state)
 
     def _pending(self, node: form.Pending, state: State) -> None:
         """Only `Whole` asks for it."""

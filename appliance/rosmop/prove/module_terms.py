@@ -4,6 +4,7 @@ Three kinds of places are known, and an address that is none of them is a differ
 
 - cells, 8 bytes each at constant addresses: variables, budgets, times, and where the log ends (`UNDO`);
 - the message, from the address that the function is handed: everything that is read or written is within its size;
+- what is put out, of which only is known that it stands nowhere else;
 - the log, by which a message that is left is put back: whatever is written into the message was noted there before,
   address, size and the bytes that stood there, and a note is never written again.
 
@@ -40,8 +41,8 @@ from appliance.rosmop.prove.terms import (
     with_number,
 )
 
-UNDO = 8
-"""Where the end of the log stands."""
+POSITION, UNDO, SAID = 0, 8, 12
+"""Where the frame, the end of the log and that of the lines stand."""
 
 _ENTRY = 16  # bytes of a note: address, size (4 bytes each), what stood there
 _MESSAGE, _NOTE = "message", "note"
@@ -97,6 +98,10 @@ class Execution:
         self._frame = 0
         self._returned: list[tuple[State, Term]] = []
         slots: dict[Any, Any] = {_MESSAGE: message, ("cell", UNDO): Pointer("log", integer(0, 32))}
+        slots |= {
+            ("cell", SAID): Pointer("lines", integer(0, 32)),
+            ("cell", POSITION): z3.BitVec("position", 32),
+        }
         slots |= {("cell", address): value for address, value in cells.items()}
         self._state = State(z3.BoolVal(True), slots)
         self._number = number
@@ -108,7 +113,7 @@ class Execution:
         cells = {
             key[1]: value
             for key, value in state.slots.items()
-            if isinstance(key, tuple) and key[0] == "cell" and key[1] != UNDO
+            if isinstance(key, tuple) and key[0] == "cell" and key[1] not in (POSITION, UNDO, SAID)
         }
         return Done(
             either(*self._trapped), either(*self._outside), bits, state.slots[_MESSAGE], cells,
@@ -240,6 +245,8 @@ class Execution:
     def _store(  # noqa: PLR0917  as the instruction has them
         self, family: str, how: str, offset: float, address: Any, value: Any, state: State
     ) -> None:
+        if isinstance(address, Pointer) and address.place == "lines":
+            return
         if isinstance(address, Pointer):
             size = int(how or family[1:]) // 8
             (self._write if address.place == "message" else self._note)(
@@ -255,8 +262,11 @@ class Execution:
             raise DiffersError(
                 f"it writes {each_name(family, how)} at {place}, where nothing of that kind stands"
             )
+        if place == SAID and (not isinstance(value, Pointer) or value.place != "lines"):
+            raise DiffersError("what is put out is noted elsewhere")
         state.slots["cell", place] = value
-        self._stored.add(place)
+        if place != SAID:
+            self._stored.add(place)
 
     def _within(self, pointer: Pointer, offset: int, size: int, state: State) -> Term:
         end = z3.ZeroExt(32, pointer.offset) + integer(offset + size, 64)
@@ -352,6 +362,8 @@ def _calculated(family: str, name: str, operands: Sequence[float], stack: list[A
     if family == "i32" and name == "add" and (isinstance(left, Pointer) or isinstance(right, Pointer)):
         pointer, more = (left, right) if isinstance(left, Pointer) else (right, left)
         return Pointer(pointer.place, pointer.offset + _bits(more))
+    if name == "gt_u" and isinstance(left, Pointer) and left.place == "lines":
+        return z3.FreshBool("full")
     if family == "i32" and z3.is_bool(left) and z3.is_bool(right) and name in ("and", "or"):
         return both(left, right) if name == "and" else either(left, right)
     operation = (_OF_FLOATS if family[0] == "f" else _OF_INTEGERS).get(name)

@@ -55,6 +55,11 @@ class LogLine:
     monitor: str
 
 
+def line_of(level: str, text: bytes, monitor: str) -> LogLine:
+    """A line with this text. Bytes that are not UTF-8 are shown as U+FFFD."""
+    return LogLine(level, text.decode("utf-8", "replace").rstrip("\n"), monitor)
+
+
 @dataclass(frozen=True, slots=True)
 class Published:
     """A message to be published by a monitor; `site` is that of the statement."""
@@ -137,10 +142,9 @@ class Context:
             self._measure(size - replaced, site)
 
     def log(self, level: str, text: bytes, site: int) -> None:
-        """A line of output. Bytes that are not UTF-8 are shown as U+FFFD."""
+        """A line of output."""
         self.spend(OUTPUT_COST + len(text) // BYTES_PER_INSTRUCTION, site)
-        line = text.decode("utf-8", "replace").rstrip("\n")
-        self.turn.log.append(LogLine(level, line, self.monitor))
+        self.turn.log.append(line_of(level, text, self.monitor))
 
     def throttle(self, period: float, site: int) -> bool:
         """Whether output at this site is due: the last was at least `period` seconds ago."""

@@ -2,7 +2,7 @@
 
 from appliance.rosmop.runtime.context import Context, FaultError
 
-_MAX_PRECISION = 100
+MAX_PRECISION = 100
 _LONG = 1024  # bytes; a shorter text is not charged before it is made
 
 
@@ -18,14 +18,14 @@ def to_text_streamed(value: float) -> bytes:
 
 def to_text_fixed(value: float, precision: int, site: int) -> bytes:
     """`std::cout << std::fixed << std::setprecision(precision) << value`."""
-    if not 0 <= precision <= _MAX_PRECISION:
+    if not 0 <= precision <= MAX_PRECISION:
         raise FaultError(site, f"a precision of {precision}")
     return b"%.*f" % (precision, value)
 
 
 def to_text_precise(value: float, precision: int, site: int) -> bytes:
     """`std::cout << std::setprecision(precision) << value`."""
-    if not 0 <= precision <= _MAX_PRECISION:
+    if not 0 <= precision <= MAX_PRECISION:
         raise FaultError(site, f"a precision of {precision}")
     return b"%.*g" % (precision, value)
 

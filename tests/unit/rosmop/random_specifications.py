@@ -152,6 +152,8 @@ class Specifications:
             f"total = {value};", f"level = {value};", "total++;", "seen = !seen;", f"total += {value};",
             *(f"{name} = {value};" for name in assigned),
             *(f'if ({name} == "abc") {{ last = {name}; }}' for name in texts),
+            *(f'ROS_INFO("%s %.3f %d", {name}.c_str(), {value}, total);' for name in texts),
+            f'ROS_WARN("%g and %5d", (double) {value}, total);', f"std::cout << {value} << std::endl;",
         ]  # fmt: skip
         choices += [f'for (int i = 0; i < {name}.size(); i++) {{ if ({name}[i] == "nnnn") {{ total += i; }} }}'
                     for name, (_, kind) in names.items() if kind == "std::string[]"]  # fmt: skip

@@ -220,6 +220,12 @@ HARD = {
             ptltl: e @violation { n = n * 2 % 1000; } @validation { n++; }
             ere: (e o*)* o e @match { } @fail { __RESET; if (n % 3 == 0) { DROP; } } }
         t() { int n = 0; event e(double x) /plain own/Plain '{x:x}' { n++; x = n; } }""",
+    "output of every message": """
+        s() { event e(int count, double x) /plain own/Plain '{count:count, x:x}' {
+                ROS_INFO("%d of %.2f", count, x); if (count == 5) { x = 3; } }
+            event f(std::string f) /stamped own/Stamped '{frame:f}' { ROS_WARN("from %s", f.c_str()); }
+            ptltl: f @violation { ROS_ERROR("not f"); if (1 > 0) { DROP; } } }
+        t() { int n = 0; event e(int kind) /plain own/Plain '{kind:kind}' { n++; if (kind == 1) { return; } } }""",
     "a budget that runs out": """
         s() { int n = 0; event e(int count, double x) /plain own/Plain '{count:count, x:x, kind:2}' {
             if (count == 5 && x > 50) { while (true) { n++; } } n = 1; } }""",
@@ -310,6 +316,32 @@ def test_most_messages_are_taken_together(monkeypatch: pytest.MonkeyPatch) -> No
     monitored.middle.tick()
     assert single == 1
     assert [(row.events, row.changes) for row in monitored.rows()] == [(5000, 5000)]
+    monitored.close()
+
+
+def test_lines_are_told_of_the_message_as_it_came() -> None:
+    """Which has a header that is changed, too, or is shorter than one."""
+    text = """s() { event e(unsigned int n) /h std_msgs/Header '{seq:n}' { n = 3; } }
+        t() { event e() /h std_msgs/Header '{}' { ROS_INFO("came"); } }
+        u() { event e(std::string f) /j std_msgs/Header '{frame_id:f}' { ROS_INFO("from %s", f.c_str()); }
+              event all() /j std_msgs/Header '{}' { ROS_WARN("any"); } }"""
+    bodies = [
+        message("std_msgs/Header", seq=seq, frame_id=name) for seq, name in ((7, "a"), (8, "b"), (9, "a"))
+    ]
+    for one in (bodies, [b"abc", *bodies]):
+        frames = b"".join(struct.pack("<I", len(body)) + body for body in one)
+        agree({"x.rv": text}, definitions(), [Traffic(topic, frames, len(one)) for topic in ("/h", "/j")] * 5)
+
+
+def test_the_time_that_lines_take_is_counted() -> None:
+    """As that of whatever monitors do for long: their text is made behind the walk."""
+    monitored = Monitored(
+        {"x.rv": "s() { event e() /h std_msgs/Empty '{}' { puts(\"came\"); } }"}, definitions(), together=True
+    )
+    for _ in range(2):
+        monitored.through(Traffic("/h", bytes(4 * 100), 100))
+    spent, _ = monitored.middle.spent, monitored.through(Traffic("/h", bytes(4 * 100), 100))
+    assert monitored.middle.spent > spent
     monitored.close()
 
 

@@ -127,7 +127,7 @@ def in_module(body: str) -> list[str]:
     monitors.monitor("s").seen = True
     walker = monitors.walker("/t")
     assert walker is not None
-    assert walker.take(message("std_msgs/Int32", data=0), 1) == ("s.e",)
+    assert walker.take(message("std_msgs/Int32", data=0), 1) == (("s.e",), [])
     return [f"{monitors.value('s', name):.9g}" for name in names]
 
 

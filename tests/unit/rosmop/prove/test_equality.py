@@ -24,7 +24,7 @@ SHIPPED = {
     "goals": {"goals.goal": IN_PYTHON, "goals.cancel": IN_PYTHON, "goals.result": IN_PYTHON},
     "logging": {
         "logging.batteryState": EQUAL, "logging.position": EQUAL, "logging.turretMovement": "not loop-free",
-        "logging.shot": IN_PYTHON,
+        "logging.shot": EQUAL,
     },
     "obstacle_avoidance": {
         "obstacleAvoidance.speed": EQUAL, "obstacleAvoidance.scan": "not loop-free",
@@ -68,12 +68,15 @@ PROVED = {
         "n = f(x, 7); x = n;", "int x", "count:x",
         'int n = 0; int f(int a, int b) { if (a > 3) { ROS_INFO("x"); } n += a; return a > 2 ? b : a << 1; }',
     ),
+    "output": event('ROS_INFO("%d %f", x, y); y = 3;', "int x, double y", "count:x, x:y"),
     "output that is not due": event('n++; ROS_INFO_THROTTLE(10.0, "%d", n);', "int x", "count:x", "int n = 0;"),
     "an element of an array": event(
         "n = three[x] + three.size();", "std::vector<long> three, int x", "three:three, count:x", "long n = 0;"
     ),
     "a string": """s() { int n = 0;
         event e(std::string f) /stamped own/Stamped '{frame:f}' when (f == "base_link") { n += f.size(); } }""",
+    "a string that is put out": """s() { event e(std::string f) /stamped own/Stamped '{frame:f}' {
+        ROS_INFO("from %s", f.c_str()); } }""",
 }  # fmt: skip
 
 
