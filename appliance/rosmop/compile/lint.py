@@ -23,6 +23,10 @@ def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Findi
     """Warnings about a property, each at the handler or formula it is about."""
     handlers = {handler.category: handler.position for handler in node.handlers}
     findings = []
+    if not handlers:
+        handler = f"`@{compiled.categories[-1]} {{ … }}`"
+        text = f"nothing comes of this property: it has no handler; write {handler} behind it"
+        findings.append(Finding(node.position, "warning", text))
     for fact in analyse(compiled, [category for category in handlers if category in compiled.categories]):
         position = handlers.get(fact.category) if fact.kind == "never runs" else node.position
         trace = f" (shortest trace: {' '.join(fact.trace)})" if fact.trace else ""

@@ -28,6 +28,9 @@ FORBIDDEN = {
     "sizeof": "sizes of types have no meaning here; write `.size()`",
     "decltype": "write the type itself, or `auto`",
     "wchar_t": "write `char` or `std::string`",
+    "and": "write `&&`",
+    "or": "write `||`",
+    "not": "write `!`",
 }
 """Words of C++ that are not part of the language, and what to write instead."""
 
@@ -156,10 +159,11 @@ def describe(text: str, offset: int, accepted: Set[str]) -> str:
     if nearly is not None and {"SEMICOLON", "LBRACE"} <= accepted and piece in _TRIGGERS:
         return f"found {shown(nearly[1])} where an event begins with `event`; write `event {nearly[2]}(…)`"
     expected = _expected(accepted)
-    if accepted == {"AT"} and text[:offset].rstrip().endswith(":"):
+    before = text[:offset].rstrip()
+    if "AT" in accepted and before.endswith(":"):
         return f"found {found}, expected a formula; a property is `logic: formula @category {{ … }}`"
-    if accepted == {"AT"}:
-        return f"found {found} after the formula; a property needs a handler: `@category {{ … }}`"
+    if "AT" in accepted and not before.endswith("}"):
+        return f"found {found} after the formula, expected a handler `@category {{ … }}`"
     if "'" in found and "QUOTE" not in accepted and "STRING" in accepted:
         hint = hint or "a character literal is one character; write a string in double quotes"
     return f"found {found}, expected {expected}" + (f"; {hint}" if hint else "")

@@ -47,7 +47,7 @@ path_step: NAME ["[" NUMBER "]"]
          | string | character
          | NAME ("::" NAME)+                      -> name
 
-property: NAME ":" FORMULA handler+
+property: NAME ":" FORMULA handler*
 handler: AT CATEGORY block
 
 // Types

@@ -14,6 +14,7 @@ from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.builder import Builder, check
 from appliance.rosmop.syntax.complaints import FORBIDDEN, RESERVED, describe
+from appliance.rosmop.syntax.directives import check_directives
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.grammar import GRAMMAR
 
@@ -43,6 +44,7 @@ def parse(text: str, file: str) -> tree.File:
         raise SpecificationError.at(
             start.within(text, broken.start()), "these bytes are no UTF-8; save the file as UTF-8"
         )
+    check_directives(text, file)
     parsed = _parse(text, file)
     _check_depth(parsed, file)
     builder = Builder(file, text)

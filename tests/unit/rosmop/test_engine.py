@@ -356,7 +356,6 @@ BAD_PROPERTIES = [
     ("ere: e @match { x = 1; }", "there is no variable `x`"),
     ("tfsm: s [ e -> s, timeout 1s -> s ] @timeout { DROP; }", "`DROP;` cannot stand here"),
     ("pattern: globally: e causes f within 1s @violation { DROP; }", "`DROP;` cannot stand here"),
-    ("ere: e", "a property needs a handler"),
 ]
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.unit.rosmop.acting import load
+from tests.unit.rosmop.acting import load, message
 
 EVENTS = "event e() /t std_msgs/Int32 '{}' { } event f() /u std_msgs/Int32 '{}' { } "
 FORMULAS = [
@@ -18,3 +18,13 @@ FORMULAS = [
 def test_events_that_no_property_uses(formula: str, warnings: list[str]) -> None:
     """An event that nothing names is told; the `default` of a state names all of them."""
     assert [finding.text for finding in load(f"s() {{ {EVENTS} {formula} }}").warnings] == warnings
+
+
+def test_a_property_without_a_handler_is_taken_and_told() -> None:
+    """The grammar of ROSMOP has any number of handlers, none included; messages pass as without the property."""
+    loaded = load(f"s() {{ {EVENTS} ere: e f }}")
+    assert [finding.text for finding in loaded.warnings] == [
+        "nothing comes of this property: it has no handler; write `@fail { … }` behind it"
+    ]
+    outcome = loaded.process("/u", message("std_msgs/Int32", data=1), 0)
+    assert (outcome.result, outcome.verdicts) == ("passed", ())
