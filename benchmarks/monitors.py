@@ -7,7 +7,8 @@ the monitor's work. Cells are medians of the rounds; ratios are to the C relay, 
 
 *window*: 64 messages on their way; *flat*: as fast as it goes, with the loss; *paced*: 1,000 a second, the delay;
 *topics*: 1, 8 and more topics at 1,000 a second each, each with a monitor of its own; *memory*: that of the relay while
-a flat run of `--minutes` lasts. `--relays` leaves out the peers whose runs take longest.
+a flat run of `--minutes` lasts. `--relays` leaves out the peers whose runs take longest; `--kinds` has monitors of one
+kind each instead (`KINDS`), and no peers.
 Needs g++, rosmaster, topic_tools and rospy.
 """
 
@@ -19,6 +20,7 @@ import subprocess
 import threading
 from pathlib import Path
 
+from appliance.ros.definitions import Definitions
 from benchmarks.relay_throughput import (
     HERE,
     PROGRAM,
@@ -44,6 +46,20 @@ NAME() {
     @fail { ROS_ERROR("impossible"); }
 }
 """
+KINDS = {
+    "read": "(double value) TOPIC relay_load/Sample '{value:value}' when (value > 2) { }",
+    "write": "(double value) TOPIC relay_load/Sample '{value:value}' { value = 0.5; }",
+    "fsm": "() TOPIC relay_load/Sample '{}' { } fsm: here [ sample -> there ] there [ sample -> here ] @fail { }",
+    "ptltl": "() TOPIC relay_load/Sample '{}' { } ptltl: sample => <*> sample @violation { ROS_ERROR(\"no\"); }",
+    "string": "(std::string data) TOPIC relay_load/Sample '{data:data}' when (data == \"none\") { }",
+    "100 numbers": """(std::vector<uint8_t> data) TOPIC relay_load/Sample '{data:data}' {
+        int sum = 0;
+        for (int i = 0; i < data.size() && i < 100; i++) { sum += data[i]; }
+    }""",
+}
+TEXT = "uint64 number\nint64 sent\nfloat64 value\nstring data\n"
+TEXT_MD5SUM = Definitions.from_files({f"{TYPE}.msg": TEXT}).md5sum(TYPE)
+"""The message as it is on the wire, but its bytes are a string."""
 TOPICS = (1, 8)
 MORE_TOPICS = (1, 8, 20, 50, 100)
 SIZES = (32, 200, 4096, 65536, 1048576, 4194304)
@@ -96,6 +112,19 @@ def monitored(others: int) -> Relay:
     ]
     try:
         relay.monitor(files, {f"{TYPE}.msg": DEFINITION.read_text()})
+    except BaseException:
+        relay.close()
+        raise
+    return relay
+
+
+def of_kind(name: str) -> Relay:
+    """The relay with a monitor of this kind."""
+    relay = Relay(name)
+    definition = TEXT if name == "string" else DEFINITION.read_text()
+    try:
+        files = [("load.rv", f"load() {{ event sample{KINDS[name].replace('TOPIC', '/load')} }}")]
+        relay.monitor(files, {f"{TYPE}.msg": definition})
     except BaseException:
         relay.close()
         raise
@@ -203,9 +232,12 @@ def cell(results: Results, mode: str, size: int, name: str) -> str:
     return text + (f" ({cpu:.2f})" if cpu else "")
 
 
-def begin(systems: list[System], *, peers: bool) -> None:
+def begin(systems: list[System], *, peers: bool, kinds: bool) -> None:
     """Start what is put in the middle in turns."""
     systems += [Direct(), CopyingRelay(), CopyingRelay(epoll=True), Relay("relay alone")]
+    if kinds:
+        systems += map(of_kind, KINDS)
+        return
     systems += [monitored(others) for others in (0, 10, 50)]
     if peers:
         systems.append(RosRelay())
@@ -225,6 +257,7 @@ def main() -> None:
     )
     parser.add_argument("--minutes", type=float, help="of the memory run (1; with --all 10)")
     parser.add_argument("--relays", action="store_true", help="without topic_tools and rospy")
+    parser.add_argument("--kinds", action="store_true", help="monitors of one kind each, without peers")
     parser.add_argument("--sizes", type=lambda text: tuple(int(one) for one in text.split(",")))
     options = parser.parse_args()
     rounds = options.rounds or (5 if options.all else 3)
@@ -239,12 +272,13 @@ def main() -> None:
     systems: list[System] = []
     try:
         if plan:
-            begin(systems, peers=not options.relays)
+            begin(systems, peers=not options.relays, kinds=options.kinds)
         for _round in range(rounds):
             for mode, sizes in plan.items():
                 for size in sizes:
                     for system in systems:
-                        result = run(mode, size, seconds, system)
+                        said = [TEXT_MD5SUM] if system.name == "string" else []
+                        result = run(mode, size, seconds, system, *said)
                         results.setdefault((mode, size, system.name), []).append(result)
     finally:
         for system in systems:

@@ -1,7 +1,7 @@
 // A TCPROS publisher of relay_load/Sample and a subscriber in one program, for measuring what is between them (no ROS
 // needed).
 //
-//   relay_load BYTES SECONDS flat|window|paced
+//   relay_load BYTES SECONDS flat|window|paced [MD5SUM]
 //
 // Prints the publisher's port. Reads one line, "PORT TOPIC": where the subscriber connects. The publisher
 // sends markers until one has come through, then runs: as fast as it can, with at most 64 messages on their
@@ -89,7 +89,7 @@ void tune(int fd) {
 struct Load {
   size_t frame;
   double seconds;
-  std::string mode;
+  std::string mode, md5sum = "e603182a04880972f86c550eadc3cb3a";
   std::atomic<bool> primed{false}, ended{false};
   std::atomic<uint64_t> received{0};
   uint64_t sent = 0, lost = 0, disordered = 0;
@@ -100,7 +100,7 @@ struct Load {
     int fd = accept(listening, nullptr, nullptr);
     tune(fd);
     const Fields asked = read_header(fd);
-    write_header(fd, {{"callerid", "/load"}, {"latching", "0"}, {"md5sum", "e603182a04880972f86c550eadc3cb3a"},
+    write_header(fd, {{"callerid", "/load"}, {"latching", "0"}, {"md5sum", md5sum},
                       {"message_definition", "uint64 number\nint64 sent\nfloat64 value\nuint8[] data\n"},
                       {"topic", asked.at("topic")}, {"type", "relay_load/Sample"}});
     const size_t batch = mode == "paced" ? 1 : std::max<size_t>(1, 262144 / frame);
@@ -195,11 +195,12 @@ struct Load {
 };
 
 int main(int argc, char** argv) try {
-  if (argc != 4) throw std::runtime_error("relay_load BYTES SECONDS flat|window|paced");
+  if (argc != 4 && argc != 5) throw std::runtime_error("relay_load BYTES SECONDS flat|window|paced [MD5SUM]");
   Load load;
   load.frame = std::max<size_t>(FIXED, std::atoi(argv[1]));
   load.seconds = std::atof(argv[2]);
   load.mode = argv[3];
+  if (argc == 5) load.md5sum = argv[4];
   int listening = socket(AF_INET, SOCK_STREAM, 0);
   sockaddr_in where{};
   socklen_t size = sizeof where;

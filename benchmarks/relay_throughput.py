@@ -72,10 +72,10 @@ def cpu_seconds(pid: int | None) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def run(mode: str, size: int, seconds: float, system: "System") -> Result:
-    """One run of the load through a system."""
+def run(mode: str, size: int, seconds: float, system: "System", *md5sum: str) -> Result:
+    """One run of the load through a system; `md5sum`: what it says of its messages, if not that of its definition."""
     with subprocess.Popen(
-        [str(compiled()), str(size), str(seconds), mode],
+        [str(compiled()), str(size), str(seconds), mode, *md5sum],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
