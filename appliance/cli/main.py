@@ -1,5 +1,7 @@
 """The `rosrv` command: one app, one module for each verb, imported when it is run (`lazy.py`)."""
 
+import errno
+import os
 import sys
 import traceback
 from typing import Annotated
@@ -154,6 +156,7 @@ _TOLD = frozenset({"ConfigError", "StartError", "NetworkError"})
 
 def main() -> None:
     """Entry point of the command: errors are words, never a traceback."""
+    _open_closed_streams()
     sys.argv[1:] = _asking_for_help(_without_old_flags(sys.argv[1:]))
     try:
         app()
@@ -163,12 +166,25 @@ def main() -> None:
         ):
             sys.stderr.write(f"rosrv: {error}\n")
             sys.exit(1)
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC and error.filename is None:
+            sys.stderr.write(f"rosrv: output: {error.strerror}\n")
+            sys.exit(2)
         last = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{last.filename}:{last.lineno}"
         sys.stderr.write(
             f"rosrv: a defect of rosrv, please report it: {type(error).__name__}: {error} ({where})\n"
         )
         sys.exit(70)
+
+
+def _open_closed_streams() -> None:
+    """Standard streams that are closed (`>&-`) go to /dev/null; no file that is opened later gets their number."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)
+    sys.stdin = sys.stdin or os.fdopen(0)
+    sys.stdout = sys.stdout or os.fdopen(1, "w", encoding="utf-8")
+    sys.stderr = sys.stderr or os.fdopen(2, "w", encoding="utf-8")
 
 
 _OLD_FLAGS = {"-list": "list", "-rvstate": "rvstate", "-enable": "enable", "-disable": "disable"}

@@ -1,6 +1,7 @@
 """Tests of `appliance.cli.main`."""
 
 import json
+import subprocess
 import sys
 
 import pytest
@@ -10,6 +11,7 @@ from appliance.cli import main
 from appliance.config_sources import ConfigError, Mistake
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.errors import StartError
+from tests.support.command import ROSRV
 
 
 @pytest.mark.parametrize(
@@ -107,3 +109,15 @@ def test_a_mistyped_verb_is_told_the_nearest(
     status, text = said_by(monkeypatch, capsys, *words)
     assert status == 2
     assert f"Did you mean '{meant}'?" in text
+
+
+@pytest.mark.parametrize("verb", [("config", "show"), ("policy", "check", "/dev/null"), ("--help",)])
+@pytest.mark.parametrize(("output", "status"), [("> /dev/full", 2), (">&-", 0), ("<&- >&- 2>&-", 0)])
+def test_an_output_that_takes_nothing(verb: tuple[str, ...], output: str, status: int) -> None:
+    """A full disk is said in words; closed streams are as /dev/null. Neither is a defect."""
+    command = ["/bin/sh", "-c", f'exec "$0" "$@" {output}', ROSRV, *verb]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (
+        status,
+        "rosrv: output: No space left on device\n" if status else "",
+    )
