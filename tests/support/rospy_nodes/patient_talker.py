@@ -3,7 +3,7 @@
 import argparse
 
 import rospy
-from report import init_node, report
+from report import report
 from std_msgs.msg import String
 
 
@@ -12,7 +12,8 @@ def main():
     arguments = argparse.ArgumentParser()
     arguments.add_argument("topic")
     options = arguments.parse_args(rospy.myargv()[1:])
-    init_node("patient_talker")
+    # Not `report.init_node`: with rospy's own, slow end the next one finds that listeners have forgotten this one.
+    rospy.init_node("patient_talker")
     publisher = rospy.Publisher(options.topic, String, queue_size=10)
     report("ready", name=rospy.get_name(), uri=rospy.get_node_uri())
     while not publisher.get_num_connections() and not rospy.is_shutdown():
