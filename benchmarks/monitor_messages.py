@@ -2,8 +2,8 @@
 
 A message on a topic of no monitor; the reference specification of the design (reads two fields, writes one, steps
 one state machine); the same with ten monitors on other topics; a string that grows; a copy of the whole message;
-the reference in the module, many at once and alone; a state machine with a timeout; and loading, with the module and
-without.
+the reference in the module, many at once and alone; a state machine with a timeout; a handler and a line of output with
+each message; a string that is kept, and a message that is published; and loading, with the module and without.
 Times are processor time, the median of the rounds, in microseconds for a message.
 """
 
@@ -41,6 +41,15 @@ SCAN = """scan() { double nearest = 0;
 }"""
 WATCHED = """watched() { event e(double x) /cmd geometry_msgs/TwistStamped '{twist:{linear:{x:x}}}' { }
     tfsm: quiet [ e -> moving ] moving [ e -> moving, timeout 500 ms -> quiet ] @timeout { ROS_WARN("silence"); } }"""
+HANDLED = """handled() { int n = 0; event e(double x) /cmd geometry_msgs/TwistStamped '{twist:{linear:{x:x}}}' { }
+    ptltl: e @violation { n = 1; } @validation { n = 2; } }"""
+SAID = """said() { event e(double x) /cmd geometry_msgs/TwistStamped '{twist:{linear:{x:x}}}' {
+    ROS_INFO("%f", x); } }"""
+KEPT = """kept() { std::string last; int n = 0;
+    event e(std::string f) /cmd geometry_msgs/TwistStamped '{header.frame_id:f}' {
+        if (f != last) { n++; } last = f; } }"""
+PUBLISHED = """published() { std_msgs::Float64 m; event e(double x) /cmd geometry_msgs/TwistStamped
+    '{twist:{linear:{x:x}}}' { m.data = x; PUBLISH(/out, std_msgs/Float64, m); } }"""
 WHOLE = "whole() { geometry_msgs::TwistStamped v; event e() /cmd geometry_msgs/TwistStamped '{}' { v = MESSAGE; } }"
 OTHERS = "".join(
     f"other{number}() {{ event e(int x) /other{number} std_msgs/Int32 '{{data:x}}' {{ x++; }} }}\n"
@@ -86,7 +95,7 @@ def batched(messages: int, body: bytes, text: str = REFERENCE, topic: str = "/cm
     frame = struct.pack("<I", len(body)) + body
     view = area[: len(frame) * messages]
     view[:] = frame * messages
-    prepared = walker.prepare(loud=False, told=())
+    prepared = walker.prepare(loud=False, told=(), counted=[True] * len(walker.verdicts))
     times = MESSAGES // messages
     return microseconds(lambda: walker.walk(view, 0, 0, [], 1, prepared), times) / messages
 
@@ -102,7 +111,12 @@ def main() -> None:
     ]
     many = monitors(REFERENCE + OTHERS)
     rows.append(("reference, ten other monitors", lambda: many.process("/cmd", bytearray(COMMAND), 1)))
-    for name, text in (("a string grows", GROWING), ("a copy of all", WHOLE)):
+    for name, text in (
+        ("a string grows", GROWING),
+        ("a string is kept", KEPT),
+        ("a message is published", PUBLISHED),
+        ("a copy of all", WHOLE),
+    ):
         loaded = monitors(text)
         rows.append((name, partial(loaded.process, "/cmd", COMMAND, 1)))
     for name, action in rows:
@@ -118,6 +132,8 @@ def main() -> None:
     row = microseconds(lambda: watched.process("/cmd", bytearray(COMMAND), 1), MESSAGES)
     print(f"{'a tfsm, engine':32} {row:8.2f} µs")
     print(f"{'a tfsm, 64 together':32} {batched(64, COMMAND, WATCHED):8.3f} µs")
+    print(f"{'a handler each, 64 together':32} {batched(64, COMMAND, HANDLED):8.3f} µs")
+    print(f"{'a line each, 64 together':32} {batched(64, COMMAND, SAID):8.3f} µs")
     scans = monitors(SCAN)
     loop = microseconds(lambda: scans.process("/scan", LASER, 1), MESSAGES // 20)
     print(f"{'a loop over 100 numbers, engine':32} {loop:8.2f} µs")
