@@ -97,11 +97,11 @@ class Batch:
         return self.last
 
     def keep_last(self) -> "Batch":
-        """The last frame as a batch of its own, in memory that stays as it is."""
+        """The last frame as a batch of its own, in memory that nobody else writes to; monitors may on its way."""
         if self._owned and self.messages == 1:
             self.keep()
             return self
-        last = memoryview(bytes(self.view[self.find_last() :]))
+        last = memoryview(bytearray(self.view[self.find_last() :]))
         return Batch(last, 1, 0, owned=True)
 
 

@@ -122,6 +122,7 @@ def test_the_last_message_of_a_latching_publisher_comes_later() -> None:
     last = flow.later(0.6)
     assert last is not None
     assert (len(last.view), last.first, memory.used) == (12, 3, 0)
+    assert not last.view.readonly, "monitors change it in place"
     assert flow.later(9.0) is None
     flow.passing(frames(10, 11, 12), 9.0, latching=True)
     assert flow.passing(frames(9), 99.0, latching=True) is not None
