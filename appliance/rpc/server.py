@@ -220,6 +220,10 @@ class _Connection(Front):
                 b"413 Content Too Large",
                 f"announced a body of {int(value)} bytes; the limit is {self.limits.body_bytes}",
             )
+        elif lowered == b"content-encoding" and value.lower() != b"identity":
+            encoding = value[:20].decode("latin-1")
+            what = f"sent a body encoded as {encoding!a}; send it as it is, without Content-Encoding"
+            self.reject(b"415 Unsupported Media Type", what)
         elif lowered == b"expect" and value.lower() == b"100-continue":
             self._expects = True
 

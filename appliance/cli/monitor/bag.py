@@ -48,7 +48,12 @@ def open_bag(path: Path) -> Reader:
         reader = Reader(path)
         reader.open()
     except (*_DAMAGE, OSError) as error:
-        raise usage_error(f"cannot read the bag {path}: {_said_by(error)}") from error
+        mend = (
+            "; it takes a bag of ROS 1, and `rosbag reindex` mends one that was cut off"
+            if path.is_file()
+            else ""
+        )
+        raise usage_error(f"cannot read the bag {path}: {_said_by(error).rstrip('.')}{mend}") from error
     _order_by_place(reader)
     return reader
 

@@ -432,6 +432,7 @@ def test_a_handler_without_an_answer() -> None:
         (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", 400, "not HTTP"),
         (b"\xaf\x00\x00\x00callerid=/x", 400, "not HTTP"),
         (post(b"", length=17 << 20), 413, "announced a body"),
+        (post(b"", "Content-Encoding: gzip"), 415, "encoded as 'gzip'"),
         (post(b"", "Connection: upgrade", "Upgrade: h2c"), 501, "another protocol"),
         (b"POST / HTTP/1.1\r\nContent-Length: -5\r\n\r\n", 400, "not HTTP"),
         (b"POST / HTTP/1.1\r\nContent-Length: 1e3\r\n\r\n", 400, "not HTTP"),
