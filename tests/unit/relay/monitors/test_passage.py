@@ -321,12 +321,14 @@ def test_most_messages_are_taken_together(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_lines_are_told_of_the_message_as_it_came() -> None:
     """Which has a header that is changed, too, or is shorter than one."""
-    text = """s() { event e(unsigned int n) /h std_msgs/Header '{seq:n}' { n = 3; } }
-        t() { event e() /h std_msgs/Header '{}' { ROS_INFO("came"); } }
-        u() { event e(std::string f) /j std_msgs/Header '{frame_id:f}' { ROS_INFO("from %s", f.c_str()); }
-              event all() /j std_msgs/Header '{}' { ROS_WARN("any"); } }"""
+    text = """s() { event e(unsigned int n) /h geometry_msgs/PointStamped '{header.seq:n}' { n = 3; } }
+        t() { int k = 0; event e() /h geometry_msgs/PointStamped '{}' { k++; ROS_INFO("came %d", k); } }
+        u() { event e(std::string f) /j geometry_msgs/PointStamped '{header.frame_id:f}' {
+                ROS_INFO("from %s", f.c_str()); }
+              event all() /j geometry_msgs/PointStamped '{}' { ROS_WARN("any"); } }"""
     bodies = [
-        message("std_msgs/Header", seq=seq, frame_id=name) for seq, name in ((7, "a"), (8, "b"), (9, "a"))
+        message("geometry_msgs/PointStamped", header__seq=seq, header__frame_id=name)
+        for seq, name in ((7, "a"), (8, "b"), (9, "a"))
     ]
     for one in (bodies, [b"abc", *bodies]):
         frames = b"".join(struct.pack("<I", len(body)) + body for body in one)
