@@ -362,8 +362,10 @@ def test_a_wrong_specification_is_not_run(tmp_path: Path) -> None:
 def test_what_is_no_bag(tmp_path: Path) -> None:
     """A file that is no recording, or none at all, is a mistake of the command line."""
     spec = write(tmp_path, "a.rv", GOOD)
-    assert invoke("run", spec, "--bag", spec).exit_code == 2
-    assert invoke("run", spec, "--bag", tmp_path / "none.bag").exit_code == 2
+    for bag, mended in ((spec, True), (tmp_path / "none.bag", False)):
+        done = invoke("run", spec, "--bag", bag)
+        assert done.exit_code == 2
+        assert ("rosbag reindex" in done.stderr) == mended
 
 
 def test_an_empty_recording(tmp_path: Path) -> None:
