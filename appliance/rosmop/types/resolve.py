@@ -31,6 +31,7 @@ _CPP_NAMES = {  # of the types of fields, as .msg files name them
     "time": "ros::Time",
     "duration": "ros::Duration",
 }
+_SHORT_NAMES = {short: f"unsigned {short[1:]}" for short in ("uint", "ushort", "ulong")}  # of glibc
 _UNKNOWN_CONTAINERS = frozenset(
     {"map", "set", "list", "deque", "pair", "array", "unordered_map", "queue", "tuple"}
 )
@@ -94,6 +95,10 @@ def _message(name: tree.TypeName, messages: Messages) -> Type:
             f"there is no type `{text}`; ROS's {text} is `{_CPP_NAMES[text]}` in C++: write that",
         )
     if len(name.name) != 2:
+        if text in _SHORT_NAMES:
+            raise SpecificationError.at(
+                name.position, f"there is no type `{text}`; write `{_SHORT_NAMES[text]}`"
+            )
         known = ["bool", "int", "double", "float", "char", "string", "size_t"]
         hint = nearest(text, known) if len(name.name) == 1 and len(text) > 2 else ""
         hint = hint if "did you mean" in hint else "; write a C++ type or a message type `package::Type`"

@@ -57,6 +57,7 @@ REFUSED = [
     ("state", "there is no type `state`"),
     ("float64", "ROS's float64 is `double` in C++"),
     ("float32", "ROS's float32 is `float` in C++"),
+    ("uint", "there is no type `uint`; write `unsigned int`"),
     ("uint8", "ROS's uint8 is `uint8_t` in C++"),
     ("time", "ROS's time is `ros::Time` in C++"),
     ("strin", "there is no type `strin`; did you mean `string`?"),
