@@ -162,7 +162,7 @@ class _Gathered:
             table = table[key]
         table[path[-1]] = value
         # Where the file stands no longer matters for what is under this key.
-        for older in [one for one in self._places if one[: len(path)] == path]:
+        for older in [place for place in self._places if place[: len(path)] == path]:
             del self._places[older]
         self._places[path] = place
 

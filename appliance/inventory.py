@@ -59,9 +59,9 @@ def debian_licences(text: str) -> list[str]:
 def python_licences(fields: Message) -> list[str]:
     """The licences that the metadata of a Python package names."""
     classified = [
-        str(one).rpartition(" :: ")[2]
-        for one in fields.get_all("Classifier", [])
-        if str(one).startswith("License ::")
+        str(classifier).rpartition(" :: ")[2]
+        for classifier in fields.get_all("Classifier", [])
+        if str(classifier).startswith("License ::")
     ]
     said = str(fields["License-Expression"] or fields["License"] or "")
     return [said] if said and "\n" not in said else classified

@@ -23,7 +23,7 @@ def open_alarms(status: Status) -> list[Alarm]:
     """The open conditions, the gravest first."""
     order = ("alarm", "warning", "notice")
     found = [*_system(status), *_audit(status), *_policy(status), *_monitors(status), *_hosts(status)]
-    return sorted(found, key=lambda one: order.index(one.severity))
+    return sorted(found, key=lambda alarm: order.index(alarm.severity))
 
 
 def _system(status: Status) -> Iterator[Alarm]:

@@ -135,6 +135,6 @@ def _methods(request: Request) -> set[str]:
 async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)  # noqa: S101  registered for it
     errors = error.errors()
-    bad = [BadInput(where=".".join(map(str, one["loc"])), text=str(one["msg"])) for one in errors]
-    detail = "; ".join(f"{one.where}: {one.text}" for one in bad[:5])
+    bad = [BadInput(where=".".join(map(str, error["loc"])), text=str(error["msg"])) for error in errors]
+    detail = "; ".join(f"{problem.where}: {problem.text}" for problem in bad[:5])
     return _answer(request, ProblemError(422, "bad-input", detail, errors=bad))

@@ -348,7 +348,7 @@ def _readable(entry: Entry, bearer: Bearer) -> Entry:
 
 def _exported(path: pathlib.Path, wanted: Filter, bearer: Bearer) -> Iterator[str]:
     if reads_contents(bearer):
-        return _begun(evidence_line(*one) for one in evidence(path, wanted))
+        return _begun(evidence_line(*record) for record in evidence(path, wanted))
     shown = (_shown([entry], bearer, wanted.text) for entry in export(path, wanted))
     return _begun(_as_line(record) for records in shown for record in records)
 

@@ -60,8 +60,10 @@ def judge_change(order: PolicyLoad, current: PolicyKnown, registrations: Iterabl
         revision=current.revision,
         warnings=_findings_of(policy.warnings),
         changes=[
-            Change(**one.request.fields(), now=one.old.word, then=one.new.word, reason=one.new.reason)
-            for one in changes
+            Change(
+                **change.request.fields(), now=change.old.word, then=change.new.word, reason=change.new.reason
+            )
+            for change in changes
         ],
         ends=[Ended(**asdict(end)) for end in endings(policy, live)],
     )

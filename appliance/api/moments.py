@@ -33,9 +33,9 @@ def in_full(value: Any) -> Any:
                 fields[name + _UTC] = _text(fields[name], units[name])
         return fields
     if isinstance(value, Mapping):
-        return {name: in_full(one) for name, one in value.items()}
+        return {name: in_full(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [in_full(one) for one in value]
+        return [in_full(item) for item in value]
     return value
 
 

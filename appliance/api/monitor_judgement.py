@@ -115,13 +115,13 @@ def properties_of(monitor: Monitor) -> list[PropertyShown]:
 
     return [
         PropertyShown(
-            logic=each.property.logic,
-            formula=each.property.formula.strip(),
-            categories=list(each.property.categories),
-            handled=list(each.order),
-            drawn=dot_of([each.property]) is not None,
+            logic=code.property.logic,
+            formula=code.property.formula.strip(),
+            categories=list(code.property.categories),
+            handled=list(code.order),
+            drawn=dot_of([code.property]) is not None,
         )
-        for each in monitor.code.properties
+        for code in monitor.code.properties
     ]
 
 
@@ -129,4 +129,4 @@ def picture_of(monitor: Monitor) -> str | None:
     """The automata of a monitor's properties (SVG); None when none is finite."""
     from appliance.rosmop.logics.picture import svg_of  # noqa: PLC0415  the compiler: see the head
 
-    return svg_of([each.property for each in monitor.code.properties])
+    return svg_of([code.property for code in monitor.code.properties])

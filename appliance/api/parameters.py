@@ -28,5 +28,5 @@ async def only_known(request: Request) -> None:
             BadInput(where=f"query.{name}", text=f"there is no such parameter{meant(name, known)}")
             for name in unknown
         ]
-        detail = "; ".join(f"{one.where}: {one.text}" for one in bad)
+        detail = "; ".join(f"{problem.where}: {problem.text}" for problem in bad)
         raise ProblemError(422, "bad-input", f"{detail}; {there_are}", errors=bad)

@@ -164,7 +164,7 @@ def _parted(error: msgspec.ValidationError) -> tuple[str, str]:
 def _bad_input(errors: list[msgspec.ValidationError]) -> ProblemError:
     bad = [BadInput(f"body{place}", text) for text, place in map(_parted, errors)]
     return ProblemError(
-        422, "bad-input", "; ".join(f"{one.where}: {one.text}" for one in bad[:5]), errors=bad
+        422, "bad-input", "; ".join(f"{problem.where}: {problem.text}" for problem in bad[:5]), errors=bad
     )
 
 

@@ -131,7 +131,7 @@ class CopiesAudit:
         self._log = log
         self._key = key
         self._others = sorted({copy.log for copy in copies if copy.log != log})
-        self._copies = sorted({copy for copy in copies if copy.log == log}, key=lambda one: one.number)
+        self._copies = sorted({copy for copy in copies if copy.log == log}, key=lambda copy: copy.number)
         self.sequences = {copy.sequence for copy in self._copies}
         self._agreeing: list[SignedCheckpoint] = []
         self.removed: list[int] = []

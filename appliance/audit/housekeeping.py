@@ -141,7 +141,7 @@ class Housekeeping:
 
     def seal_now(self, waiter: Waiter) -> None:
         """Seal with the next batch; the waiter is answered when that is signed."""
-        self._waiting = [one for one in self._waiting if not one.future.done()] + [waiter]
+        self._waiting = [pending for pending in self._waiting if not pending.future.done()] + [waiter]
 
     def _answer_sealed(self) -> None:
         """What was to be sealed now is: its waiters wait for the signature, if it is not there yet."""

@@ -170,15 +170,15 @@ def _page(connection: sqlite3.Connection, wanted: Filter, walk: _Walk, limit: in
 def _most_selective(connection: sqlite3.Connection, found: list[Condition]) -> str | None:
     """The index with the fewest candidates; None when each has so many that walking the log is quick."""
     best, fewest = None, _SELECTIVE
-    for one in found:
-        if one.answered_by is not None:
+    for condition in found:
+        if condition.answered_by is not None:
             count = connection.execute(
-                f"SELECT count(*) FROM (SELECT 1 FROM record INDEXED BY {one.answered_by}"  # noqa: S608  fixed names
-                f" WHERE {one.sql} LIMIT ?)",
-                (*one.values, fewest),
+                f"SELECT count(*) FROM (SELECT 1 FROM record INDEXED BY {condition.answered_by}"  # noqa: S608  fixed names
+                f" WHERE {condition.sql} LIMIT ?)",
+                (*condition.values, fewest),
             ).fetchone()[0]
             if count < fewest:
-                best, fewest = one.answered_by, count
+                best, fewest = condition.answered_by, count
     return best
 
 
@@ -231,11 +231,11 @@ def _neighbours(
 
 
 def _where(found: list[Condition]) -> str:
-    return "WHERE " + " AND ".join(one.sql for one in found) if found else ""
+    return "WHERE " + " AND ".join(condition.sql for condition in found) if found else ""
 
 
 def _values(found: list[Condition]) -> tuple[object, ...]:
-    return tuple(value for one in found for value in one.values)
+    return tuple(value for condition in found for value in condition.values)
 
 
 def _fetch(

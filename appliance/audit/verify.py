@@ -30,7 +30,7 @@ _TOLD_EVERY = 5000
 _MOST_FINDINGS = 1000
 _EVENT, _DETAIL = StoredColumns._fields.index("event"), StoredColumns._fields.index("detail")
 # By how many places a record may have been renumbered.
-_DISTANCES = tuple(distance for one in range(1, 1000) for distance in (one, -one))
+_DISTANCES = tuple(distance for step in range(1, 1000) for distance in (step, -step))
 _WORDS_TABLES = ("words_data", "words_idx", "words_docsize", "words_config")
 _LOG_ID = re.compile("[0-9a-f]{32}")
 _Count = Annotated[int, msgspec.Meta(ge=0)]
@@ -175,7 +175,7 @@ class _Verifier:
         elsewhere = self._check_copies(removed)
         removal = self._check_removal(removed)
         audit = self._checkpoints
-        self._findings.sort(key=lambda one: one.first)
+        self._findings.sort(key=lambda finding: finding.first)
         if self._further is not None:
             self._findings.append(self._further)
         return Verification(
@@ -322,11 +322,11 @@ class _Verifier:
         if not order:
             return self._changed_or_renumbered(row, ahead[0] if ahead else None, place)
         first = order[0].sequence
-        if len(order) > 1 and max(one.sequence for one in order) == row.sequence + len(order) - 1:
+        if len(order) > 1 and max(written.sequence for written in order) == row.sequence + len(order) - 1:
             self._explained = row.sequence + len(order) - 1
             self._find(Kind.REORDERED, row.sequence, self._explained, "not in the order they were written in")
-            for offset, one in enumerate(order):
-                self._note(one, place + offset)
+            for offset, written in enumerate(order):
+                self._note(written, place + offset)
             return order[-1].hash
         self._find(Kind.INSERTED, row.sequence, first - 1, "inserted; what follows was renumbered")
         self._explained = first - 1

@@ -16,7 +16,7 @@ class Waiter(NamedTuple):
 
 def answer(waiting: Iterable[Waiter], result: str | None) -> None:
     """Answer all of them; those of one event loop with one call into it."""
-    for loop, group in itertools.groupby(waiting, lambda one: one.loop):
+    for loop, group in itertools.groupby(waiting, lambda waiter: waiter.loop):
         # A closed loop raises RuntimeError: nobody waits any more.
         with contextlib.suppress(RuntimeError):
             loop.call_soon_threadsafe(_settle, [waiter.future for waiter in group], result)

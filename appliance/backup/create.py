@@ -118,7 +118,7 @@ def _files(state: Path) -> Iterator[tuple[str, int]]:
             f"{state} has more than {MOST_FILES} files, most of them in {parts.most_common(1)[0][0]}: see who put them"
             " there, and take them away"
         )
-    for name in sorted(names, key=lambda one: one != AUDIT_LOG):
+    for name in sorted(names, key=lambda candidate: candidate != AUDIT_LOG):
         descriptor = opened(state, name)
         if descriptor is not None:
             yield name, descriptor

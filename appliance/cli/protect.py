@@ -167,7 +167,7 @@ def _check(checked: _Checked, running: Appliance, as_json: bool) -> None:
     opened = any(result.open for result in results)
     unknown = not all(result.answered and not result.untried for result in results)
     state: Literal["closed", "open", "unknown"] = "open" if opened else "unknown" if unknown else "closed"
-    addresses = [asdict(one) | {"obstacle": one.obstacle or None} for one in results]
+    addresses = [asdict(result) | {"obstacle": result.obstacle or None} for result in results]
     report = {
         "event": "check",
         "host": checked.host,

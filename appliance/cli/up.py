@@ -138,7 +138,7 @@ def _announce(said: ControlReady, settings: Settings, *, as_json: bool) -> None:
         shown = None if said.token else line
         log.warning("standard output takes nothing", error=error.strerror, first_token=kept, line=shown)
     with contextlib.suppress(OSError):
-        typer.echo("".join(f"{one}\n" for one in more), err=True, nl=False)
+        typer.echo("".join(f"{line}\n" for line in more), err=True, nl=False)
 
 
 def _rest_url(settings: Settings) -> str | None:

@@ -182,6 +182,8 @@ class Looks:
             who=policies.in_force.who,
             differs_from_file=policies.differs_from_file,
             warnings=len(policies.current.warnings),
-            audit_only=[one.name for one in DECIDERS if policies.current.audit_only(one.categories[0])],
+            audit_only=[
+                decider.name for decider in DECIDERS if policies.current.audit_only(decider.categories[0])
+            ],
             confirm_by=policies.confirm_by,
         )

@@ -45,7 +45,7 @@ def measures_of(parts: Parts, status: Status, hosts: list[Host], queued_deliveri
         queued_deliveries=queued_deliveries,
         decisions=[(*labels, count) for labels, count in from_zero(meter.decisions, _DECISIONS).items()],
         decision_seconds=meter.decision_seconds.values(),
-        calls=[(call, one.values()) for call, one in meter.calls.items()],
+        calls=[(call, histogram.values()) for call, histogram in meter.calls.items()],
         nodes={"live": lives[Life.LIVE], "lost": lives[Life.SHADOW]},
         registrations=dict(kinds),
         relayed=relayed,

@@ -78,7 +78,7 @@ def _state(monitors: Monitors, name: str) -> answers.MonitorState:
         slice_limit=row.slice_limit if row is not None else 0,
         margins=[]
         if row is None
-        else [_margin(each, monitors.sources.files.get(row.file, "")) for each in row.margins],
+        else [_margin(margin, monitors.sources.files.get(row.file, "")) for margin in row.margins],
     )
 
 

@@ -23,7 +23,7 @@ def graph_of(parts: Parts) -> Graph:
     live = [incarnation for incarnation in shown if incarnation.life is Life.LIVE]
     names = {incarnation.key: incarnation.name for incarnation in shown}
     return Graph(
-        [_node(incarnation) for incarnation in sorted(shown, key=lambda one: one.name)],
+        [_node(incarnation) for incarnation in sorted(shown, key=lambda incarnation: incarnation.name)],
         _topics(parts, live, names),
         _services(parts, live, names),
     )

@@ -178,7 +178,9 @@ class Policies:
         async with self._changing(request.expected):
             before, now = self.revision, self.in_force
             if now.who != _DISK and (now.text, now.signature) == given:
-                return Loaded(before, before, [str(one) for one in self.current.warnings], 0, self.confirm_by)
+                return Loaded(
+                    before, before, [str(warning) for warning in self.current.warnings], 0, self.confirm_by
+                )
             policy, signature = await self._prepared(lambda: given, f"revision {self._next_number()}", who)
             self.trial.announce(before, within)
             revoked = self._keep(policy, signature, who=who, note=request.note or "posted")

@@ -58,7 +58,7 @@ def sha256(data: bytes) -> bytes:
 
 def printable(text: str) -> str:
     """Without what a terminal would obey: a bundle may have anything in the place of a number."""
-    return "".join(one if one.isprintable() else ascii(one)[1:-1] for one in text)
+    return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)
 
 
 def unhexed(text: str) -> bytes:
@@ -109,8 +109,8 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
     file.seek(archive.start_dir)
     directory, at, begin, members = file.read(MOST), 0, 0, archive.infolist()
     free: set[Any] = {FREE}  # what packers write as they like
-    for one in members:
-        name, where, packed, size = one.filename, one.header_offset, one.compress_size, one.file_size
+    for info in members:
+        name, where, packed, size = info.filename, info.header_offset, info.compress_size, info.file_size
         entry = ENTRY.unpack_from(directory, begin)
         text = directory[begin + ENTRY.size :][: entry[12]]
         begin += ENTRY.size + sum(entry[12:15])
@@ -119,12 +119,12 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
         if where != at:
             yield f"bytes {at} to {where}: belong to no member"
         large = (b"", extra(size, packed), extra(where), extra(size, packed, where))
-        if one.comment or one.extra not in large:
+        if info.comment or info.extra not in large:
             yield f"{name!a}: has a comment or an extra field"
         file.seek(where)
         header = HEADER.unpack(file.read(HEADER.size))
         name_here = file.read(header[10])
-        told = (0, 0, 0) if one.flag_bits & 8 else (one.CRC, packed, size)
+        told = (0, 0, 0) if info.flag_bits & 8 else (info.CRC, packed, size)
         same = (
             header[0] == b"PK\3\4" and header[1] in (20, entry[3]) and header[2:8] == (*entry[4:9], told[0])
         )
@@ -133,15 +133,15 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
         if file.read(header[11]) not in (b"", extra(0, 0), extra(size, packed)):
             yield f"{name!a}: has an extra field"
         at = file.tell() + packed
-        if not (ends(file, packed) if one.compress_type else packed == size):
+        if not (ends(file, packed) if info.compress_type else packed == size):
             yield f"{name!a}: something stands behind it"
         file.seek(at)
         forms = ("<4sLQQ", "<4s3L") if max(packed, size) < LARGE else ("<4sLQQ",)
         sealed, after = (
-            [struct.pack(form, b"PK\7\x08", one.CRC, packed, size) for form in forms],
+            [struct.pack(form, b"PK\7\x08", info.CRC, packed, size) for form in forms],
             file.read(24),
         )
-        at += next((len(seal) for seal in sealed if after.startswith(seal)), 0) if one.flag_bits & 8 else 0
+        at += next((len(seal) for seal in sealed if after.startswith(seal)), 0) if info.flag_bits & 8 else 0
     start, count = archive.start_dir, len(members)
     if at != start:
         yield f"bytes {at} to {start}: belong to no member"
@@ -304,7 +304,9 @@ class Verifier:
                 if line != written or {*record} != {*COLUMNS, "detail", "chain"} or {*chain} - CHAIN:
                     self.findings.append(f"record {sequence}: is not written as the appliance writes it")
                 detail = record["detail"].encode("utf-8", "surrogateescape")
-                columns = b"\xdc\x00\x13" + b"".join(map(packed, [*(record[one] for one in COLUMNS), detail]))
+                columns = b"\xdc\x00\x13" + b"".join(
+                    map(packed, [*(record[column] for column in COLUMNS), detail])
+                )
                 before, own = unhexed(chain["previous"]), unhexed(chain["hash"])
                 # The second is how version 0.1.0 made it.
                 if own not in (sha256(before + b"2" + sha256(columns)), sha256(before + columns)):

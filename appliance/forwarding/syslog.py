@@ -74,19 +74,19 @@ class Formatter:
         room = max(0, self._longest - len(_message(head, ELEMENT, named, "")) - 1)
         return _message(head, ELEMENT, named, _shortened(text, room))
 
-    def checkpoint(self, one: SignedCheckpoint) -> bytes:
+    def checkpoint(self, signed: SignedCheckpoint) -> bytes:
         """A signed checkpoint: what `rosrv audit verify --checkpoints` finds again in the receiver's file."""
-        head = self._head(Severity.NOTICE, one.time, "checkpoint signed")
+        head = self._head(Severity.NOTICE, signed.time, "checkpoint signed")
         fields = {
-            name: str(value) for name, value in msgspec.structs.asdict(one).items() if value is not None
+            name: str(value) for name, value in msgspec.structs.asdict(signed).items() if value is not None
         }
-        text = f"checkpoint {one.number} of the audit log"
+        text = f"checkpoint {signed.number} of the audit log"
         if self._ocsf:
             record = Record(
-                id=one.hash, time=one.time, event="checkpoint", severity=Severity.NOTICE, reason=text,
-                detail={"number": one.number, "sequence": one.sequence, "hash": one.hash},
+                id=signed.hash, time=signed.time, event="checkpoint", severity=Severity.NOTICE, reason=text,
+                detail={"number": signed.number, "sequence": signed.sequence, "hash": signed.hash},
             )  # fmt: skip
-            text = as_ocsf_line(Entry(one.sequence, record))
+            text = as_ocsf_line(Entry(signed.sequence, record))
         return _message(head, SYSLOG_ELEMENT, fields, text)
 
     def _head(self, severity: Severity, time: int, event: str) -> str:

@@ -69,6 +69,6 @@ class CheckedPorts:
         except ValueError:
             self._table.enrolled_row(name)  # says which there are
             raise
-        behind = [one.name for one in self._tunnels.seen.values() if one.remote == address]
+        behind = [tunnel.name for tunnel in self._tunnels.seen.values() if tunnel.remote == address]
         row = self._table.at(address)
         return row.name if row is not None else behind[0] if len(behind) == 1 else address

@@ -149,12 +149,12 @@ class HostTable:
         if wanted is None and kept is not None:
             wanted = kept
         taken = {row.address: row.name for row in self.rows.values() if row.name != name}
-        taken |= {address: one for address, one in awaited.items() if one != name}
+        taken |= {address: holder for address, holder in awaited.items() if holder != name}
         if wanted is None:
             reserved = {host.address for host in self.declared.hosts.values()}
-            for one in itertools.islice(self.pool.hosts(), 1, None):
-                if str(one) not in taken and str(one) not in reserved:
-                    return str(one)
+            for candidate in itertools.islice(self.pool.hosts(), 1, None):
+                if str(candidate) not in taken and str(candidate) not in reserved:
+                    return str(candidate)
             raise HostRefusedError(f"every address of {self.pool} is a host's: take a larger ipsec.pool")
         try:
             address = ipaddress.IPv4Address(wanted)

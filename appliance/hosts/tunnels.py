@@ -225,7 +225,7 @@ class Tunnels:
                 )
             case messages.TunnelsReported(taken, rows):
                 self._reported(rows)
-                for number in [one for one in self._stated if one <= taken]:
+                for number in [statement for statement in self._stated if statement <= taken]:
                     self._taken_changes = self._stated.pop(number)
                 self._wake.set()
 

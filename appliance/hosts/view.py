@@ -94,7 +94,7 @@ class HostView:
         return IpsecState(
             esp=self._tunnels.esp,
             key_exchange=charon.key_exchange if charon else [],
-            post_quantum=any("mlkem" in one for one in charon.key_exchange) if charon else None,
+            post_quantum=any("mlkem" in exchange for exchange in charon.key_exchange) if charon else None,
             charon=charon.version if charon else None,
             pool=str(self._table.pool),
             address=self._table.own_address,

@@ -163,8 +163,8 @@ def _seen(name: str, row: Any) -> TunnelSeen | None:
         host,
         _text(row, "remote-host"),
         int(_text(row, "established") or 0),
-        sum(int(_text(one, "bytes-in") or 0) for one in children),
-        sum(int(_text(one, "bytes-out") or 0) for one in children),
+        sum(int(_text(child, "bytes-in") or 0) for child in children),
+        sum(int(_text(child, "bytes-out") or 0) for child in children),
     )
 
 

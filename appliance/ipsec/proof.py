@@ -34,7 +34,7 @@ def require_proof(
     except (ValueError, TypeError, InvalidSignature) as error:
         raise RequestRefusedError("the present certificate is not one of this authority") from error
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
-    if [one.value for one in names] != [name]:
+    if [attribute.value for attribute in names] != [name]:
         raise RequestRefusedError("the present certificate is in another name")
     if certificate.not_valid_after_utc <= now:
         raise RequestRefusedError("the present certificate has ended: only a new kit helps (rosrv host kit)")

@@ -107,7 +107,7 @@ class Signer:
             case messages.CertificateWanted():
                 return self._issue(message)
             case messages.RevocationsWanted(number, revoked):
-                rows = [(one.serial, one.moment) for one in revoked]
+                rows = [(certificate.serial, certificate.moment) for certificate in revoked]
                 return messages.RevocationsMade(number, self._authority.revocations(rows))
             case _:
                 return None

@@ -73,7 +73,7 @@ class Proposals:
     @property
     def key_exchange(self) -> list[str]:
         """The methods of key exchange, for status: `x25519+mlkem768`, `x25519`, `ecp384`."""
-        words = [one.removeprefix("aes256gcm16-prfsha384-") for one in self.ike]
+        words = [proposal.removeprefix("aes256gcm16-prfsha384-") for proposal in self.ike]
         return [word.replace("-ke1_", "+") for word in words]
 
 

@@ -144,7 +144,7 @@ class _Proposer:
         yield from self._sets(topic, content, support)
         if rhythm.count < _FEWEST:
             return
-        for place in sorted(self._numbers(content), key=lambda each: -each[3].changed):
+        for place in sorted(self._numbers(content), key=lambda found: -found[3].changed):
             yield from self._number(topic, content, rhythm, place)
 
     def _support(self, rhythm: Rhythm) -> Support:
@@ -265,7 +265,7 @@ class _Proposer:
         for path, series in content.numbers.items():
             row = content.elements.get(path)
             if row:
-                yield from ((path, place, len(row), each) for place, each in enumerate(row))
+                yield from ((path, place, len(row), series) for place, series in enumerate(row))
             elif (
                 content.types[path].endswith("]")
                 or content.types[path].startswith("float")
@@ -294,7 +294,7 @@ class _Proposer:
                 condition=same + (" && !isinf({v})" if series.infinite else ""),
             )  # fmt: skip
             return
-        top, bottom = (self._upper(each, stops=True) for each in (series.highs, series.lows))
+        top, bottom = (self._upper(side, stops=True) for side in (series.highs, series.lows))
         if top is None or bottom is None:
             return
         width = high - low
@@ -351,7 +351,7 @@ class _Proposer:
                 row for row in self._timed(a, b, pair, orders) if row[1].kind == "causes" or not taking_turns
             ]
         told: dict[str, int] = {}
-        for _, candidate in sorted(found, key=lambda one: one[0]):
+        for _, candidate in sorted(found, key=lambda ranked: ranked[0]):
             names = [topic for topic, _ in candidate.events.values()]
             if all(told.get(name, 0) < MOST["order"] for name in names):
                 told.update({name: told.get(name, 0) + 1 for name in names})

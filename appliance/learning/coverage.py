@@ -76,7 +76,10 @@ class _Marked:
         self._declared: list[tree.Declaration] = []
         self._specification = ""
         self.files = [
-            replace(file, specifications=tuple(self._marked(each) for each in file.specifications))
+            replace(
+                file,
+                specifications=tuple(self._marked(specification) for specification in file.specifications),
+            )
             for file in files
         ]
 
@@ -87,22 +90,25 @@ class _Marked:
             for event in node.events
         )
         functions = tuple(
-            replace(each, body=self._block("function", each.name, each.position, each.body))
-            for each in node.functions
+            replace(function, body=self._block("function", function.name, function.position, function.body))
+            for function in node.functions
         )
         inits = tuple(
-            replace(each, body=self._block("function", "init", each.position, each.body))
-            for each in node.inits
+            replace(block, body=self._block("function", "init", block.position, block.body))
+            for block in node.inits
         )
         properties = tuple(
             replace(
-                each,
+                declared,
                 handlers=tuple(
-                    replace(one, body=self._block("handler", f"@{one.category}", one.position, one.body))
-                    for one in each.handlers
+                    replace(
+                        handler,
+                        body=self._block("handler", f"@{handler.category}", handler.position, handler.body),
+                    )
+                    for handler in declared.handlers
                 ),
             )
-            for each in node.properties
+            for declared in node.properties
         )
         return replace(
             node, declarations=(*node.declarations, *self._declared), events=events, functions=functions, inits=inits,
@@ -125,7 +131,7 @@ class _Marked:
 
     def _inside(self, node: tree.Statement) -> tree.Statement:
         if isinstance(node, tree.Block):
-            return replace(node, statements=tuple(self._inside(each) for each in node.statements))
+            return replace(node, statements=tuple(self._inside(statement) for statement in node.statements))
         if isinstance(node, tree.If):
             yes = self._block("branch", "if", node.position, node.yes)
             no = node.no or tree.Block(node.position, ())
@@ -140,7 +146,7 @@ class _Marked:
                     case,
                     statements=(
                         self._mark(Item(self._specification, "branch", "case", case.position)),
-                        *(self._inside(each) for each in case.statements),
+                        *(self._inside(statement) for statement in case.statements),
                     ),
                 )
                 for case in node.cases
@@ -255,10 +261,10 @@ def _transition(specification: str, source: Source, state: str, event: str, text
 def _machine_items(file: tree.File) -> Iterator[Item]:
     for node in file.specifications:
         names = tuple(event.name for event in node.events)
-        for each in node.properties:
-            if each.logic.lower() in _MACHINES:
-                logic = each.logic.lower()
-                source = Source(logic, each.formula, names, each.formula_position)
+        for declared in node.properties:
+            if declared.logic.lower() in _MACHINES:
+                logic = declared.logic.lower()
+                source = Source(logic, declared.formula, names, declared.formula_position)
                 for name, state in read_machine(source, timed=logic == "tfsm").states.items():
                     yield _state(node.name, source, name)
                     for event in state.moves:

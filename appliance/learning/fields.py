@@ -113,7 +113,7 @@ def _array(part: ArrayPart) -> _Part:
     kind = (
         np.dtype("<" + PRIMITIVES[part.type][0]) if _elements_read(part) and part.type != "string" else None
     )
-    nested = [_reader(each) for each in part.layout.parts] if part.layout is not None else []
+    nested = [_reader(inner) for inner in part.layout.parts] if part.layout is not None else []
 
     def read(data: bytes, position: int, values: dict[str, Value]) -> int:
         count = part.count
@@ -135,8 +135,8 @@ def _array(part: ArrayPart) -> _Part:
             return _within(data, position + count * part.element_size)
         for _ in range(count):
             ignored: dict[str, Value] = {}
-            for each in nested:
-                position = each(data, position, ignored)
+            for inner in nested:
+                position = inner(data, position, ignored)
         return position
 
     return read

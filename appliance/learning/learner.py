@@ -83,7 +83,7 @@ class _Learner:
         rows = list(specifications(candidates, known))
         alarms = self._alarms(rows)
         self._continue(known)
-        wider = {each.key: each for each in known.candidates()}
+        wider = {candidate.key: candidate for candidate in known.candidates()}
         kept, left_out = [], []
         for candidate in candidates:
             count = alarms[candidate.key]
@@ -96,7 +96,7 @@ class _Learner:
             else:
                 left_out.append(replace(candidate, alarms=count))
         rows = list(specifications(kept, known))
-        names = {each.key: name for name, _, group in rows for each in group}
+        names = {candidate.key: name for name, _, group in rows for candidate in group}
         text = "\n".join([self._head(known, kept, left_out), *(row[1] for row in rows)])
         MonitorSet.load({"learnt.rv": text}, self._definitions)
         return Learnt(
@@ -171,8 +171,8 @@ class _Learner:
             monitors.start(part.began, frozenset(part.topics))
             for topic, time, data in self._messages(part):
                 outcome = monitors.process(topic, data, time)
-                for each in (*outcome.before, outcome):
-                    found.update(_warned(each, groups))
+                for told in (*outcome.before, outcome):
+                    found.update(_warned(told, groups))
         return found
 
     def _head(self, known: Knowledge, kept: Sequence[Candidate], left_out: Sequence[Candidate]) -> str:
@@ -187,14 +187,15 @@ class _Learner:
             else "Nothing was held out: it is untested.",
         ]
         if self._held_out:
-            widened = sum(1 for each in kept if each.widened)
+            widened = sum(1 for candidate in kept if candidate.widened)
             lines.append(
                 f"{len(kept) - widened} conditions gave no alarm there; {widened} did and were widened, "
                 f"{len(left_out)} did and were left out" + (":" if left_out else ".")
             )
         lines += [
-            f"  {each.topic} {each.says} ({each.seen}): {each.alarms} alarms; {on(each.support)}"
-            for each in left_out
+            f"  {candidate.topic} {candidate.says} ({candidate.seen}): {candidate.alarms} alarms; "
+            f"{on(candidate.support)}"
+            for candidate in left_out
         ]
         lines += [f"Not looked at: {text}" for text in self._skipped]
         lines += [
@@ -229,9 +230,9 @@ def _warned(outcome: Outcome, groups: dict[str, list[Candidate]]) -> list[tuple[
     for line in outcome.log:
         if line.level != "WARN":
             continue
-        for each in groups.get(line.monitor, ()):
-            if line.text == f"{each.topic} {each.says}" or line.text.startswith(
-                f"{each.topic} {each.says}: "
+        for candidate in groups.get(line.monitor, ()):
+            if line.text == f"{candidate.topic} {candidate.says}" or line.text.startswith(
+                f"{candidate.topic} {candidate.says}: "
             ):
-                found.append(each.key)
+                found.append(candidate.key)
     return found

@@ -58,12 +58,12 @@ class Part:
 
     def messages(self) -> Iterator[Received]:
         """The messages of these times."""
-        return (each for each in self.whole.messages() if self.began <= each[1] <= self.ended)
+        return (message for message in self.whole.messages() if self.began <= message[1] <= self.ended)
 
 
 def split(recordings: Sequence[Recording], held_out: float) -> tuple[list[Part], list[Part]]:
     """What is learnt from, and about this share to test it: whole recordings, spread evenly; of one alone its end."""
-    parts = [Part(each, each.began, each.ended) for each in recordings]
+    parts = [Part(recording, recording.began, recording.ended) for recording in recordings]
     if held_out <= 0:
         return parts, []
     if len(parts) == 1:

@@ -72,7 +72,10 @@ class Content:
 
     def begin(self) -> None:
         """A recording begins."""
-        for series in [*self.numbers.values(), *(each for row in self.elements.values() for each in row)]:
+        for series in [
+            *self.numbers.values(),
+            *(element for row in self.elements.values() for element in row),
+        ]:
             series.begin()
         self._before: dict[str, Any] = {}
         self._stamp = -1.0

@@ -16,8 +16,8 @@ def specifications(
 ) -> Iterator[tuple[str, str, list[Candidate]]]:
     """Name, text and candidates of each specification."""
     taken: set[str] = set()
-    own = [each for each in candidates if not each.events]
-    for topic, group in groupby(own, key=lambda each: each.topic):
+    own = [candidate for candidate in candidates if not candidate.events]
+    for topic, group in groupby(own, key=lambda candidate: candidate.topic):
         rows, name = list(group), _new_name(topic, taken)
         yield name, _topic(name, rows, known), rows
     for candidate in candidates:

@@ -199,8 +199,8 @@ def measure(value: Value) -> tuple[int, int]:
         if kinds == {str}:
             return weight + _TEXT * len(level) + sum(map(len, cast(list[str], level))), depth
         below: list[Value] = []
-        for one in level:
-            weight += _own_weight(one, below)
+        for inner in level:
+            weight += _own_weight(inner, below)
         if not kinds & {list, dict}:
             return weight, depth
         level, depth = below, depth + 1

@@ -83,7 +83,7 @@ class ParameterMirror:
         refusal = pool.take(host, growth) if growth else ""
         if not refusal:
             return Reserved(pool, host, growth, weight)
-        former, most = max(held.items(), key=lambda each: each[1])
+        former, most = max(held.items(), key=lambda item: item[1])
         if after > most:
             raise LimitReachedError(f"parameter {key[:80]} is not set: {refusal}")
         return Reserved(pool, former, 0, weight)

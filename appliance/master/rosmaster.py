@@ -73,7 +73,7 @@ class BatchingClient:
         return [_outcome(method, value) for (method, _params), value in zip(calls, values, strict=True)]
 
     def _send_waiting(self) -> None:
-        waiting = [one for one in self._waiting if not one[2].done()]  # the others have been given up
+        waiting = [entry for entry in self._waiting if not entry[2].done()]  # the others have been given up
         part, self._waiting = waiting[:_LARGEST], waiting[_LARGEST:]
         self._busy = bool(part)
         if part:

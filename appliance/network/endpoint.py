@@ -45,10 +45,11 @@ def only_address(namespace: Namespace, *, without: Sequence[str]) -> Endpoint:
     held = links.addresses_by_interface(namespace)
     own = [text.partition("/")[0] for name, texts in held.items() if name not in without for text in texts]
     found = sorted(
-        {ipaddress.ip_address(text) for text in own if _counts(text)}, key=lambda one: (one.version, one)
+        {ipaddress.ip_address(text) for text in own if _counts(text)},
+        key=lambda address: (address.version, address),
     )
     for version in _VERSIONS:
-        of_it = [str(one) for one in found if one.version == version]
+        of_it = [str(address) for address in found if address.version == version]
         if len(of_it) == 1:
             return Endpoint(of_it[0], "the only address here")
         if of_it:

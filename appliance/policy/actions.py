@@ -11,7 +11,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.sections import PARAMETERS
 from appliance.ros.names import is_global_name
 
-VERBS = {"use-node" if one is Category.NODE else one.value: one for one in Category}
+VERBS = {"use-node" if category is Category.NODE else category.value: category for category in Category}
 
 
 class BadWordError(ValueError):

@@ -121,7 +121,8 @@ def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, s
         key = _key_of(decision.rule.key, request) if below and decision.rule is not None else f"{key}/**"
     written = f"{request.category.value} {key}" if request.category in PARAMETERS else key
     section = next(
-        (one for one in _sections(text) if one.name.text == BY_CATEGORY[request.category].name), None
+        (section for section in _sections(text) if section.name.text == BY_CATEGORY[request.category].name),
+        None,
     )
     entry = None if section is None else _entry(section, written)
     if entry is not None:
@@ -159,7 +160,7 @@ def _with_word(text: str, entry: Entry, word: str) -> tuple[str, str]:
 
 def _with_takeover(text: str) -> tuple[str, str]:
     option = f"takeover = {TAKEOVERS[-1]}"
-    section = next((one for one in _sections(text) if one.name.text == OPTIONS), None)
+    section = next((candidate for candidate in _sections(text) if candidate.name.text == OPTIONS), None)
     entry = None if section is None else _entry(section, "takeover")
     if entry is None:
         return _with_line(text, section, OPTIONS, option)

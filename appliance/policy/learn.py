@@ -133,7 +133,7 @@ def _text(rights: dict[tuple[Category, str], _Right], robot: Collection[Address 
     for section in DECIDERS:
         yield f"\n[{section.name}]\n"
         for category in section.categories:
-            keys = sorted(key for one, key in rights if one is category)
+            keys = sorted(key for kind, key in rights if kind is category)
             width = max(map(len, keys), default=0)
             verb = f"{category.value} " if category in PARAMETERS else ""
             for key in keys:
@@ -145,7 +145,7 @@ def _text(rights: dict[tuple[Category, str], _Right], robot: Collection[Address 
 
 def _hosts(hosts: set[Address], robot: Collection[Address | Network]) -> tuple[str, str]:
     """The group of the robot, if it is among them, and the addresses of the others."""
-    known = {host for host in hosts if any(_within(host, one) for one in robot)}
+    known = {host for host in hosts if any(_within(host, network) for network in robot)}
     rest = sorted(hosts - known, key=lambda host: (host.version, int(host)))
     return "robot" if known else "", " ".join(map(str, rest))
 

@@ -137,9 +137,9 @@ def decide(policy: Policy, rights: Iterable[Right]) -> Decision:
         category = right.request.category
         if category in PARAMETERS and not policy.has_section(category):
             continue  # a section that is not there leaves parameters free
-        one = decide_right(policy, right)
-        if not one.allowed or (one.would_deny and not verdict.would_deny):
-            verdict = replace(one, needs=str(right))
+        decision = decide_right(policy, right)
+        if not decision.allowed or (decision.would_deny and not verdict.would_deny):
+            verdict = replace(decision, needs=str(right))
     return verdict
 
 

@@ -84,7 +84,7 @@ class RuleCompiler:
         if len(decider.categories) == 1:
             return decider.categories[0], entry.key
         verb, _, name = entry.key.text.partition(" ")
-        category = next((one for one in decider.categories if one.value == verb), None)
+        category = next((category for category in decider.categories if category.value == verb), None)
         if category is None or not name:
             text = "a key here is read or write and a name, as read /ns/** or write default"
             self._error(entry.key, f"{quoted(entry.key.text)}: {text}")

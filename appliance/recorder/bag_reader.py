@@ -129,7 +129,7 @@ class BagReader:
             if len(found) == most and chunk.last < found[-1][0].time:
                 break
             if chunk.first <= place.time:
-                earlier = (one for one in self.places(chunk, connections) if one[0] < place)
+                earlier = (entry for entry in self.places(chunk, connections) if entry[0] < place)
                 found = heapq.nlargest(most, [*found, *earlier])
         return found[::-1]
 

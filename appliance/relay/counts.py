@@ -49,7 +49,7 @@ class Counts:
         begin anew.
         """
         happened = self.walker.happened()
-        counts = [Count(*each) for each in zip(happened, self._dropped, self._last_drop, strict=True)]
+        counts = [Count(*row) for row in zip(happened, self._dropped, self._last_drop, strict=True)]
         changed = {self.walker.writers(who): count for who, count in self.changed.items()}
         told = self._told
         self._clear()

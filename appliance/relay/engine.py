@@ -176,9 +176,9 @@ class Engine:
     def _withdrawn(self, message: messages.Message) -> None:
         if isinstance(message, messages.NodeWithdrawn):
             self.ports.close(message.key)
-            for key, topic in [one for one in self.topics if one[0] == message.key]:
+            for key, topic in [entry for entry in self.topics if entry[0] == message.key]:
                 self._remove_topic(key, topic, "the publisher's node is gone")
-            for visitor in [one for one in self.visitors if one.key == message.key]:
+            for visitor in [visitor for visitor in self.visitors if visitor.key == message.key]:
                 self._visitor_failed(visitor, "")
             self._cut_clients("the service's node is gone", message.key)
             self._forget_services(message.key)
@@ -204,8 +204,8 @@ class Engine:
                 client.cut(reason)
 
     def _forget_services(self, key: str, service: str | None = None) -> None:
-        for one in [one for one in self._services if one[0] == key and service in {None, one[1]}]:
-            row = self._services.pop(one).row(*one)
+        for entry in [entry for entry in self._services if entry[0] == key and service in {None, entry[1]}]:
+            row = self._services.pop(entry).row(*entry)
             if row is not None:
                 self._last_rows.append(row)
 
@@ -256,13 +256,17 @@ class Engine:
         placed = self.topics.get((grant.key, grant.topic))
         members = () if placed is None else placed[0].members
         who = grant.host, grant.caller_id
-        return [one for one in members if isinstance(one, Subscriber) and (one.host, one.caller_id) == who]
+        return [
+            subscriber
+            for subscriber in members
+            if isinstance(subscriber, Subscriber) and (subscriber.host, subscriber.caller_id) == who
+        ]
 
     def _make_room(self, host: str, size: int) -> None:
         """A host wants to have a message latched: those that have more than it would have make room."""
         latched, share = self.memory.latched, self.memory.latched.of(host)
         while share.refusal(size):
-            greatest, held = max(latched.holders(), key=lambda one: one[1], default=("", 0))
+            greatest, held = max(latched.holders(), key=lambda holder: holder[1], default=("", 0))
             of_greatest = (topic for topic, _publisher in self.topics.values() if topic.host == greatest)
             largest = max(of_greatest, key=lambda topic: topic.latched, default=None)
             if held <= share.used + size or largest is None or not largest.latched:
@@ -514,7 +518,9 @@ class Engine:
         """What went through since the last call."""
         rows = [row for topic, _publisher in self.topics.values() if (row := topic.traffic()) is not None]
         rows += [
-            row for (key, name), one in self._services.items() if (row := one.row(key, name)) is not None
+            row
+            for (key, name), service in self._services.items()
+            if (row := service.row(key, name)) is not None
         ]
         rows, self._last_rows = self._last_rows + rows, []
         return rows

@@ -37,7 +37,9 @@ def deciding(source: Source, why: Explanation) -> list[str]:
     if any(node.operator in mtl.FUTURE for node in nodes(formula)):
         return []
     words = _Words(syntax)
-    meaning = Meaning([source.events[one.event] for one in why.events], [one.time for one in why.events])
+    meaning = Meaning(
+        [source.events[event.event] for event in why.events], [event.time for event in why.events]
+    )
     last = len(why.events) - 1
     found = [
         f"{words.text(part)} is {str(value).lower()}" for part, value in _decisive(meaning, formula, last)
@@ -86,7 +88,9 @@ class Meaning:
         for place, event in enumerate(self._events[:at]):
             seen.append(place)
             if event == ptcaret.END:
-                open_calls = [number for number, one in enumerate(seen) if self._events[one] == ptcaret.BEGIN]
+                open_calls = [
+                    number for number, event in enumerate(seen) if self._events[event] == ptcaret.BEGIN
+                ]
                 seen = seen[: open_calls[-1]] if open_calls else []
         return [*seen, at]
 
@@ -95,7 +99,7 @@ class Meaning:
         if operator == "event":
             return self._events[at] == formula.name
         if operator in _BOOLEAN:
-            return _BOOLEAN[operator]([self.holds(one, at) for one in operands])
+            return _BOOLEAN[operator]([self.holds(operand, at) for operand in operands])
         if operator.partition(" ")[0] in ("at", "some", "every"):
             return self.holds(self._plain.setdefault(id(formula), ptcaret.plain(formula)), at)
         abstract, dual = operator.startswith("abstract "), operator.startswith("dual ")
@@ -132,7 +136,7 @@ class _Words:
     """Formulas as text, in the words of a logic."""
 
     def __init__(self, syntax: Syntax) -> None:
-        levels = [syntax.unary, *(one.operators for one in syntax.levels)]
+        levels = [syntax.unary, *(level.operators for level in syntax.levels)]
         self._spelled = {meant: word for words in levels for word, meant in reversed([*words.items()])}
 
     def text(self, formula: Formula) -> str:
@@ -140,7 +144,8 @@ class _Words:
         if not formula.operands:
             return formula.name or formula.operator
         parts = [
-            f"({self.text(one)})" if len(one.operands) > 1 else self.text(one) for one in formula.operands
+            f"({self.text(operand)})" if len(operand.operands) > 1 else self.text(operand)
+            for operand in formula.operands
         ]
         word = self._spelled[formula.operator] + _bounds(formula.bounds)
         return f"{word} {parts[0]}" if len(parts) == 1 else f" {word} ".join(parts)

@@ -147,7 +147,7 @@ class MonitorSet:
         nodes = {node.name: node for file in files for node in file.specifications}
         self._order = tuple(nodes)
         self._monitors = monitors_of(
-            compiled, [nodes[one.name] for one in compiled.specifications], 0, slices
+            compiled, [nodes[specification.name] for specification in compiled.specifications], 0, slices
         )
         self.steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
@@ -161,7 +161,11 @@ class MonitorSet:
         self._timed = False
         self._walks = Walks()
         self._broken = False
-        for comparison in (each for one in compiled.specifications for each in one.comparisons):
+        for comparison in (
+            comparison
+            for specification in compiled.specifications
+            for comparison in specification.comparisons
+        ):
             for left, right in (comparison.when_true, comparison.when_false):
                 compiled.namespace |= {left: math.inf, right: 0.0}
         self._index()
@@ -196,7 +200,7 @@ class MonitorSet:
         if findings:
             raise SpecificationError([*findings, *findings_of(files, definitions)])
         compiled = compile_files(files, definitions, margins=margins)
-        uses = {one.name: one.uses for one in compiled.specifications}
+        uses = {specification.name: specification.uses for specification in compiled.specifications}
         groups = [group for group in sharing(uses) if not group.isdisjoint(trials)]
         if not groups:
             return cls(compiled, files, on_fault, patience, slices=slices)
@@ -256,11 +260,21 @@ class MonitorSet:
     def publications(self) -> Mapping[str, str]:
         """The topics that specifications publish, or would if they were not on trial, and their message types."""
         sets = (self, *self.trials)
-        return MappingProxyType({each.topic: each.type for one in sets for each in one.compiled.publications})
+        return MappingProxyType(
+            {
+                publication.topic: publication.type
+                for part in sets
+                for publication in part.compiled.publications
+            }
+        )
 
     def published_by(self, file: str) -> frozenset[str]:
         """The topics that the specifications of a file publish."""
-        return frozenset(one.topic for one in self.compiled.publications if one.position.file == file)
+        return frozenset(
+            publication.topic
+            for publication in self.compiled.publications
+            if publication.position.file == file
+        )
 
     def md5sum(self, message_type: str) -> str:
         """The md5sum of a message type as the specifications understand it."""
@@ -342,12 +356,20 @@ class MonitorSet:
         """
         namespace = self.compiled.namespace
         for monitor in self.monitors:
-            for number, one in enumerate(monitor.code.comparisons):
-                for holds, sides in ((True, one.when_true), (False, one.when_false)):
+            for number, comparison in enumerate(monitor.code.comparisons):
+                for holds, sides in ((True, comparison.when_true), (False, comparison.when_false)):
                     left, right = (namespace[name] for name in sides)
                     if not math.isinf(left):
                         namespace[sides[0]] = math.inf
-                        yield Margin(monitor.name, number, one.position, one.threshold, holds, left, right)
+                        yield Margin(
+                            monitor.name,
+                            number,
+                            comparison.position,
+                            comparison.threshold,
+                            holds,
+                            left,
+                            right,
+                        )
 
     # What is done to them
 
@@ -401,9 +423,9 @@ class MonitorSet:
         `incomplete` have not seen all messages on trial: they begin anew when they are not on trial any more.
         """
         known = {
-            monitor.name: (monitor, one.compiled)
-            for one in (before, *before.trials)
-            for monitor in one.monitors
+            monitor.name: (monitor, part.compiled)
+            for part in (before, *before.trials)
+            for monitor in part.monitors
         }
         others = redefined(before.definitions, self.definitions)
         tried = [trial._follow(known, others, time_ns) for trial in self.trials]
@@ -411,7 +433,7 @@ class MonitorSet:
             monitor.held = False
         known = {name: found for name, found in known.items() if name not in incomplete}
         outcome = self._follow(known, others, time_ns)
-        was_tried, is_tried = ({monitor.name for monitor in one.tried} for one in (before, self))
+        was_tried, is_tried = ({monitor.name for monitor in part.tried} for part in (before, self))
         for monitor in (*self._monitors, *self.tried):
             if (monitor.name in was_tried) is not (monitor.name in is_tried):
                 monitor.faults = 0
@@ -635,10 +657,10 @@ class MonitorSet:
                 self._fault(error, step.monitor, step.event.position, outcome)
                 self._block(message, outcome)
                 return
-        for one in whole:
+        for slice_ in whole:
             outcome.events, outcome.verdicts, outcome.faults = before, (), ()
             self._explains = len(verdicts) < EXPLAINED
-            dropped = self._in_slice(step.monitor, one, outcome, message, act)
+            dropped = self._in_slice(step.monitor, slice_, outcome, message, act)
             if outcome.events is not before:
                 names, reached = outcome.events, reached + 1
             verdicts += outcome.verdicts  # many slices: a tuple would be copied with each
@@ -646,11 +668,11 @@ class MonitorSet:
             if dropped:
                 break
         self._explains = False  # of seeds nothing is told
-        for one in () if dropped else seeds:
+        for slice_ in () if dropped else seeds:
             unseen = Outcome(time=outcome.time)
             lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
             copied = None if message is None else Message(bytes(message.buffer), message.time)
-            self._in_slice(step.monitor, one, unseen, copied, act)
+            self._in_slice(step.monitor, slice_, unseen, copied, act)
             reached += bool(unseen.events)
             del turn.log[lines:], turn.published[published:]
             turn.looked = looked
@@ -666,7 +688,7 @@ class MonitorSet:
     def _in_slice(
         self,
         monitor: Monitor,
-        one: Slice,
+        slice_: Slice,
         outcome: Outcome,
         message: Message | None,
         act: Callable[[Outcome, Message | None], bool],
@@ -674,12 +696,12 @@ class MonitorSet:
         """Make the slice the state of the monitor and let the event happen; whether the message was dropped."""
         slices = monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
-        for running, run in zip(monitor.properties, slices.select(one), strict=True):
+        for running, run in zip(monitor.properties, slices.select(slice_), strict=True):
             running.run = run
-        before, monitor.slice = outcome.events, one
+        before, monitor.slice = outcome.events, slice_
         dropped = act(outcome, message)
         runs = tuple(running.run for running in monitor.properties)
-        slices.settle(one, runs, happened=outcome.events is not before)
+        slices.settle(slice_, runs, happened=outcome.events is not before)
         return dropped
 
     def _refuse_slice(
@@ -715,7 +737,7 @@ class MonitorSet:
             outcome.buffer = message.buffer
             sites = self.compiled.module.sites
             outcome.changed_by = tuple([step.name for step, _ in writers])
-            outcome.changed_at = tuple([sites[one].position for _, at in writers for one in at])
+            outcome.changed_at = tuple([sites[site].position for _, at in writers for site in at])
         if self._timed:
             self._schedule()
 
@@ -786,16 +808,16 @@ class MonitorSet:
 
     def _verdict(self, monitor: Monitor, running: RunningProperty, category: str) -> Verdict:
         source, index = running.code.property.source, running.index
-        slices, one = monitor.slices, monitor.slice
-        binding = {} if slices is None or one is None else slices.binding(one)
+        slices, slice_ = monitor.slices, monitor.slice
+        binding = {} if slices is None or slice_ is None else slices.binding(slice_)
         verdict = Verdict(monitor.name, index, source.logic, category, source, binding=binding)
         if self._asked is not None and not self._asked(verdict, self._sender.source):
             return verdict
-        if slices is None or one is None:
+        if slices is None or slice_ is None:
             return replace(verdict, why=running.history.explain(category))
         if not self._explains:
             return verdict
-        why = of_slice(running.code.property, monitor.trail, slices.values(one), category)
+        why = of_slice(running.code.property, monitor.trail, slices.values(slice_), category)
         return replace(verdict, why=why)
 
     def _handle(
@@ -1039,12 +1061,19 @@ class MonitorSet:
 def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
     """Specifications by those that share variables, however indirectly; `uses` says whose each one uses."""
     names = list(uses)
-    return [{names[number] for number in one} for one in connected([(name, *uses[name]) for name in names])]
+    return [
+        {names[number] for number in group} for group in connected([(name, *uses[name]) for name in names])
+    ]
 
 
 def _part(files: Sequence[tree.File], names: Collection[str]) -> list[tree.File]:
     """The files with these of their specifications only."""
     return [
-        replace(file, specifications=tuple(one for one in file.specifications if one.name in names))
+        replace(
+            file,
+            specifications=tuple(
+                specification for specification in file.specifications if specification.name in names
+            ),
+        )
         for file in files
     ]

@@ -30,7 +30,7 @@ def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
     """What led to the change of the message, and where the events are written that made it."""
     return {
         "changed_by": list(outcome.changed_by),
-        "at": [str(one) for one in outcome.changed_at],
+        "at": [str(position) for position in outcome.changed_at],
         **_led(outcome, who),
     }
 
@@ -84,7 +84,7 @@ def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
     why = verdict.why
     if why is None:
         return {}
-    events = [_event(verdict, one, who) for one in why.events]
+    events = [_event(verdict, event, who) for event in why.events]
     between = len(events) - 2 * _EACH_END
     said: dict[str, Any] = {"events": events}
     if between > 0:
@@ -103,8 +103,8 @@ def moment(time_ns: int) -> str:
     return datetime.datetime.fromtimestamp(time_ns / 1e9, datetime.UTC).isoformat(timespec="microseconds")
 
 
-def _event(verdict: Verdict, one: Happened, who: Who) -> dict[str, Any]:
-    event: dict[str, Any] = {"event": verdict.source.events[one.event], "time": moment(one.time)}
-    event |= {"state": one.state} if one.state else {}
-    event |= who(one.sender.source) if one.sender.source else {}
-    return event | ({"seq": one.sender.number} if one.sender.kind == SEQ else {})
+def _event(verdict: Verdict, happened: Happened, who: Who) -> dict[str, Any]:
+    event: dict[str, Any] = {"event": verdict.source.events[happened.event], "time": moment(happened.time)}
+    event |= {"state": happened.state} if happened.state else {}
+    event |= who(happened.sender.source) if happened.sender.source else {}
+    return event | ({"seq": happened.sender.number} if happened.sender.kind == SEQ else {})

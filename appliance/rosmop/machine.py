@@ -84,7 +84,7 @@ class Machine:
             raise _trapped(trap)
         name, length, export = ctypes.c_void_p(), ctypes.c_size_t(), _Export()
         for number in count():
-            out = (ctypes.byref(one) for one in (name, length, export))
+            out = (ctypes.byref(slot) for slot in (name, length, export))
             if not c.wasmtime_instance_export_nth(store.context, instance, number, *out):
                 break
             text = ctypes.string_at(name.value or 0, length.value).decode()
@@ -248,7 +248,7 @@ def _bound(store: _Store, export: _Export) -> Call | None:
     native = _Export.from_buffer_copy(export)
     function = ctypes.byref(native, _Export.of.offset)
     kind = c.wasmtime_func_type(store.context, function)
-    takes, gives = (_kinds(one(kind)) for one in (c.wasm_functype_params, c.wasm_functype_results))
+    takes, gives = (_kinds(types_of(kind)) for types_of in (c.wasm_functype_params, c.wasm_functype_results))
     c.wasm_functype_delete(kind)
     if len(gives) > 1 or None in (*takes, *gives):
         return None

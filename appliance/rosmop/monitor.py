@@ -131,12 +131,12 @@ def _monitor(
     properties = tuple(
         RunningProperty(
             index,
-            each,
-            tuple((category, names[each.handlers[category]]) for category in each.order),
-            each.property.start(time_ns),
-            history_of(each.property, time_ns),
+            declared,
+            tuple((category, names[declared.handlers[category]]) for category in declared.order),
+            declared.property.start(time_ns),
+            history_of(declared.property, time_ns),
         )
-        for index, each in enumerate(code.properties)
+        for index, declared in enumerate(code.properties)
     )
     monitor = Monitor(code, node, names[code.context], properties)
     if code.slicing is not None:

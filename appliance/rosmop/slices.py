@@ -78,7 +78,7 @@ class Slices:
 
     def __init__(self, code: SpecificationCode, namespace: dict[str, Any], limit: int) -> None:
         assert code.slicing is not None  # noqa: S101  who asks has looked
-        grows = any(not isinstance(one.property, FiniteProperty) for one in code.properties)
+        grows = any(not isinstance(declared.property, FiniteProperty) for declared in code.properties)
         self.limit = min(limit, GROWING_LIMIT) if grows else limit
         self.refused: Mapping[str, object] | None = None
         """What the last event bound of which there can be no slice."""
@@ -105,10 +105,10 @@ class Slices:
     def _look_at(self, properties: Sequence[PropertyCode]) -> None:
         """Find out in which states of automata a slice is over, as if there were none, or nothing but a state."""
         events = self._code.events
-        finite = [one for one in properties if isinstance(one.property, FiniteProperty)]
+        finite = [declared for declared in properties if isinstance(declared.property, FiniteProperty)]
         every = len(finite) == len(properties)
-        ends = every and bool(finite) and not any(one.acts for one in events if one.period_ns is None)
-        self._lost = [_lost(one) for one in finite] if ends else []
+        ends = every and bool(finite) and not any(event.acts for event in events if event.period_ns is None)
+        self._lost = [_lost(declared) for declared in finite] if ends else []
         self._idles = _idles(events, finite, self._all) if every and finite else None
         lost = self._lost or [frozenset()] * len(finite)
         idles = self._idles or [-1] * len(finite)
@@ -151,19 +151,19 @@ class Slices:
         """
         if key not in self._whole:
             return None
-        one, calm = self._whole[key], self._calm[event]
-        if one is None or calm is None:
-            return False if one is None else None
+        slice_, calm = self._whole[key], self._calm[event]
+        if slice_ is None or calm is None:
+            return False if slice_ is None else None
         if len(calm) == 1:  # as below, for most
-            run: Any = one.runs[0]
+            run: Any = slice_.runs[0]
             state = calm[0][run.state]
             if state < 0:
                 return None
             run.state = state
             return True
-        after = [*map(getitem, calm, _states(one.runs))]
+        after = [*map(getitem, calm, _states(slice_.runs))]
         if min(after, default=0) >= 0:
-            for run, state in zip(one.runs, after, strict=True):
+            for run, state in zip(slice_.runs, after, strict=True):
                 run.state = state
             return True
         return None
@@ -188,16 +188,16 @@ class Slices:
             return (), ()
         whole: list[Slice] = []
         seeds: list[Slice] = []
-        for one in (*self._agreeing(domain, key), *self._fresh(event, domain, key)):
-            (whole if one.domain == self._all else seeds).append(one)
+        for slice_ in (*self._agreeing(domain, key), *self._fresh(event, domain, key)):
+            (whole if slice_.domain == self._all else seeds).append(slice_)
         return whole, seeds
 
     def _agreeing(self, domain: int, key: Key) -> Iterator[Slice]:
         """The slices that bind what the event binds, with the same values."""
         for other, known in self._known.items():
             if other & domain == domain:
-                for one in self._with(other, domain, key):
-                    found = known.slices[one]
+                for known_key in self._with(other, domain, key):
+                    found = known.slices[known_key]
                     if found is not None:
                         yield found
 
@@ -217,14 +217,14 @@ class Slices:
             if other & domain == domain:
                 continue
             shared = domain & other
-            for one in self._with(other, shared, _key(own, shared)):
-                both = own | dict(zip(_members(other), one[1:], strict=True))
+            for known_key in self._with(other, shared, _key(own, shared)):
+                both = own | dict(zip(_members(other), known_key[1:], strict=True))
                 joined = (domain | other, _key(both, domain | other))
                 if joined not in wanted and joined[1] not in self._known[joined[0]].slices:
                     wanted.add(joined)
                     order.append(joined)
         found = (self._derived(into, values, len(order)) for into, values in order)
-        return [one for one in found if one is not None]
+        return [slice_ for slice_ in found if slice_ is not None]
 
     def _derived(self, domain: int, key: Key, most: int) -> Slice | None:
         """A slice with the state of the largest binding in this one that is known; None if that has ended."""
@@ -250,43 +250,43 @@ class Slices:
 
     # The state of the monitor
 
-    def select(self, one: Slice) -> tuple[Run, ...]:
+    def select(self, slice_: Slice) -> tuple[Run, ...]:
         """Give the variables the values that they have in this slice; its runs, for the properties."""
         namespace = self._namespace
-        if one.domain == self._all:
-            for (_, code, _), value in zip(self._parameters, one.key[1:], strict=True):
+        if slice_.domain == self._all:
+            for (_, code, _), value in zip(self._parameters, slice_.key[1:], strict=True):
                 namespace[code] = value
         else:
-            bound = dict(zip(_members(one.domain), one.key[1:], strict=True))
+            bound = dict(zip(_members(slice_.domain), slice_.key[1:], strict=True))
             for number, (_, code, _) in enumerate(self._parameters):
                 namespace[code] = bound.get(number, self._first.key[number + 1])
         if self._own:
-            namespace.update(zip(self._own, one.values, strict=True))
-        return one.runs
+            namespace.update(zip(self._own, slice_.values, strict=True))
+        return slice_.runs
 
-    def settle(self, one: Slice, runs: tuple[Run, ...], *, happened: bool) -> None:
+    def settle(self, slice_: Slice, runs: tuple[Run, ...], *, happened: bool) -> None:
         """Take the state back; one that has begun with this event stays only if it `happened`."""
         if self._own:
-            one.values = tuple(self._namespace[name] for name in self._own)
-        one.runs = runs
-        if not one.kept:
+            slice_.values = tuple(self._namespace[name] for name in self._own)
+        slice_.runs = runs
+        if not slice_.kept:
             if not happened:
                 return
-            self._keep(one)
+            self._keep(slice_)
         if self._lost and all(map(contains, self._lost, _states(runs))):
-            self._remember(one.domain, one.key)
+            self._remember(slice_.domain, slice_.key)
             self.live -= 1
-        elif self._idles is not None and one.values == self._first.values and self._idles == _states(runs):
-            self._forget(one.domain, one.key)
+        elif self._idles is not None and slice_.values == self._first.values and self._idles == _states(runs):
+            self._forget(slice_.domain, slice_.key)
             self.live -= 1
 
-    def values(self, one: Slice) -> Mapping[int, Any]:
+    def values(self, slice_: Slice) -> Mapping[int, Any]:
         """The values of the parameters, by their numbers."""
-        return dict(zip(_members(one.domain), one.key[1:], strict=True))
+        return dict(zip(_members(slice_.domain), slice_.key[1:], strict=True))
 
-    def binding(self, one: Slice) -> Mapping[str, object]:
+    def binding(self, slice_: Slice) -> Mapping[str, object]:
         """The values of the parameters, as they are told."""
-        return self._shown(one.domain, one.key)
+        return self._shown(slice_.domain, slice_.key)
 
     def _shown(self, domain: int, key: Key) -> Mapping[str, object]:
         told = {}
@@ -295,18 +295,18 @@ class Slices:
             told[name] = showing(kind)(value)
         return told
 
-    def _keep(self, one: Slice) -> None:
-        one.kept = True
+    def _keep(self, slice_: Slice) -> None:
+        slice_.kept = True
         self.live += 1
-        self._put(one.domain, one.key, one)
+        self._put(slice_.domain, slice_.key, slice_)
 
-    def _put(self, domain: int, key: Key, one: Slice | None) -> None:
+    def _put(self, domain: int, key: Key, slice_: Slice | None) -> None:
         known = self._known[domain]
         if key not in known.slices:
             values = dict(zip(_members(domain), key[1:], strict=True))
             for part, keys in known.parts.items():
                 keys.setdefault(_key(values, part), {})[key] = None
-        known.slices[key] = one
+        known.slices[key] = slice_
 
     def _remember(self, domain: int, key: Key) -> None:
         """No slice begins with this binding."""
@@ -385,9 +385,9 @@ def _idles(
 ) -> list[int] | None:
     """The states of the properties in which a slice is as if there were none; None if that cannot be."""
     automata = [
-        (one.property.automaton, {*one.order})
-        for one in properties
-        if isinstance(one.property, FiniteProperty)
+        (declared.property.automaton, {*declared.order})
+        for declared in properties
+        if isinstance(declared.property, FiniteProperty)
     ]
     initial = [automaton.initial for automaton, _ in automata]
     for number, event in enumerate(events):

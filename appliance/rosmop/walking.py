@@ -240,9 +240,9 @@ class Walker:
         """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none,
         `counted` for each verdict whether there may be more. Good until the engine is asked for anything.
         """
-        bits = sum(1 << number for number, one in enumerate(told) if one) - (LOUD if loud else 0)
+        bits = sum(1 << number for number, silent in enumerate(told) if silent) - (LOUD if loud else 0)
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
-        only = sum(1 << number for number, one in enumerate(counted) if one)
+        only = sum(1 << number for number, silent in enumerate(counted) if silent)
         return Prepared(source, bits, enabled, only, {} if changed is None else changed)
 
     def walk(  # noqa: PLR0917  called for every batch: keywords would cost a tenth of it

@@ -173,9 +173,9 @@ class Exits:
 
     def _named(self, way: Sequence[Happened]) -> tuple[Happened, ...]:
         automaton, state, found = self._automaton, self._automaton.initial, []
-        for one in way:
-            state = automaton.table[state][one.event]
-            found.append(one._replace(state=automaton.names[state]) if automaton.names else one)
+        for event in way:
+            state = automaton.table[state][event.event]
+            found.append(event._replace(state=automaton.names[state]) if automaton.names else event)
         return tuple(found)
 
 
@@ -184,11 +184,11 @@ def _shortest(automaton: Automaton, way: Sequence[Happened], category: str) -> S
     best: dict[int, tuple[int, ...]] = {automaton.initial: ()}
     fewest: tuple[int, ...] = ()
     mine: tuple[int, ...] = ()
-    for number, one in enumerate(way):
+    for number, event in enumerate(way):
         found = dict(best)
         mine = ()
         for state, before in best.items():
-            target, now = automaton.table[state][one.event], (*before, number)
+            target, now = automaton.table[state][event.event], (*before, number)
             if len(now) <= len(found.get(target, now)):
                 found[target] = now
             if category in automaton.verdicts[target]:
@@ -260,7 +260,7 @@ class Steps:
         if not steps:
             return None
         ended = steps[-1].time if steps[-1].event == _DEADLINE else None
-        events = [one for one in steps if one.event != _DEADLINE]
+        events = [step for step in steps if step.event != _DEADLINE]
         last = events[-1:] if ended is None else []
         tries: list[tuple[Run | None, list[Happened]]] = [(None, events)]
         if earlier is not None:
@@ -366,9 +366,9 @@ class _Trial:
         run = self._start()
         told: Categories = ()
         try:
-            for one in events:
-                self._expire(run, one.time)
-                told = run.step(one.event, one.time)
+            for event in events:
+                self._expire(run, event.time)
+                told = run.step(event.event, event.time)
         except RunFaultError:
             return False
         return self._category in (told if self._ended is None else self._expire(run, self._ended + 1))
@@ -413,13 +413,13 @@ def of_slice(
     None where it takes an event of which it is not known whether it happened in this slice.
     """
     found, own = Steps(compiled, 0), dict[Happened, bool]()
-    for one in trail:
-        if all(map(_same, map(values.get, one.binds), one.key[1:])) and (own or one.creates):
-            happened = Happened(one.event, one.time, one.sender)
-            own[happened] = one.everywhere
+    for bound in trail:
+        if all(map(_same, map(values.get, bound.binds), bound.key[1:])) and (own or bound.creates):
+            happened = Happened(bound.event, bound.time, bound.sender)
+            own[happened] = bound.everywhere
             found.add(happened)
     why = found.explain(category)
-    return why if why is not None and all(own[one] for one in why.events) else None
+    return why if why is not None and all(own[event] for event in why.events) else None
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -81,22 +81,22 @@ def weigh(value: Value, enough: int) -> int:
     total = 0
     waiting: list[Value] = [value]
     while waiting and total < enough:
-        one = waiting.pop()
-        kind = type(one)
+        value_ = waiting.pop()
+        kind = type(value_)
         if kind is int:
             total += _VALUE
         elif kind is str or kind is bytes:
-            total += _TEXT + len(one)  # type: ignore[arg-type]  # it is one of the two
+            total += _TEXT + len(value_)  # type: ignore[arg-type]  # it is one of the two
         elif kind is list:
             total += _ARRAY
-            waiting += one  # type: ignore[arg-type]  # it is one
-        elif isinstance(one, dict):
+            waiting += value_  # type: ignore[arg-type]  # it is one
+        elif isinstance(value_, dict):
             total += _STRUCT
-            for name in one:
+            for name in value_:
                 total += _MEMBER + len(name)
                 if total >= enough:
                     return total
-            waiting += one.values()
+            waiting += value_.values()
         else:
             total += _VALUE
     return total

@@ -138,7 +138,7 @@ class Visitors(Generic[Holder]):
         while True:
             await asyncio.sleep(1.0)
             now = time.monotonic()
-            for connection in [one for one in self._of if one.deadline < now]:
+            for connection in [connection for connection in self._of if connection.deadline < now]:
                 connection.expire()
 
     def _take(self, pool: Pool[Holder], host: Holder, amount: int) -> str:
@@ -177,4 +177,4 @@ class Visitors(Generic[Holder]):
             )
             and self._standing(self._of[connection][0]) <= mine
         ]
-        return max(able, key=lambda one: one.holding, default=None)
+        return max(able, key=lambda visitor: visitor.holding, default=None)

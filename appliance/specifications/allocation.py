@@ -115,7 +115,9 @@ class Allocation:
         homes: list[int] = []
         loads = [0] * self.relays
         for group in groups:
-            costs = [(*self._cost(group, one, carried), loads[one], one) for one in range(self.relays)]
+            costs = [
+                (*self._cost(group, relay, carried), loads[relay], relay) for relay in range(self.relays)
+            ]
             homes.append(min(costs)[-1])
             loads[homes[-1]] += group.specifications
         return homes
@@ -130,12 +132,14 @@ class Allocation:
 
         def cost(relay: int) -> tuple[int, int]:
             costs = [
-                self._cost(group, relay, carried) for group, one in zip(groups, moving, strict=True) if one
+                self._cost(group, relay, carried)
+                for group, moves in zip(groups, moving, strict=True)
+                if moves
             ]
             return sum(files for files, _ in costs), sum(resources for _, resources in costs)
 
         target = min(range(self.relays), key=cost)
-        return [target if one else home for one, home in zip(moving, homes, strict=True)]
+        return [target if moves else home for moves, home in zip(moving, homes, strict=True)]
 
     def _planned(self, groups: Sequence[Group], homes: Sequence[int], carried: set[Resource]) -> Plan:
         """The plan with these groups on these relays."""
@@ -173,7 +177,8 @@ class Allocation:
         """The monitors, and the carried topics and services, that would have to move there."""
         here = self._plan.files
         return sum(count for name, count in group.files.items() if here.get(name, relay) != relay), sum(
-            one in carried and self._of(self._plan.resources, one) != relay for one in group.resources
+            resource in carried and self._of(self._plan.resources, resource) != relay
+            for resource in group.resources
         )
 
     def _of(self, resources: Mapping[Resource, int], resource: Resource) -> int:
@@ -188,14 +193,15 @@ def groups_of(checked: Checked) -> list[Group]:
     """The groups, the largest first; in the order of their files' names where they are as large."""
     touched: dict[str, set[Resource]] = {file: set() for file in checked.monitors.values()}
     for name, file in checked.monitors.items():
-        touched[file] |= {(TOPIC, one) for one in checked.topics[name]}
-        touched[file] |= {(SERVICE, one) for one in checked.services[name]}
+        touched[file] |= {(TOPIC, topic) for topic in checked.topics[name]}
+        touched[file] |= {(SERVICE, service) for service in checked.services[name]}
     for file, topics in checked.published_by.items():
-        touched[file] |= {(TOPIC, one) for one in topics}
+        touched[file] |= {(TOPIC, topic) for topic in topics}
     counts = Counter(checked.monitors.values())
     groups = [
         Group(
-            {file: counts[file] for file in files}, frozenset(one for file in files for one in touched[file])
+            {file: counts[file] for file in files},
+            frozenset(resource for file in files for resource in touched[file]),
         )
         for files in _join(touched, checked)
     ]

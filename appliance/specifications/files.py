@@ -150,29 +150,31 @@ def check(sources: Sources, site_keys: Sequence[str]) -> Checked:
         definitions = _standard().extended(Definitions.from_files(sources.definitions))
         monitors = MonitorSet.load(sources.files, definitions)
     except SpecificationError as error:
-        raise SpecificationsRefusedError([str(one) for one in error.findings]) from error
+        raise SpecificationsRefusedError([str(finding) for finding in error.findings]) from error
     except DefinitionError as error:
         raise SpecificationsRefusedError([f"msg/{error}"]) from error
     certificates, wrong = certificates_of(monitors.monitors)
     if wrong:
         raise SpecificationsRefusedError([str(finding) for finding in wrong])
     return Checked(
-        {one.name: one.code.file for one in monitors.monitors},
+        {monitor.name: monitor.code.file for monitor in monitors.monitors},
         {
-            one.name: frozenset(e.topic for e in one.code.events if e.topic is not None and e.part is None)
-            for one in monitors.monitors
+            monitor.name: frozenset(
+                e.topic for e in monitor.code.events if e.topic is not None and e.part is None
+            )
+            for monitor in monitors.monitors
         },
         {
-            one.name: frozenset(
-                e.topic for e in one.code.events if e.topic is not None and e.part is not None
+            monitor.name: frozenset(
+                e.topic for e in monitor.code.events if e.topic is not None and e.part is not None
             )
-            for one in monitors.monitors
+            for monitor in monitors.monitors
         },
         dict(monitors.publications),
-        tuple(str(one) for one in monitors.warnings),
+        tuple(str(warning) for warning in monitors.warnings),
         dict(monitors.topics) | dict(monitors.publications),
         definitions,
-        {one.name: one.code.uses for one in monitors.monitors},
+        {monitor.name: monitor.code.uses for monitor in monitors.monitors},
         {name: monitors.published_by(name) for name in sources.files},
         sources.signers(site_keys),
         certificates,

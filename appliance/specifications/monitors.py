@@ -300,7 +300,9 @@ class Monitors:
                 raise UnknownMonitorError(self._unknown(unknown))
             files = {owners.get(name, name) for name in names}
             left = sorted(
-                one for one, file in owners.items() if file in files and not {one, file} & set(names)
+                monitor
+                for monitor, file in owners.items()
+                if file in files and not {monitor, file} & set(names)
             )
             if left:
                 text = f"{', '.join(left)} would go, too: they are in the same file; name the file, or load it without"
@@ -491,7 +493,9 @@ class Monitors:
         return ""
 
     def _named(self) -> set[str]:
-        return set() if self._enable in {"all", "none"} else {one.strip() for one in self._enable.split(",")}
+        return (
+            set() if self._enable in {"all", "none"} else {name.strip() for name in self._enable.split(",")}
+        )
 
     def _unknown(self, names: list[str]) -> str:
         known = ", ".join(self.checked.monitors) or "none is loaded"
@@ -525,7 +529,7 @@ class Monitors:
         """`switches` are for monitors that are not in force yet."""
         before, previous, switched = self.revision, self.sources, self._switches
         self._switches = {
-            **{one: to for one, to in switches.items() if one not in self.checked.monitors},
+            **{monitor: to for monitor, to in switches.items() if monitor not in self.checked.monitors},
             **switched,
         }
         try:

@@ -97,4 +97,4 @@ class MonitorRecords:
 def _monitors(event: MonitorEvent) -> set[str]:
     """The monitors that did it."""
     together = event.detail.get("changed_by", ())
-    return {event.monitor, *(str(one).partition(".")[0] for one in together)}
+    return {event.monitor, *(str(other).partition(".")[0] for other in together)}

@@ -282,7 +282,7 @@ class Stating:
 
     def lost(self, relay: int) -> None:
         """A relay is gone: what it has not answered is refused, since it may have died of it."""
-        for at, statement in [one for one in self._waiting if one[0] == relay]:
+        for at, statement in [entry for entry in self._waiting if entry[0] == relay]:
             self._answer(at, statement, ["a relay process ended while it took them: try again"])
 
     def _taken(self, relay: int, statement: int, began: list[str], held: list[str]) -> None:
@@ -316,8 +316,8 @@ class Stating:
         self._answer(relay, statement, findings or ["the relay gives no reason"])
 
     def _stop_waiting(self, relay: int) -> None:
-        for one in [one for one in self._waiting if one[0] == relay]:
-            del self._waiting[one]
+        for entry in [entry for entry in self._waiting if entry[0] == relay]:
+            del self._waiting[entry]
 
     def _answer(self, relay: int, statement: int, findings: list[str]) -> None:
         waiting = self._waiting.pop((relay, statement), None)

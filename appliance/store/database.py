@@ -107,7 +107,7 @@ class Database:
                 self._keep(gathered.statements)
 
     def _keep(self, statements: list[_Queued]) -> None:
-        ahead = [(one.sql, one.parameters) for one in statements if one.ahead]
+        ahead = [(statement.sql, statement.parameters) for statement in statements if statement.ahead]
         if ahead:
             try:
                 self._ahead.append(ahead)

@@ -25,7 +25,7 @@ async def end_all(posts: Sequence[Post], someone_died: asyncio.Event) -> None:
     for post in posts:
         if post.due is not None:
             post.due.cancel()
-    await _end([one for one in posts if not one.role.outlives_control], _STOP_SECONDS, someone_died)
+    await _end([post for post in posts if not post.role.outlives_control], _STOP_SECONDS, someone_died)
     await _end(posts, _LAST_SECONDS, someone_died)
 
 

@@ -38,10 +38,10 @@ def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
     stop = within.stop
     while stop - count >= within.start:
         wanted = range(stop - count, stop)
-        in_the_way = [one for one in taken if one.start < wanted.stop and wanted.start < one.stop]
+        in_the_way = [span for span in taken if span.start < wanted.stop and wanted.start < span.stop]
         if not in_the_way:
             return wanted
-        stop = min(one.start for one in in_the_way)
+        stop = min(span.start for span in in_the_way)
     raise StartError(
         f"no {count} neighbouring ports between {within.start} and {within.stop - 1} are left for the appliance's own "
         "node: make [Ports] range in the policy smaller"

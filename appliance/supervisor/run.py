@@ -85,7 +85,7 @@ def _run(
             rosmaster=settings.rosmaster_port,
             nodes=node_ports,
             api=settings.api_address[1] if settings.api_address else None,
-            api_networks=tuple(str(one) for one in settings.api_networks),
+            api_networks=tuple(str(network) for network in settings.api_networks),
             syslog=settings.audit.syslog.destination if settings.audit.syslog.to is not None else None,
             own_node=_ports_of_rosout(settings, node_ports),
         )
@@ -109,7 +109,7 @@ def _ports_of_rosout(settings: Settings, node_ports: range) -> range:
     taken += [settings.api_address[1]] if settings.api_address else []
     return spare_ports(
         _LIVES_A_MINUTE,
-        [node_ports, range(chosen.first, chosen.last + 1), *(range(one, one + 1) for one in taken)],
+        [node_ports, range(chosen.first, chosen.last + 1), *(range(port, port + 1) for port in taken)],
         _UNPRIVILEGED,
     )
 

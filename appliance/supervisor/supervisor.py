@@ -288,7 +288,7 @@ class Supervisor:
 
     def _cannot_serve(self, life: Life, reason: str) -> None:
         """Before nodes may connect, it is for the person who starts the appliance; later the next life may succeed."""
-        post = next(one for one in self.posts if one.life is life)
+        post = next(post for post in self.posts if post.life is life)
         if self.is_ready or post.role.dispensable:
             log.error("process cannot serve", role=life.role, reason=reason)
             life.kill()
@@ -462,7 +462,7 @@ class Supervisor:
         return await health.answers(self._facts.rosmaster_port, account_of("rosrv"), inside, seconds)
 
     def _died(self, life: Life, code: int) -> None:
-        post = next(one for one in self.posts if one.life is life)
+        post = next(post for post in self.posts if post.life is life)
         lived = post.bury(life)
         self._someone_died.set()
         if self.stopping.is_set():

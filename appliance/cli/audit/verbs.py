@@ -186,9 +186,9 @@ def checkpoints(
         pause = threading.Event()
         while True:
             found = source.checkpoints(after)
-            for one in found:
-                write(one.as_json())
-                after = one.number
+            for checkpoint in found:
+                write(checkpoint.as_json())
+                after = checkpoint.number
             sys.stdout.flush()
             if not found:
                 if not follow:

@@ -64,7 +64,7 @@ def learn_monitors(
     else:
         conditions, names = counted(len(learnt.candidates), "condition"), set(learnt.names.values())
         say(f"{conditions} in {counted(len(names), 'specification')}: {out}")
-        widened = sum(1 for each in learnt.candidates if each.widened)
+        widened = sum(1 for candidate in learnt.candidates if candidate.widened)
         if learnt.held_out:
             say(f"alarms on what was held out: {widened} widened, {len(learnt.left_out)} left out")
 
@@ -80,11 +80,12 @@ def _check_same(recording: Recorded, others: Definitions) -> None:
 
 def _say_rows(learnt: Learnt) -> None:
     for result, rows in (("kept", learnt.candidates), ("left out", learnt.left_out)):
-        for each in rows:
+        for candidate in rows:
             say_json({
-                "specification": learnt.names.get(each.key, ""), "topic": each.topic, "kind": each.kind,
-                "field": each.place, "says": each.says, "seen": each.seen, "support": asdict(each.support),
-                "held_out_alarms": each.alarms, "result": "widened" if each.widened else result,
+                "specification": learnt.names.get(candidate.key, ""), "topic": candidate.topic, "kind": candidate.kind,
+                "field": candidate.place, "says": candidate.says, "seen": candidate.seen,
+                "support": asdict(candidate.support), "held_out_alarms": candidate.alarms,
+                "result": "widened" if candidate.widened else result,
             })  # fmt: skip
 
 
@@ -108,7 +109,7 @@ def _write(out: Path, learnt: Learnt, recorded: Definitions) -> None:
 def _needed(learnt: Learnt, recorded: Definitions) -> list[str]:
     """The types of the specifications, and those that they are made of, that `check` would not know."""
     own = standard_definitions()
-    waiting = [learnt.types[topic] for each in learnt.candidates for topic in each.topics]
+    waiting = [learnt.types[topic] for candidate in learnt.candidates for topic in candidate.topics]
     found: set[str] = set()
     while waiting:
         name = waiting.pop()

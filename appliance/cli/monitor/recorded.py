@@ -95,7 +95,7 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
     pieces: list[Piece] = []
     with tempfile.TemporaryDirectory(prefix="rosrv-replay-") as folder, ExitStack() as opened:
         bags: dict[str, Path] = {}
-        for part, row in sorted(found, key=lambda one: one[0]):
+        for part, row in sorted(found, key=lambda entry: entry[0]):
             if row.id not in bags:
                 bag = bag_of(appliance, row.id, Path(folder) / row.id)
                 try:

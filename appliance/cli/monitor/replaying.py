@@ -155,7 +155,7 @@ def _topics(texts: Mapping[str, str], chosen: str | None, patterns: Sequence[str
 def _only(chosen: str | None, monitors: MonitorSet) -> MonitorSet:
     """A set in which only this one, with those that it shares variables with, is enabled (None: all are)."""
     if chosen is not None:
-        uses = {one.name: one.code.uses for one in monitors.monitors}
+        uses = {monitor.name: monitor.code.uses for monitor in monitors.monitors}
         together = next(group for group in sharing(uses) if chosen in group)
         monitors.switch({name: name in together for name in uses}, 0)
     return monitors

@@ -65,11 +65,13 @@ def check(
         for monitor in monitors.monitors if monitors is not None else ():
             for line in explained(monitor):
                 say(f"{monitor.name}: {line}")
-            for line, each in zip(certificates[monitor.name], monitor.properties, strict=True):
+            for line, running in zip(certificates[monitor.name], monitor.properties, strict=True):
                 say(f"{monitor.name}: {line}")
-                say(f"{monitor.name}: {each.code.property.logic}: {each.code.enforcement}")
+                say(f"{monitor.name}: {running.code.property.logic}: {running.code.enforcement}")
     if monitors is not None:
-        properties = [each.code.property for monitor in monitors.monitors for each in monitor.properties]
+        properties = [
+            running.code.property for monitor in monitors.monitors for running in monitor.properties
+        ]
         _draw(properties, dot, svg)
         if prove:
             from appliance.cli.monitor.proving import say_proofs  # noqa: PLC0415  its package may be missing

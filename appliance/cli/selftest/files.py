@@ -108,7 +108,7 @@ def _hosts(file: Path) -> Iterator[Found]:
 
 def _state(state: Path) -> Iterator[Found]:
     if not state.exists():
-        parent = next(one for one in state.absolute().parents if one.exists())
+        parent = next(folder for folder in state.absolute().parents if folder.exists())
         if os.access(parent, os.W_OK):
             yield ok("state", f"{state} will be made")
         else:

@@ -105,13 +105,13 @@ def _check_members(value: Value, place: str) -> None:
 def _names(value: Value, caller_id: str) -> list[str]:
     if not isinstance(value, list):
         raise ProtocolError(f"must be a list of names, not {_type_name(value)}")
-    return [_text(one, caller_id) for one in value]
+    return [_text(item, caller_id) for item in value]
 
 
 def _protocols(value: Value, _caller_id: str) -> list[list[Value]]:
     if not isinstance(value, list) or not value:
         raise ProtocolError("must be specified and a list that is not empty")
-    protocols = [one for one in value if isinstance(one, list)]
+    protocols = [protocol for protocol in value if isinstance(protocol, list)]
     if len(protocols) != len(value):
         raise ProtocolError("must be a list of protocols, each a list of its name and its parameters")
     return protocols

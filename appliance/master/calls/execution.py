@@ -131,16 +131,19 @@ class Execution:
         """
         if sum(map(self._parameters.weight_of_answer, run)) >= self._large:
             await visit.bulk.take()
-        looks = [self._settled(one) for one in run]
+        looks = [self._settled(attempt) for attempt in run]
         writing = [
-            one for one, look in zip(run, looks, strict=True) if look.allowed and one.call.verb is Verb.WRITE
+            attempt
+            for attempt, look in zip(run, looks, strict=True)
+            if look.allowed and attempt.call.verb is Verb.WRITE
         ]
         if not writing:
             return await self._carry_out_run(visit, run, looks)
         async with self._turn(writing) as later:
             if later:
                 looks = [
-                    self._settled(one) if look.allowed else look for one, look in zip(run, looks, strict=True)
+                    self._settled(attempt) if look.allowed else look
+                    for attempt, look in zip(run, looks, strict=True)
                 ]
             return await self._carry_out_run(visit, run, looks)
 
@@ -174,7 +177,7 @@ class Execution:
         self, visit: Visit, run: Sequence[Attempt], decisions: Sequence[Decision]
     ) -> list[Value]:
         answers: list[Value] = [
-            self._recorded(one, decision) for one, decision in zip(run, decisions, strict=True)
+            self._recorded(attempt, decision) for attempt, decision in zip(run, decisions, strict=True)
         ]
         obstacle = await self._obstacle() if self._trail.strict else None
         writes: list[int] = []

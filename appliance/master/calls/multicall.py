@@ -84,7 +84,7 @@ class Multicall:
                 weight += self._parameters.weight_of_answer(attempt)
             left.popleft()
             answers.append(None if isinstance(attempt, Attempt) else attempt)
-        done = await self._execution.answer_run(visit, [one for _place, one in run])
+        done = await self._execution.answer_run(visit, [attempt for _place, attempt in run])
         for (place, _one), answer in zip(run, done, strict=True):
             answers[place] = [answer]
         return answers

@@ -106,13 +106,13 @@ class RegistrationCalls:
         port = service_api.uri.port
         provider = next(
             (
-                one
-                for one in self.registry.registered(Kind.SERVICE, service)
-                if one.name == caller.caller_id
+                holder
+                for holder in self.registry.registered(Kind.SERVICE, service)
+                if holder.name == caller.caller_id
                 # By its own port, or as `rosnode cleanup` does, by the one that lookupService told.
                 and (
-                    one.registrations[Kind.SERVICE, service].detail == str(port)
-                    or self.relay.port(one, Kind.SERVICE, service) == port
+                    holder.registrations[Kind.SERVICE, service].detail == str(port)
+                    or self.relay.port(holder, Kind.SERVICE, service) == port
                 )
             ),
             None,

@@ -171,8 +171,8 @@ class Repetitions:
         if call.method == MULTICALL:
             calls = call.params[0] if call.params and isinstance(call.params[0], list) else []
         parts: list[_Part] = []
-        for one in calls:
-            match one:
+        for entry in calls:
+            match entry:
                 case {"methodName": str(method), "params": list(params)} if (
                     method in table and table[method].call.mirrored
                 ):

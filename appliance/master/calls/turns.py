@@ -85,7 +85,7 @@ def _ended(keys: Collection[str]) -> tuple[str, ...]:
 
 
 def _meet(mine: tuple[str, ...], others: tuple[str, ...]) -> bool:
-    return any(one.startswith(others) for one in mine) or any(other.startswith(mine) for other in others)
+    return any(key.startswith(others) for key in mine) or any(other.startswith(mine) for other in others)
 
 
 class Claims:
@@ -135,7 +135,7 @@ class Claim:
     def _end(self) -> None:
         """The next one is let in; one that was cancelled and has not run since is no more there."""
         waiting = self._waiting[self._name]
-        turn = next((one for one in waiting if not one.done()), None)
+        turn = next((future for future in waiting if not future.done()), None)
         if turn is None:
             del self._waiting[self._name]
         else:

@@ -33,7 +33,9 @@ class NodeCall:
         """About how many bytes it takes while it waits."""
         if self.size:
             return self.size
-        texts = [one for given in self.parameters for one in (given if isinstance(given, list) else [given])]
+        texts = [
+            text for given in self.parameters for text in (given if isinstance(given, list) else [given])
+        ]
         return _CALL_BYTES + sum(_TEXT_BYTES + len(text) for text in texts if isinstance(text, str))
 
 

@@ -114,7 +114,7 @@ class Graph:
         return effects + self.remind(incarnation, resource) if kind is Kind.SUBSCRIPTION else effects
 
     def _others_offer(self, incarnation: Incarnation, service: str) -> bool:
-        return any(one is not incarnation for one in self._registry.registered(Kind.SERVICE, service))
+        return any(holder is not incarnation for holder in self._registry.registered(Kind.SERVICE, service))
 
     def _take_name(self, incarnation: Incarnation) -> Effects:
         """From whoever has it: also from one that has nothing left, and is not to get anything back any more."""
@@ -317,7 +317,7 @@ class Graph:
         """Have a subscriber drop these publishers and take them again: roscpp takes a list it knows for no news."""
         if not absent:
             return self.remind(subscriber, topic)
-        gone = {one.outer_uri(subscriber.told) for one in absent}
+        gone = {publisher.outer_uri(subscriber.told) for publisher in absent}
         without = [uri for uri in self._publishers_for(subscriber, topic) if uri not in gone]
         return [_list(subscriber, topic, without), *self.remind(subscriber, topic)]
 
@@ -333,11 +333,11 @@ class Graph:
         for subscriber in subscribers:
             for topic in subscriber.resources(Kind.SUBSCRIPTION):
                 publishers = [
-                    one
-                    for one in self._registry.registered(Kind.PUBLICATION, topic)
-                    if one is not subscriber
-                    and (one.own or subscriber.own or self._mediation.carries_topic(topic))
-                    and PermissionRow(one.key, TOPIC, topic, str(subscriber.host), subscriber.name)
+                    publisher
+                    for publisher in self._registry.registered(Kind.PUBLICATION, topic)
+                    if publisher is not subscriber
+                    and (publisher.own or subscriber.own or self._mediation.carries_topic(topic))
+                    and PermissionRow(publisher.key, TOPIC, topic, str(subscriber.host), subscriber.name)
                     not in used
                 ]
                 if publishers:

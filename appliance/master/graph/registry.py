@@ -133,7 +133,7 @@ class Incarnation:
 
     def in_order(self) -> list[Registration]:
         """What it registered, in the order in which it did."""
-        return sorted(self.registrations.values(), key=lambda one: one.order)
+        return sorted(self.registrations.values(), key=lambda registration: registration.order)
 
     def resources(self, kind: Kind) -> list[str]:
         """What it registered of that kind, in order."""
@@ -249,7 +249,7 @@ class Registry:
         keys, above = self._subscribed_keys, key.rstrip("/")
         # Those that begin with `above/` stand together, before `above0`: '0' follows '/'.
         return [
-            one for one in keys[bisect_left(keys, f"{above}/") : bisect_left(keys, f"{above}0")] if one != "/"
+            key for key in keys[bisect_left(keys, f"{above}/") : bisect_left(keys, f"{above}0")] if key != "/"
         ]
 
     def nodes_of(self, host: Address) -> int:
@@ -258,14 +258,16 @@ class Registry:
 
     def spare_of(self, host: Address) -> Incarnation | None:
         """The incarnation of a host that makes room first: one that has nothing, else the one that was lost first."""
-        mine = [one for one in self._by_key.values() if one.host == host]
-        idle = next((one for one in mine if one.spare), None)
-        gone = (one for one in mine if one.life is not Life.LIVE)
-        return idle or min(gone, key=lambda one: one.changed, default=None)
+        mine = [incarnation for incarnation in self._by_key.values() if incarnation.host == host]
+        idle = next((incarnation for incarnation in mine if incarnation.spare), None)
+        gone = (incarnation for incarnation in mine if incarnation.life is not Life.LIVE)
+        return idle or min(gone, key=lambda incarnation: incarnation.changed, default=None)
 
     def spare(self, host: Address) -> Incarnation | None:
         """The incarnation that makes room for one of this host: of it, or of another host one that has nothing."""
-        return self.spare_of(host) or next((one for one in self._by_key.values() if one.spare), None)
+        return self.spare_of(host) or next(
+            (incarnation for incarnation in self._by_key.values() if incarnation.spare), None
+        )
 
     @property
     def registrations(self) -> int:
@@ -282,7 +284,11 @@ class Registry:
 
     def in_order(self) -> Iterator[tuple[Incarnation, Registration]]:
         """Every registration of live incarnations, in the order they were made."""
-        pairs = [(one, each) for one in self._live.values() for each in one.registrations.values()]
+        pairs = [
+            (incarnation, registration)
+            for incarnation in self._live.values()
+            for registration in incarnation.registrations.values()
+        ]
         return iter(sorted(pairs, key=lambda pair: pair[1].order))
 
     def uris_for(self, reader: Incarnation, kind: Kind, topic: str, *, hidden: bool) -> tuple[str, ...]:
@@ -292,8 +298,10 @@ class Registry:
         appliance's own nodes reach others through the appliance only.
         """
         return tuple(
-            one.api_text if one is reader else one.uri_for(reader.told, hidden=hidden or reader.own)
-            for one in self.registered(kind, topic)
+            incarnation.api_text
+            if incarnation is reader
+            else incarnation.uri_for(reader.told, hidden=hidden or reader.own)
+            for incarnation in self.registered(kind, topic)
         )
 
     # --- changing ---

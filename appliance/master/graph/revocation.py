@@ -110,20 +110,20 @@ class Revocation:
             return []
         effects: Effects = []
         back: list[Registration] = []
-        for one in sorted(incarnation.shelf.values(), key=lambda one: one.order):
-            if self.may_have(incarnation, one.kind, one.resource):
-                effects += self._graph.granted_again(incarnation, one)
-                if (one.kind, one.resource) in incarnation.registrations:
-                    back.append(one)
+        for registration in sorted(incarnation.shelf.values(), key=lambda registration: registration.order):
+            if self.may_have(incarnation, registration.kind, registration.resource):
+                effects += self._graph.granted_again(incarnation, registration)
+                if (registration.kind, registration.resource) in incarnation.registrations:
+                    back.append(registration)
         return [*effects, PutBack(incarnation, tuple(back))] if back else effects
 
     def _registrations(self) -> list[tuple[Incarnation, Registration]]:
         """Every registration that counts now or will when its node is back, in the order they were made."""
         pairs = [
-            (incarnation, each)
+            (incarnation, registration)
             for incarnation in self._registry.all()
             if incarnation.life is not Life.REPLACED
-            for each in incarnation.registrations.values()
+            for registration in incarnation.registrations.values()
         ]
         return sorted(pairs, key=lambda pair: pair[1].order)
 

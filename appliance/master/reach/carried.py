@@ -105,8 +105,8 @@ class Carried:
     def total(self) -> Traffic:
         """What went through everything, forgotten incarnations included."""
         total = Traffic()
-        for one in (*self.past.values(), *self.traffic.values()):
-            total.include(one)
+        for traffic in (*self.past.values(), *self.traffic.values()):
+            total.include(traffic)
         return total
 
     def flow(self, key: str, resource: str) -> Flow:
@@ -130,9 +130,9 @@ class Carried:
 
     def forgotten(self, key: str) -> None:
         """An incarnation is gone for good."""
-        for one in [one for one in self.traffic if one[0] == key]:
-            name = one[1] if one[1] in self.past or len(self.past) < MOST_RESOURCES else OTHERS
-            self.past.setdefault(name, Traffic()).include(self.traffic.pop(one))
+        for carried in [carried for carried in self.traffic if carried[0] == key]:
+            name = carried[1] if carried[1] in self.past or len(self.past) < MOST_RESOURCES else OTHERS
+            self.past.setdefault(name, Traffic()).include(self.traffic.pop(carried))
 
     def reported(self, rows: list[TopicTraffic], over: float = 1.0) -> None:
         """A relay's counters; the last words about a node that is forgotten count for nothing."""

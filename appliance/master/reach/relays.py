@@ -205,7 +205,7 @@ class RelayControl:
 
     async def carried_out(self) -> None:
         """Wait until every relay has carried out what it was told; one that ends or comes meanwhile begins with it."""
-        if waiting := [one for post in self._posts for one in post.orders()]:
+        if waiting := [order for post in self._posts for order in post.orders()]:
             await asyncio.wait(waiting)
 
     async def look(

@@ -148,7 +148,7 @@ class Reconciler:
             for key, pair in wanted.items()
             if key not in seen or uris.get(pair[0].name) != self._faces.inner_uri(pair[0])
         )
-        extra = sorted(one for one in seen if one not in wanted)
+        extra = sorted(entry for entry in seen if entry not in wanted)
         if extra:
             rows = (await self._rosmaster.call_now("getTopicTypes", NAME))[2]
             types = dict(cast(list[tuple[str, str]], rows))

@@ -133,8 +133,8 @@ def statuses(
     for rule in rules:
         chain, purpose = rule.chain.value, rule.purpose
         seen = of_rule.get((chain, purpose), ())
-        packets, octets = sum(one.packets for one in seen), sum(one.octets for one in seen)
-        present = sum(2 if one.family is None else 1 for one in seen)
+        packets, octets = sum(counter.packets for counter in seen), sum(counter.octets for counter in seen)
+        present = sum(2 if counter.family is None else 1 for counter in seen)
         in_force = present >= len({*rule.families()} & {*families})
         found.append(FirewallRule(chain, purpose, rule.describe(), packets, octets, in_force))
     return tuple(found)

@@ -137,9 +137,9 @@ def render_rule(rule: Rule) -> list[Json]:
     if rule.above is None:
         return bodies
     return [
-        one
+        rendered
         for body, family in zip(bodies, rule.families(), strict=True)
-        for one in (body, _shared(rule, body, family))
+        for rendered in (body, _shared(rule, body, family))
     ]
 
 
@@ -237,11 +237,11 @@ def _shared(rule: Rule, own: Json, family: Family) -> Json:
     assert rule.above is not None  # noqa: S101 - the caller asked
     address = _payload("ip6" if family == 6 else "ip", "saddr")
     expressions: list[Json] = []
-    for one in own["expr"]:
-        if "set" in one:
+    for expression in own["expr"]:
+        if "set" in expression:
             expressions += [_match(address, f"@{_meter(rule, family)}", "!="), _limit(rule.above)]
         else:
-            expressions.append(one)
+            expressions.append(expression)
     return own | {"expr": expressions, "comment": own["comment"] + _SHARED}
 
 
@@ -328,7 +328,7 @@ def _translates_source(rule: Json) -> bool:
 
 def _counters(rules: list[Json]) -> tuple[RuleCounter, ...]:
     """The rules as they are counted: the two of a limit for each host as one, which neither is without the other."""
-    shared = {_key(one): one for one in map(_counter, rules) if one.purpose.endswith(_SHARED)}
+    shared = {_key(counter): counter for counter in map(_counter, rules) if counter.purpose.endswith(_SHARED)}
     found = []
     for rule in rules:
         counter = _counter(rule)

@@ -152,7 +152,7 @@ class ServiceClient:
         held = (
             self._exchange.unfinished + self._client.backlog + (self._server.backlog if self._server else 0)
         )
-        patience = SMALL if any(one.share.exhausted for one in self._weights) else _PATIENT
+        patience = SMALL if any(weight.share.exhausted for weight in self._weights) else _PATIENT
         if self._stall.seen(held if held > patience else 0, self._context.loop.clock()):
             seconds = self._context.limits.stall_seconds
             self.cut(f"{held} bytes of a message wait, and nothing of it has come or gone for {seconds:g} s")

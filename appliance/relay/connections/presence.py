@@ -39,7 +39,7 @@ class Presences:
     def want(self, names: frozenset[str], address: tuple[str, int]) -> None:
         """These subscribers are served now, of the publisher at this address."""
         self._wanted, self._address = names, address
-        for name in [one for one in self._streams if one not in names]:
+        for name in [stream for stream in self._streams if stream not in names]:
             self._streams.pop(name).close()
         self._open_missing()
 

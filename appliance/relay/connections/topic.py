@@ -176,8 +176,8 @@ class RelayedTopic:
 
     def leave(self, member: Member) -> None:
         """A subscriber's connection is closed."""
-        self._waiting = tuple(one for one in self._waiting if one is not member)
-        self._served = tuple(one for one in self._served if one is not member)
+        self._waiting = tuple(other for other in self._waiting if other is not member)
+        self._served = tuple(other for other in self._served if other is not member)
         self._announce()
         self._reported = False
         self._forget_header()

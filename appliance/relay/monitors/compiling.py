@@ -104,16 +104,16 @@ class Compiler:
                 margins=True,
                 slices=message.slices,
             )
-            for one in (monitors, *monitors.trials):
+            for part in (monitors, *monitors.trials):
                 _, wrong = certificates_of(
-                    one.monitors
+                    part.monitors
                 )  # control has checked its own: these are what will judge
                 if wrong:
                     return [str(finding) for finding in wrong]
             monitors.write_module()
             return monitors
         except SpecificationError as error:
-            return [str(one) for one in error.findings]
+            return [str(finding) for finding in error.findings]
         except DefinitionError as error:
             return [str(error)]
         except Exception as error:  # noqa: BLE001  a defect of the compiler is a reason to refuse, no more

@@ -188,8 +188,10 @@ class Lane:
         if prepared is None or self._sight is not self._middle.sight or self._walker is not walker:
             prepared = self._prepared = walker.prepare(
                 loud=walker.changes and telling.shows(place),
-                told=[not telling.hides_drop(one, place) for one in walker.monitors] if walker.drops else (),
-                counted=[telling.hides_verdict(one, place) for one in walker.verdicts],
+                told=[not telling.hides_drop(monitor, place) for monitor in walker.monitors]
+                if walker.drops
+                else (),
+                counted=[telling.hides_verdict(verdict, place) for verdict in walker.verdicts],
                 source=self._source,
                 changed=counts.changed,
             )

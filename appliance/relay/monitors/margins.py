@@ -34,8 +34,8 @@ class Margins:
 
     def take(self, monitors: MonitorSet, time: int) -> None:
         """Take what came since the last time (nanoseconds since the epoch)."""
-        for each in (monitors, *monitors.trials):
-            for margin in each.take_margins():
+        for part in (monitors, *monitors.trials):
+            for margin in part.take_margins():
                 self._take(margin, Approach(margin.left, margin.right, time))
 
     def _take(self, margin: Margin, now: Approach) -> None:
@@ -54,12 +54,12 @@ class Margins:
         """How close those of a monitor came, as of this time."""
         return [
             MarginRow(
-                one.margin.position.line,
-                one.margin.position.column,
-                one.margin.holds,
-                one.margin.threshold,
-                one.load,
-                one.today if one.today.time // _DAY == time // _DAY else None,
+                closest.margin.position.line,
+                closest.margin.position.column,
+                closest.margin.holds,
+                closest.margin.threshold,
+                closest.load,
+                closest.today if closest.today.time // _DAY == time // _DAY else None,
             )
-            for _key, one in sorted(self._closest.get(monitor, {}).items())
+            for _key, closest in sorted(self._closest.get(monitor, {}).items())
         ]

@@ -122,12 +122,12 @@ class Middle:
             outcome = result.succeed(before, now, incomplete)
         self.monitors, self._stated, self.blocked = result, message, ""
         began = list(result.began)
-        self._margins.keep([one.name for one in (*result.monitors, *result.tried)], began)
+        self._margins.keep([monitor.name for monitor in (*result.monitors, *result.tried)], began)
         for monitor in result.monitors:
             monitor.held = monitor.held or (
                 monitor.code.hold and monitor.name in message.moved and monitor.name in began
             )
-        self.telling.keep([one.name for one in result.monitors], began, now)
+        self.telling.keep([monitor.name for monitor in result.monitors], began, now)
         self.telling.told(outcome, NOWHERE)
         self.trials.take(result, outcome)
         anew = None if before is None or blocked else _topics(_replaced(before, result))
@@ -138,7 +138,7 @@ class Middle:
         held: list[str] = []
         if self.monitors is not None:
             both = (*self.monitors.monitors, *self.monitors.tried)
-            switches = {one.name: self._switches.get(one.name, True) for one in both}
+            switches = {monitor.name: self._switches.get(monitor.name, True) for monitor in both}
             switched = _topics(self.monitors.switch(switches, self.now()))
             anew = None if anew is None else anew | switched
             held = [monitor.name for monitor in self.monitors.monitors if monitor.held]
@@ -171,7 +171,7 @@ class Middle:
         self.look_again()
         if self.monitors is None:
             return frozenset()
-        held = [one for one in self.monitors.monitors if one.name == name and one.held]
+        held = [monitor for monitor in self.monitors.monitors if monitor.name == name and monitor.held]
         for monitor in held:
             self.monitors.resume(monitor.name)
         return _topics(held)
@@ -335,13 +335,15 @@ class Middle:
 
 
 def _topics(monitors: Iterable[Monitor]) -> frozenset[str]:
-    return frozenset(step.event.topic for one in monitors for step in one.steps if step.event.topic)
+    return frozenset(step.event.topic for monitor in monitors for step in monitor.steps if step.event.topic)
 
 
 def _replaced(before: MonitorSet, after: MonitorSet) -> list[Monitor]:
     """The monitors of both sets that do not go on as they were."""
-    kept = {one.name for one in after.monitors} & {one.name for one in before.monitors} - set(after.began)
-    return [one for each in (before, after) for one in each.monitors if one.name not in kept]
+    kept = {monitor.name for monitor in after.monitors} & {monitor.name for monitor in before.monitors} - set(
+        after.began
+    )
+    return [monitor for part in (before, after) for monitor in part.monitors if monitor.name not in kept]
 
 
 def _same(one: SpecificationsStated, other: SpecificationsStated) -> bool:

@@ -210,9 +210,9 @@ def _value(value: Any, depth: int) -> Any:
     if value is None or isinstance(value, bool | float) or (isinstance(value, int) and value in _INTEGERS):
         return value
     if isinstance(value, Mapping) and depth:
-        return {str(name)[:200]: _value(one, depth - 1) for name, one in list(value.items())[:_VALUES]}
+        return {str(name)[:200]: _value(item, depth - 1) for name, item in list(value.items())[:_VALUES]}
     if isinstance(value, list | tuple) and depth:
-        return [_value(one, depth - 1) for one in value[:_VALUES]]
+        return [_value(item, depth - 1) for item in value[:_VALUES]]
     if isinstance(value, bytes | bytearray):
         value = value[:200].decode("utf-8", "backslashreplace")
     return str(value)[:200]

@@ -69,7 +69,7 @@ class Trials:
     def take(self, monitors: MonitorSet, outcome: Outcome) -> None:
         """These have taken over, and this came of their beginning."""
         self._monitors = monitors
-        self._telling.keep([one.name for one in monitors.tried], list(monitors.began), self._now())
+        self._telling.keep([monitor.name for monitor in monitors.tried], list(monitors.began), self._now())
         for tried in outcome.tried:
             self._telling.told(tried, NOWHERE)
         self.schedule()

@@ -80,7 +80,7 @@ def certify(logic: str, formula: str, events: Sequence[str], tables: Tables | No
 
 def _look_at_form(logic: str, events: Sequence[str], tables: Tables) -> None:
     """What is no state is one to Python where it is negative, and another to the module; time is for `tfsm` alone."""
-    limits = [one for one in tables.timeouts if one is not None]
+    limits = [limit for limit in tables.timeouts if limit is not None]
     if len(tables.verdicts) != len(tables.table) or (
         tables.timeouts and len(tables.timeouts) != len(tables.table)
     ):

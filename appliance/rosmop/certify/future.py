@@ -104,7 +104,7 @@ class Future:
     def _all(self, states: list[State]) -> State:
         together: set[Clause] = {frozenset()}
         for state in states:
-            together = set(self._least({one | other for one in together for other in state}))
+            together = set(self._least({guess | other for guess in together for other in state}))
         return frozenset(together)
 
     def _least(self, clauses: set[Clause]) -> State:

@@ -159,7 +159,7 @@ def _check_alone(targets: Sequence[Value], function: HelperFunction) -> None:
     """Refuse the last reference if it shares something with another: one change would undo the other."""
     *others, last = targets
     for other in others:
-        if all(one == beside for one, beside in zip(path(other), path(last), strict=False)):
+        if all(step == beside for step, beside in zip(path(other), path(last), strict=False)):
             raise SpecificationError.at(
                 last.position,
                 f"`{path(last)[0]}` is handed to two references of `{function.name}`,"

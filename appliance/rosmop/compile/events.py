@@ -101,7 +101,7 @@ def _key(
     scope.message_type = kind
     site = scope.lines.site = scope.site(event)
     bound = _bind(scope, event, trigger, kind)
-    found = {each.variable.name: each.variable for each in bound if each.variable is not None}
+    found = {field.variable.name: field.variable for field in bound if field.variable is not None}
     values = [found[name] for name in names.parameters if name in found]
     for variable in values:
         variable.used = True
@@ -270,7 +270,7 @@ def _assemble(
     """Write all statements of the function; returns how many stand before the action."""
     site = scope.lines.site = scope.site(event)
     read_fields(scope, bound)
-    written = [each for each in bound if each.variable is not None and each.variable.assigned]
+    written = [field for field in bound if field.variable is not None and field.variable.assigned]
     check_overlaps(bound, written)
     fields = writes(scope, written)
     for field in fields:

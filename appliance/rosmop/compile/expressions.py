@@ -260,12 +260,12 @@ def _either(scope: Scope, position: Position, tested: Value, yes: Value, no: Val
     test = condition(tested)
     if kinds.is_number(yes.type) and kinds.is_number(no.type):
         kind = yes.type if yes.type == no.type else kinds.common(yes.type, no.type)
-        either = [number(each.form, kind) for each in (yes, no)]
+        either = [number(side.form, kind) for side in (yes, no)]
     elif kinds.convertible(no.type, yes.type):
         kind = kinds.STRING if isinstance(yes.type, kinds.Characters) else yes.type
         either = [
-            convert(scope, each, kind) if kinds.is_scalar(kind) or each.type != kind else each.form
-            for each in (yes, no)
+            convert(scope, side, kind) if kinds.is_scalar(kind) or side.type != kind else side.form
+            for side in (yes, no)
         ]
     else:
         raise SpecificationError.at(

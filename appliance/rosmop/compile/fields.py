@@ -35,25 +35,25 @@ class Bound:
 def writes(scope: Scope, written: list[Bound]) -> tuple[form.Write, ...]:
     """The fields that the action assigns."""
     found = []
-    for each in written:
-        variable = each.variable
+    for field in written:
+        variable = field.variable
         assert variable is not None
         assert variable.flag is not None
         assert variable.assigned
         read = form.Read(variable.type, variable.code)
-        value = convert(scope, Value(read, each.binding.position, owned=False), each.type)
-        end = each.end or None
+        value = convert(scope, Value(read, field.binding.position, owned=False), field.type)
+        end = field.end or None
         found.append(
-            form.Write(variable.flag, value, each.spot or Spot(None, 0), end, tuple(_slots(scope, each)))
+            form.Write(variable.flag, value, field.spot or Spot(None, 0), end, tuple(_slots(scope, field)))
         )
     return tuple(found)
 
 
-def _slots(scope: Scope, each: Bound) -> list[int | str]:
+def _slots(scope: Scope, field: Bound) -> list[int | str]:
     """The path as indexes into lists; the parts of a time by name."""
     kind: Type = kinds.Record(scope.message_type or "")
     path: list[int | str] = []
-    for step in each.binding.path:
+    for step in field.binding.path:
         if isinstance(kind, kinds.Record):
             slot = scope.messages.slot(kind.name, step.name)
             path.append(slot.index)
@@ -72,27 +72,27 @@ def read_fields(scope: Scope, bound: list[Bound]) -> None:
     walk = Walk(Locator(scope.module, scope.lines.found, scope.lines.site), layout, Spot(None, 0))
     fixed: list[Bound] = []
     variable_size: list[Bound] = []
-    for each in bound:
-        each.spot = walk.find(each.binding.path)
-        if each.variable is None or each.variable.used:
-            (variable_size if struct_code(each.type) is None else fixed).append(each)
-    if any(isinstance(each.type, kinds.Vector | kinds.Record) for each in variable_size):
+    for field in bound:
+        field.spot = walk.find(field.binding.path)
+        if field.variable is None or field.variable.used:
+            (variable_size if struct_code(field.type) is None else fixed).append(field)
+    if any(isinstance(field.type, kinds.Vector | kinds.Record) for field in variable_size):
         scope.add(form.Allocate(scope.lines.site, None))
     _read_fixed(scope, fixed)
-    for each in variable_size:
-        each.read, each.end = scope.temporary("r"), scope.temporary("x")
-        at = each.spot or Spot(None, 0)
-        scope.add(form.ReadValue(scope.lines.site, each.read, each.end, at, each.type))
-    for each in bound:
-        _take(scope, each)
+    for field in variable_size:
+        field.read, field.end = scope.temporary("r"), scope.temporary("x")
+        at = field.spot or Spot(None, 0)
+        scope.add(form.ReadValue(scope.lines.site, field.read, field.end, at, field.type))
+    for field in bound:
+        _take(scope, field)
 
 
 def _read_fixed(scope: Scope, fixed: list[Bound]) -> None:
     """Read numbers; those at known distances from each other together."""
     groups: dict[str | None, list[Bound]] = {}
-    for each in fixed:
-        assert each.spot is not None  # a number is somewhere
-        groups.setdefault(each.spot.base, []).append(each)
+    for field in fixed:
+        assert field.spot is not None  # a number is somewhere
+        groups.setdefault(field.spot.base, []).append(field)
     for group in groups.values():
         waiting = sorted(group, key=_offset)
         while waiting:
@@ -102,8 +102,8 @@ def _read_fixed(scope: Scope, fixed: list[Bound]) -> None:
             _read_together(scope, together)
 
 
-def _offset(each: Bound) -> int:
-    return each.spot.offset if each.spot is not None else 0
+def _offset(field: Bound) -> int:
+    return field.spot.offset if field.spot is not None else 0
 
 
 def _near(one: Bound, other: Bound) -> bool:
@@ -114,33 +114,33 @@ def _near(one: Bound, other: Bound) -> bool:
 def _read_together(scope: Scope, together: list[Bound]) -> None:
     first = together[0].spot
     assert first is not None  # a number is somewhere
-    for each in together:
-        each.read = scope.temporary("r")
-    fields = tuple((each.read, each.type, _offset(each) - first.offset) for each in together)
+    for field in together:
+        field.read = scope.temporary("r")
+    fields = tuple((field.read, field.type, _offset(field) - first.offset) for field in together)
     scope.add(form.ReadNumbers(scope.lines.site, first, fields))
 
 
-def _take(scope: Scope, each: Bound) -> None:
+def _take(scope: Scope, field: Bound) -> None:
     """Compare a field with its constant, or give it to its variable."""
-    site, read = scope.lines.site, form.Read(each.type, each.read)
-    if each.constant is not None:
-        constant = form.Literal(each.type, each.constant)
+    site, read = scope.lines.site, form.Read(field.type, field.read)
+    if field.constant is not None:
+        constant = form.Literal(field.type, field.constant)
         test: form.Expression = form.Compare("==", read, constant, site)
-        if isinstance(each.type, kinds.String):
+        if isinstance(field.type, kinds.String):
             test = form.CompareTexts("==", read, constant, True, site)
         scope.add(form.Require(site, test))
-    elif each.variable is not None and each.variable.used:
-        value = convert(scope, Value(read, each.binding.position), each.variable.type)
-        scope.evaluate(form.Assign(each.variable.type, each.variable.code, value))
+    elif field.variable is not None and field.variable.used:
+        value = convert(scope, Value(read, field.binding.position), field.variable.type)
+        scope.evaluate(form.Assign(field.variable.type, field.variable.code, value))
 
 
 def check_overlaps(bound: list[Bound], written: list[Bound]) -> None:
     """Refuse an assignment to a field that is bound twice: one change would undo the other."""
-    for each in written:
+    for field in written:
         for other in bound:
-            if other is not each and _overlap(each.binding, other.binding):
+            if other is not field and _overlap(field.binding, other.binding):
                 raise SpecificationError.at(
-                    max(each, other, key=lambda one: one.binding.position).binding.position,
+                    max(field, other, key=lambda field: field.binding.position).binding.position,
                     "two bindings hold this field, and one of them is assigned; bind it once",
                 )
 

@@ -170,7 +170,7 @@ def declare_functions(shared: Shared, names: SpecificationNames, specification: 
         function.recursive = name in reached
         if function.references:
             function.names = frozenset().union(
-                *(_free_names(names.functions[one].node) for one in {name, *reached})
+                *(_free_names(names.functions[callee].node) for callee in {name, *reached})
             )
 
 
@@ -224,17 +224,17 @@ def _reached(first: Set[str], called: Mapping[str, Set[str]]) -> set[str]:
 
 
 def _called(node: tree.Node) -> Iterable[str]:
-    for each in _nodes(node):
-        if isinstance(each, tree.Call) and isinstance(each.callee, tree.Name):
-            yield each.callee.parts[-1]
+    for inner in _nodes(node):
+        if isinstance(inner, tree.Call) and isinstance(inner.callee, tree.Name):
+            yield inner.callee.parts[-1]
 
 
 def _free_names(function: tree.Function) -> set[str]:
     """The names in a function that it does not declare itself."""
     nodes = list(_nodes(function.body))
-    own = {each.name for each in nodes if isinstance(each, tree.Declarator | tree.RangeFor)}
+    own = {inner.name for inner in nodes if isinstance(inner, tree.Declarator | tree.RangeFor)}
     own |= {parameter.name for parameter in function.parameters}
-    return {each.parts[0] for each in nodes if isinstance(each, tree.Name) and len(each.parts) == 1} - own
+    return {inner.parts[0] for inner in nodes if isinstance(inner, tree.Name) and len(inner.parts) == 1} - own
 
 
 def _nodes(node: tree.Node) -> Iterable[tree.Node]:

@@ -82,28 +82,28 @@ def write_range_for(scope: Scope, node: tree.RangeFor, write: Write) -> None:
     element = values.type.element if isinstance(values.type, kinds.Vector) else kinds.CHAR
     kind = element if node.type.name == ("auto",) else resolve(node.type, scope.messages)
     _enter(scope, node, Loop(None))
-    each = None if node.type.reference and not node.type.constant else scope.temporary()
-    index = "" if each is not None else _first_index(scope, node, values, kind)
+    item = None if node.type.reference and not node.type.constant else scope.temporary()
+    index = "" if item is not None else _first_index(scope, node, values, kind)
     with scope.block(), scope.nested() as statements:
-        if each is None:
+        if item is None:
             _by_reference(scope, node, values, kind, index)
         else:
-            _by_value(scope, node, element, kind, each)
+            _by_value(scope, node, element, kind, item)
         _block(scope, [node.body], write)
     site = scope.lines.site
     scope.add(
         form.Loop(site, tuple(statements))
-        if each is None
-        else form.ForEach(site, each, values.form, tuple(statements))
+        if item is None
+        else form.ForEach(site, item, values.form, tuple(statements))
     )
     scope.loops.pop()
 
 
-def _by_value(scope: Scope, node: tree.RangeFor, element: Type, kind: Type, each: str) -> None:
+def _by_value(scope: Scope, node: tree.RangeFor, element: Type, kind: Type, item: str) -> None:
     charge(scope, node)
-    read: form.Expression = form.Read(element, each)
+    read: form.Expression = form.Read(element, item)
     if element == kinds.CHAR:  # of a string; those of a vector are in their range
-        read = form.Convert(kinds.CHAR, form.Read(kinds.UINT8, each))
+        read = form.Convert(kinds.CHAR, form.Read(kinds.UINT8, item))
     value = Value(read, node.position, owned=node.type.reference)
     variable = scope.local(node.name, kind, node.position, constant=node.type.constant)
     scope.evaluate(form.Assign(kind, variable.code, convert(scope, value, kind)))

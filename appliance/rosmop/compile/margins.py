@@ -36,15 +36,15 @@ def noted(scope: Scope, node: tree.Binary, left: Value, right: Value, value: Val
         if len(known) >= MOST_NOTED:
             return value
         variables = [(scope.module.fresh("g"), scope.module.fresh("g")) for _truth in range(2)]
-        constant = (side for side, one in enumerate((left, right)) if one.constant is not None)
+        constant = (side for side, operand in enumerate((left, right)) if operand.constant is not None)
         known[node] = Comparison(node.position, next(constant, None), *variables)
     comparison = known[node]
     scope.written.update(comparison.variables)
     kind = compare.left.type
     sides = [form.Read(kind, scope.temporary()) for _side in range(2)]
     kept = (
-        form.Assign(kind, side.name, each)
-        for side, each in zip(sides, (compare.left, compare.right), strict=True)
+        form.Assign(kind, side.name, operand)
+        for side, operand in zip(sides, (compare.left, compare.right), strict=True)
     )
     now = [number(side, kinds.DOUBLE) for side in sides]
     answer = form.Conditional(

@@ -21,7 +21,7 @@ def field(scope: Scope, base: Value, name: str, position: Position, site: int) -
         try:
             slot = scope.messages.slot(base.type.name, name)
         except UnknownNameError as error:
-            if name in {each.name for each in scope.messages.definition(base.type.name).constants}:
+            if name in {constant.name for constant in scope.messages.definition(base.type.name).constants}:
                 return constant(scope, base.type.name, name, position)
             raise SpecificationError.at(position, str(error)) from None
         place = SlotPlace(base, slot.index) if base.place is not None else None

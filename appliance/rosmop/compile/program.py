@@ -23,8 +23,12 @@ class Group:
 def groups(specifications: Sequence[SpecificationCode]) -> Iterator[Group]:
     """The components of a set."""
     found = connected([
-        [one.name, *one.uses, *((event.topic, event.part) for event in one.events if event.topic is not None)]
-        for one in specifications
+        [
+            specification.name,
+            *specification.uses,
+            *((event.topic, event.part) for event in specification.events if event.topic is not None),
+        ]
+        for specification in specifications
     ])  # fmt: skip
     for numbers in found:
         yield _group(specifications, numbers)
@@ -60,8 +64,9 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
         noted += (name for comparison in specification.comparisons for name in comparison.variables)
         properties += [
             (number, index)
-            for index, each in enumerate(specification.properties)
-            if isinstance(each.property, FiniteProperty | ClockedProperty) and specification.slicing is None
+            for index, declared in enumerate(specification.properties)
+            if isinstance(declared.property, FiniteProperty | ClockedProperty)
+            and specification.slicing is None
         ]
         for index, event in enumerate(specification.events):
             if event.topic is not None and event.part is None:
@@ -96,7 +101,7 @@ def _event(
     place: int,
 ) -> form.Event:
     advances = []
-    for each, code in enumerate(specifications[number].properties):
+    for property_index, code in enumerate(specifications[number].properties):
         compiled, handlers = code.property, set(code.order)
         if isinstance(compiled, FiniteProperty):
             automaton = compiled.automaton
@@ -110,7 +115,9 @@ def _event(
             )
             table = tuple(row[index] for row in automaton.table)
             advances.append(
-                form.Advance(properties.index((number, each)), table, index, None, handled, automaton.initial)
+                form.Advance(
+                    properties.index((number, property_index)), table, index, None, handled, automaton.initial
+                )
             )
         elif isinstance(compiled, ClockedProperty):
             quiet = [handlers.isdisjoint(verdict) for verdict in compiled.verdicts]
@@ -123,7 +130,7 @@ def _event(
             clock = form.Clock(
                 late, compiled.within, tuple(-1 if wait is None else wait.after for wait in compiled.waits)
             )
-            advances.append(form.Advance(properties.index((number, each)), table, index, clock))
+            advances.append(form.Advance(properties.index((number, property_index)), table, index, clock))
         else:
             advances.append(form.Advance(None, (-1,)))
     return form.Event(specifications[number].events[index].function, place, tuple(advances))

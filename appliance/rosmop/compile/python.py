@@ -97,9 +97,9 @@ class Printer:
         self._marks = []
         self._flags = frozenset(
             write.flag
-            for one in function.body
-            if isinstance(one, form.WriteBack | form.Pending)
-            for write in one.writes
+            for statement in function.body
+            if isinstance(statement, form.WriteBack | form.Pending)
+            for write in statement.writes
         )
         for index, statement in enumerate(function.body):
             if index == function.happens:

@@ -75,10 +75,14 @@ def slicing_of(names: SpecificationNames) -> Slicing | None:
     """What the slices of a specification differ in; None without parameters."""
     if not names.parameters:
         return None
-    own = (one for one in names.variables.values() if one.sliced and one.name not in names.parameters)
+    own = (
+        variable
+        for variable in names.variables.values()
+        if variable.sliced and variable.name not in names.parameters
+    )
     return Slicing(
-        tuple((one.name, one.code, one.type) for one in names.parameters.values()),
-        tuple(one.code for one in own),
+        tuple((parameter.name, parameter.code, parameter.type) for parameter in names.parameters.values()),
+        tuple(variable.code for variable in own),
     )
 
 
@@ -91,15 +95,20 @@ def binds(names: SpecificationNames, event: tree.Event) -> tuple[int, ...]:
 def creates(specification: tree.Specification, event: tree.Event) -> bool:
     """Whether a slice may begin with an event: with all where none is a `creation event`."""
 
-    def marked(one: tree.Event) -> bool:
-        return any(modifier.parts == ("creation",) for modifier in one.modifiers)
+    def marked(event: tree.Event) -> bool:
+        return any(modifier.parts == ("creation",) for modifier in event.modifiers)
 
     return marked(event) or not any(map(marked, specification.events))
 
 
 def acts(function: form.Function, shared: Shared) -> bool:
     """Whether the action of an event does more than to change the slice's own variables."""
-    others = {one.code for each in shared.specifications for one in each.variables.values() if not one.sliced}
+    others = {
+        variable.code
+        for specification in shared.specifications
+        for variable in specification.variables.values()
+        if not variable.sliced
+    }
     if not others.isdisjoint(function.shared):
         return True
     return any(
@@ -116,7 +125,7 @@ def _nodes(root: object) -> Iterator[object]:
             waiting += node
         elif is_dataclass(node):
             yield node
-            waiting += [getattr(node, each.name) for each in fields(node)]
+            waiting += [getattr(node, field.name) for field in fields(node)]
 
 
 def unsliceable(compiled: CompiledProperty) -> str | None:

@@ -109,7 +109,12 @@ class Compiled:
     @property
     def stamped(self) -> frozenset[str]:
         """The topics whose messages do."""
-        events = [event for one in self.specifications for event in one.events if event.part is None]
+        events = [
+            event
+            for specification in self.specifications
+            for event in specification.events
+            if event.part is None
+        ]
         return frozenset(event.topic for event in events if event.topic and self.is_stamped(event.type))
 
 
@@ -149,7 +154,9 @@ def findings_of(files: Sequence[tree.File], definitions: Definitions) -> list[Fi
     """What is wrong with these files while others of their set cannot be read; names may be declared in those."""
     shared = Shared(Module(), Messages(definitions))
     shared.partial = True
-    _compile_all(shared, Turn(), [(file, one) for file in files for one in file.specifications])
+    _compile_all(
+        shared, Turn(), [(file, specification) for file in files for specification in file.specifications]
+    )
     return list(dict.fromkeys(shared.findings))
 
 

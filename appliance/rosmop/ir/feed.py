@@ -244,17 +244,17 @@ class _Walk:
         self._undo = tuple((cells.variables[name][0], writer.take(8)) for name in assigned)
         self._log = writer.take(16 * sum(written.writes for written in self._written))
         properties = {
-            each.property for event in events for each in event.advances if each.property is not None
+            advance.property for event in events for advance in event.advances if advance.property is not None
         }
         self._states = {
             number: _FIRST + len(events) + place for place, number in enumerate(sorted(properties))
         }
-        for each in (each for event in events for each in event.advances):
-            if each.property is not None and each.property not in cells.exits:
-                room = ENTRY.size * len(each.table) if each.clock is None else CLOCKED_ROOM
-                cells.exits[each.property] = writer.take(room)
-                if each.clock is not None:
-                    cells.clocks[each.property] = writer.take(16)
+        for advance in (advance for event in events for advance in event.advances):
+            if advance.property is not None and advance.property not in cells.exits:
+                room = ENTRY.size * len(advance.table) if advance.clock is None else CLOCKED_ROOM
+                cells.exits[advance.property] = writer.take(room)
+                if advance.clock is not None:
+                    cells.clocks[advance.property] = writer.take(16)
         self._stamped = stamped
         self._following = _FIRST + len(events) + len(self._states)
         self._sooner = self._following + 2
@@ -411,13 +411,13 @@ class _Walk:
             code += self._drop(number, self._is(bits, DROPPED))
         gone = self._telling + 3
         steps = [
-            self._advance(each, table)
-            for each, table in zip(event.advances, self._tables[number], strict=True)
+            self._advance(advance, table)
+            for advance, table in zip(event.advances, self._tables[number], strict=True)
             if table is not None
         ]
         if steps:
             code += self._is(bits, HAPPENED) + IF + NOTHING + b"".join(steps) + END
-        if any(written.drops for each in event.advances for _, written in self._handled(each)):
+        if any(written.drops for advance in event.advances for _, written in self._handled(advance)):
             code = _set(gone, constant(I32, 0)) + code + self._drop(number, _get(gone))
         return code + END
 
@@ -506,7 +506,9 @@ class _Walk:
         code += _get(room) + seq + b"\x36\x00" + unsigned(exits + 8 + 24 * RUNS + 16)
         code += _set(count, _get(count) + constant(I64, 1) + b"\x7c")
         code += _set(now, _get(_NOW) + _get(now) + _get(_NOW) + _get(now) + b"\x55" + SELECT)
-        late, waits = (self._known_tables.address(*each) for each in ((clock.late, "h"), (clock.waits, "q")))
+        late, waits = (
+            self._known_tables.address(*table) for table in ((clock.late, "h"), (clock.waits, "q"))
+        )
         is_late = _get(now) + _get(since) + b"\x7d" + constant(I64, clock.within) + b"\x55"
         code += constant(I32, late) + constant(I32, table) + is_late + SELECT
         code += _get(state) + constant(I32, 1) + b"\x74" + _ADD + b"\x2e\x00\x00"
@@ -602,10 +604,11 @@ def _assembled(
     writer: Writer, walks: Sequence[bytes], feeds: Mapping[str, Feed], tables: _Tables, memory: int
 ) -> bytes:
     first = len(writer.written)
-    shapes = [(each.parameters, each.result) for each in writer.written]
+    shapes = [(function.parameters, function.result) for function in writer.written]
     shapes += [(_PARAMETERS, I64)] * len(walks)
     types = [
-        b"\x60" + row([bytes((one,)) for one in given]) + row([bytes((result,))]) for given, result in shapes
+        b"\x60" + row([bytes((kind,)) for kind in given]) + row([bytes((result,))])
+        for given, result in shapes
     ]
     exports = [
         text(feed.name) + b"\x00" + unsigned(first + index) for index, feed in enumerate(feeds.values())
@@ -619,7 +622,7 @@ def _assembled(
         (3, row([unsigned(index) for index in range(len(types))])),
         (5, row([b"\x01" + pages + pages])),
         (7, row([*exports, text("memory") + b"\x02\x00"])),
-        (10, row([*(each.code for each in writer.written), *walks])),
+        (10, row([*(function.code for function in writer.written), *walks])),
         (11, row(data)),
     )
     content = b"".join(bytes((number,)) + unsigned(len(part)) + part for number, part in sections)

@@ -351,7 +351,7 @@ class _Body:
         if isinstance(value, form.Literal) and value.value is None:
             return b""
         if isinstance(value, form.Conditional) and value.type == kinds.VOID:
-            yes, no = ((form.Evaluate(node.site, each),) for each in (value.yes, value.no))
+            yes, no = ((form.Evaluate(node.site, branch),) for branch in (value.yes, value.no))
             return self._if(form.If(node.site, value.test, yes, no))
         return self._value(value) + DROP
 

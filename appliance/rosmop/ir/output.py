@@ -35,7 +35,7 @@ class Line:
         self.values: list[form.Expression] = []
         self.longest = 0
         self._make = self._made(node.text)
-        self._texts = [place for place, one in enumerate(self.values) if is_text(one)]
+        self._texts = [place for place, expression in enumerate(self.values) if is_text(expression)]
         self._slots = struct.Struct("<" + "".join(map(_code, self.values)))
         self.size = HEAD.size + self._slots.size
 
@@ -62,14 +62,14 @@ class Line:
             return lambda _: constant
         if isinstance(node, form.Format):
             self.longest += _SHORT if node.size is None else node.size
-            parts, template = [self._made(one) for one in node.arguments], node.template
+            parts, template = [self._made(part) for part in node.arguments], node.template
             return lambda values: template % tuple(part(values) for part in parts)
         if isinstance(node, form.Join):
-            parts = [self._made(one) for one in node.pieces]
+            parts = [self._made(piece) for piece in node.pieces]
             return lambda values: b"".join(part(values) for part in parts)  # type: ignore[misc]  # they are bytes
         if isinstance(node, form.Call) and node.function.startswith("p_") and _goes_on(node):
             self.longest += _PIECE
-            function, parts = FUNCTIONS[node.function], [self._made(one) for one in node.arguments]
+            function, parts = FUNCTIONS[node.function], [self._made(argument) for argument in node.arguments]
             site = (node.site,) if node.function in FAULTING else ()
             return lambda values: function(*(part(values) for part in parts), *site)
         place = len(self.values)

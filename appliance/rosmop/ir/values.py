@@ -218,16 +218,16 @@ class Values:
 
     def _encoder_of_vectors(self, kind: kinds.Vector) -> Callable[[Any, bytearray], None]:
         code, length = struct_code(kind.element) or "", kind.length
-        one = None if code else self.encoder(kind.element)
+        encode = None if code else self.encoder(kind.element)
 
         def vector(values: Any, out: bytearray) -> None:
             if length is None:
                 out += struct.pack("<I", len(values))
             else:
                 vectors.fixed(values, length, -1)
-            if one is not None:
+            if encode is not None:
                 for value in values:
-                    one(value, out)
+                    encode(value, out)
             elif len(code) == 2:
                 wire.put_moments(values, code[0], out)
             else:

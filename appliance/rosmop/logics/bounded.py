@@ -121,10 +121,10 @@ class _Row:
 class _Operator(ABC):
     """An operator in a run. `ask` comes before `take` for each event, and `pass_by` between events."""
 
-    def __init__(self, run: "BoundedRun", number: int, one: Instruction) -> None:
+    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
         self.run, self.number = run, number
-        self.left, self.right = one.operands[0], one.operands[-1]
-        self.low, self.high = one.low, FOREVER if one.high is None else one.high
+        self.left, self.right = instruction.operands[0], instruction.operands[-1]
+        self.low, self.high = instruction.low, FOREVER if instruction.high is None else instruction.high
         self.rows: deque[_Row] = deque()
 
     def ask(self, now: int) -> Value:
@@ -215,8 +215,8 @@ class _OpenUntil(_Rows):
     has failed at none (`noted`), a row is decided only when its time is over and nothing in it may come any more.
     """
 
-    def __init__(self, run: "BoundedRun", number: int, one: Instruction) -> None:
-        super().__init__(run, number, one)
+    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
+        super().__init__(run, number, instruction)
         self.passed = -FOREVER
         self.hopes: deque[_Row] = deque()
         self.noted = False
@@ -308,8 +308,8 @@ class _OpenSince(_Rows):
     `least` and `most` are behind the newest row, if all that is open were to fail, or to hold.
     """
 
-    def __init__(self, run: "BoundedRun", number: int, one: Instruction) -> None:
-        super().__init__(run, number, one)
+    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
+        super().__init__(run, number, instruction)
         self.window = Window(self.low, self.high)
         self.least, self.most = self.window.copy(), self.window.copy()
 
@@ -361,8 +361,8 @@ class _OpenPreviously(_Operator):
 class _Next(_Operator):
     """`next`: the rows ask about the event before; `fresh` are those of the event that happens now."""
 
-    def __init__(self, run: "BoundedRun", number: int, one: Instruction) -> None:
-        super().__init__(run, number, one)
+    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
+        super().__init__(run, number, instruction)
         self.before: deque[_Row] = deque()
 
     def take(self, now: int) -> None:
@@ -401,8 +401,10 @@ class BoundedProperty(CompiledProperty):
         for number in range(program.result, -1, -1):
             if number in needed:
                 needed.update(program.instructions[number].operands)
-        for number, one in enumerate(program.instructions):
-            if number in needed and (one.operator in _LATER or not self.later.isdisjoint(one.operands)):
+        for number, instruction in enumerate(program.instructions):
+            if number in needed and (
+                instruction.operator in _LATER or not self.later.isdisjoint(instruction.operands)
+            ):
                 self.later.add(number)
         at_once = sorted(needed - self.later)
         result = ["None"] * (program.result + 1)
@@ -430,12 +432,12 @@ class BoundedProperty(CompiledProperty):
         """Those whose values may come later, for a run; the outermost first."""
         found: dict[int, _Operator] = {}
         for number in sorted(self.later, reverse=True):
-            one = self.program.instructions[number]
-            kind = _KINDS.get(one.operator)
-            if one.operator == "until" and self.later.isdisjoint(one.operands):
+            instruction = self.program.instructions[number]
+            kind = _KINDS.get(instruction.operator)
+            if instruction.operator == "until" and self.later.isdisjoint(instruction.operands):
                 kind = _Until
             if kind is not None:
-                found[number] = kind(run, number, one)
+                found[number] = kind(run, number, instruction)
         return found
 
     def _decided_late(self) -> set[str]:
@@ -445,15 +447,15 @@ class BoundedProperty(CompiledProperty):
         """
         signs: dict[int, set[bool]] = {self.program.result: {False}}
         for number in sorted(self.later, reverse=True):
-            one = self.program.instructions[number]
+            instruction = self.program.instructions[number]
             mine = signs.get(number, set())
-            given = {"not": {not sign for sign in mine}, "xor": {False, True}}.get(one.operator, mine)
-            for operand in one.operands:
+            given = {"not": {not sign for sign in mine}, "xor": {False, True}}.get(instruction.operator, mine)
+            for operand in instruction.operands:
                 signs.setdefault(operand, set()).update(given)
         found = (
             signs[number] for number in self.later if self.program.instructions[number].operator in _LATER
         )
-        return {VERDICTS[sign] for one in found for sign in one}
+        return {VERDICTS[sign] for signs_of in found for sign in signs_of}
 
     def blocking_refused(self, category: str) -> str | None:
         """What a deadline decides is decided when no message comes."""

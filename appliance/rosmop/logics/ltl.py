@@ -156,7 +156,7 @@ class _Past:
             first = Formula("iff", (mine, right))
             ways = ((mine, Formula("iff", (mine, Formula("or", (right, left))))), (_not(mine), first))
         after = (Formula("implies", (now, Formula("next", (following,)))) for now, following in ways)
-        self.right += [first, *(Formula("always", (one,)) for one in after)]
+        self.right += [first, *(Formula("always", (formula,)) for formula in after)]
         return mine
 
 

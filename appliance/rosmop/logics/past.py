@@ -155,10 +155,15 @@ class Stepper:
         ]
         self._place = {number: 1 << index for index, (number, _) in enumerate(remembered)}
         self._kept = [
-            (self._place[number], number if one.operator.endswith("since") else one.operands[0])
-            for number, one in remembered
+            (
+                self._place[number],
+                number if instruction.operator.endswith("since") else instruction.operands[0],
+            )
+            for number, instruction in remembered
         ]
-        self.abstract = sum(self._place[number] for number, one in remembered if one.operator[0] == "a")
+        self.abstract = sum(
+            self._place[number] for number, instruction in remembered if instruction.operator[0] == "a"
+        )
         """The bits of what abstract operators remember."""
 
     def step(self, bits: int, event: int) -> tuple[int, bool]:
@@ -328,7 +333,7 @@ class _Generator:
         lines.append(f"return {result}")
         initial = {name: value for name, value in self._state.items() if name != "now"}
         kept = "".join(f"copy({name}), " for name in initial)
-        names, values = ("".join(f"{one}, " for one in each) for each in (initial, initial.values()))
+        names, values = ("".join(f"{item}, " for item in items) for items in (initial, initial.values()))
         return "\n".join(
             [
                 "def make(now, kept=None):",

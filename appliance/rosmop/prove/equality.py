@@ -78,10 +78,10 @@ def findings_of(
     validation = Validation(compiled.functions, values, module, clock, patience)
     for group in found:
         for (topic, events), numbers in zip(group.component.topics, group.events, strict=True):
-            for place, (each, (number, index)) in enumerate(zip(events, numbers, strict=True)):
+            for place, (code, (number, index)) in enumerate(zip(events, numbers, strict=True)):
                 specification = compiled.specifications[number]
                 name = f"{specification.name}.{specification.events[index].name}"
-                yield validation.finding(topic, name, each.function, place)
+                yield validation.finding(topic, name, code.function, place)
     in_module = {numbers for group in found for events in group.events for numbers in events}
     for number, specification in enumerate(compiled.specifications):
         for index, event in enumerate(specification.events):
@@ -226,16 +226,22 @@ class Validation:
 
 def _holds(conditions: Sequence[Term], guess: Any) -> bool:
     """Whether a message and a state are an example, too, with what costly operations are in truth."""
-    values = [(one(), guess[one]) for one in guess.decls() if one.arity() == 0]
+    values = [
+        (declaration(), guess[declaration]) for declaration in guess.decls() if declaration.arity() == 0
+    ]
     known = [
-        (one, value) for one, value in values if value is not None and not isinstance(value, z3.FuncInterp)
+        (declaration, value)
+        for declaration, value in values
+        if value is not None and not isinstance(value, z3.FuncInterp)
     ]
     return all(z3.is_true(z3.simplify(z3.substitute(condition, *known))) for condition in conditions)
 
 
 def _example(model: Any) -> str:
     """A message and a state, as short as they are."""
-    return ", ".join(f"{one} = {model[one]}" for one in model.decls() if one.arity() == 0)
+    return ", ".join(
+        f"{declaration} = {model[declaration]}" for declaration in model.decls() if declaration.arity() == 0
+    )
 
 
 def _same(held: Term, value: Term) -> Term:

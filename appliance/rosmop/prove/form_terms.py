@@ -208,7 +208,7 @@ class Meaning:
         """A line costs the most that it can; that the module keeps the right values for it is not looked at."""
         line = Line(node, "")
         cost = integer(line.cost, 64)
-        for value in (self._value(each, state) for each in line.values):
+        for value in (self._value(expression, state) for expression in line.values):
             cost = cost + (z3.UDiv(value.count, integer(BYTES, 64)) if isinstance(value, _View) else 0)
         self._spend(cost, state)
 
@@ -517,7 +517,7 @@ class Meaning:
         if not isinstance(view, _View) or len(text) > form.SHORT:
             raise UnknownError("a comparison of strings")
         place = z3.Extract(31, 0, view.start)
-        letters = [number_at(view.message, place + more, 1) == one for more, one in enumerate(text)]
+        letters = [number_at(view.message, place + more, 1) == letter for more, letter in enumerate(text)]
         same = both(view.count == len(text), *letters)
         return same if node.operator == "==" else opposite(same)
 
@@ -585,7 +585,7 @@ class Meaning:
         if isinstance(kind, kinds.Vector) and struct_code(kind.element) is not None:
             self._make(view.count * self._values.width(kind.element), state)
         elif not isinstance(kind, kinds.Record) or any(
-            not struct_code(one) for one in self._values.fields(kind)
+            not struct_code(field) for field in self._values.fields(kind)
         ):
             raise UnknownError(f"a copy of type {kind}")
         return view

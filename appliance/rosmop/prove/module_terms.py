@@ -145,24 +145,24 @@ class Execution:
         return result
 
     def _run(self, instructions: Sequence[Instruction], state: State, stack: list[Any]) -> None:
-        for each in instructions:
+        for instruction in instructions:
             if z3.is_false(state.alive):
                 return
-            family, _, rest = each.name.partition(".")
-            if each.name in ("block", "loop", "br", "br_if"):
+            family, _, rest = instruction.name.partition(".")
+            if instruction.name in ("block", "loop", "br", "br_if"):
                 raise NotProvedError("not loop-free")
-            method = _CONTROL.get(each.name)
+            method = _CONTROL.get(instruction.name)
             if method is not None:
-                method(self, each, state, stack)
+                method(self, instruction, state, stack)
             elif rest.startswith("load"):
-                stack.append(self._load(family, rest[4:], each.operands[0], stack.pop(), state))
+                stack.append(self._load(family, rest[4:], instruction.operands[0], stack.pop(), state))
             elif rest.startswith("store"):
                 value = stack.pop()
-                self._store(family, rest[5:], each.operands[0], stack.pop(), value, state)
+                self._store(family, rest[5:], instruction.operands[0], stack.pop(), value, state)
             else:
                 if rest.startswith(("div_", "rem_")):
                     self._divides(rest, state, stack)
-                stack.append(_calculated(family, rest, each.operands, stack))
+                stack.append(_calculated(family, rest, instruction.operands, stack))
 
     def _divides(self, name: str, state: State, stack: Sequence[Any]) -> None:
         """A division traps by zero, and where the quotient is too large."""
@@ -175,49 +175,49 @@ class Execution:
 
     # Control
 
-    def _if(self, each: Instruction, state: State, stack: list[Any]) -> None:
+    def _if(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
         test = _truth(stack.pop())
         yes, no = state.where(test), state.where(opposite(test))
         one: list[Any] = []
         other: list[Any] = []
-        self._run(each.body, yes, one)
-        self._run(each.otherwise, no, other)
+        self._run(instruction.body, yes, one)
+        self._run(instruction.otherwise, no, other)
         state.join(test, yes, no)
         values = [branch[-1] if branch and not z3.is_false(end.alive) else None
                   for branch, end in ((one, yes), (other, no))]  # fmt: skip
         if any(value is not None for value in values):
             stack.append(choice(test, *values))
 
-    def _unreachable(self, each: Instruction, state: State, stack: list[Any]) -> None:
+    def _unreachable(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
         self._trapped.append(state.alive)
         state.alive = z3.BoolVal(False)
 
-    def _return(self, each: Instruction, state: State, stack: list[Any]) -> None:
+    def _return(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
         self._returned.append((state.where(z3.BoolVal(True)), stack[-1]))
         state.alive = z3.BoolVal(False)
 
-    def _called(self, each: Instruction, state: State, stack: list[Any]) -> None:
-        number = int(each.operands[0])
+    def _called(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+        number = int(instruction.operands[0])
         count = len(self._functions[number].parameters)
         arguments = stack[len(stack) - count :]
         del stack[len(stack) - count :]
         stack.append(self._call(number, arguments, state))
 
-    def _drop(self, each: Instruction, state: State, stack: list[Any]) -> None:
+    def _drop(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
         stack.pop()
 
-    def _select(self, each: Instruction, state: State, stack: list[Any]) -> None:
+    def _select(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
         test, no, yes = _truth(stack.pop()), stack.pop(), stack.pop()
         stack.append(choice(test, yes, no))
 
-    def _get(self, each: Instruction, state: State, stack: list[Any]) -> None:
-        value = state.slots[self._frame, each.operands[0]]
+    def _get(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+        value = state.slots[self._frame, instruction.operands[0]]
         if value is MIXED:
             raise NotProvedError("uses a variable for an address and a number")
         stack.append(value)
 
-    def _set(self, each: Instruction, state: State, stack: list[Any]) -> None:
-        state.slots[self._frame, each.operands[0]] = stack.pop()
+    def _set(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+        state.slots[self._frame, instruction.operands[0]] = stack.pop()
 
     # Memory
 
@@ -355,9 +355,9 @@ def _calculated(family: str, name: str, operands: Sequence[float], stack: list[A
         bits = int(family[1:])
         return integer(int(operands[0]), bits) if family[0] == "i" else floating(operands[0], bits)
     right = stack.pop()
-    one = _UNARY.get(f"{family}.{name}") or _UNARY.get(name)
-    if one is not None and (family[0] == "f" or name not in _FLOATS_ALONE):
-        return one(right)
+    unary = _UNARY.get(f"{family}.{name}") or _UNARY.get(name)
+    if unary is not None and (family[0] == "f" or name not in _FLOATS_ALONE):
+        return unary(right)
     left = stack.pop()
     if family == "i32" and name == "add" and (isinstance(left, Pointer) or isinstance(right, Pointer)):
         pointer, more = (left, right) if isinstance(left, Pointer) else (right, left)

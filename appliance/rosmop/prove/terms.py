@@ -47,16 +47,16 @@ def floating(value: float, bits: int) -> Term:
 
 def both(*conditions: Term) -> Term:
     """All of them, shorter where that is known."""
-    rest = [one for one in conditions if not z3.is_true(one)]
-    if any(z3.is_false(one) for one in rest):
+    rest = [condition for condition in conditions if not z3.is_true(condition)]
+    if any(z3.is_false(condition) for condition in rest):
         return z3.BoolVal(False)
     return z3.BoolVal(True) if not rest else rest[0] if len(rest) == 1 else z3.And(*rest)
 
 
 def either(*conditions: Term) -> Term:
     """Any of them, shorter where that is known."""
-    rest = [one for one in conditions if not z3.is_false(one)]
-    if any(z3.is_true(one) for one in rest):
+    rest = [condition for condition in conditions if not z3.is_false(condition)]
+    if any(z3.is_true(condition) for condition in rest):
         return z3.BoolVal(True)
     return z3.BoolVal(False) if not rest else rest[0] if len(rest) == 1 else z3.Or(*rest)
 
@@ -76,11 +76,14 @@ def choice(test: Term, yes: Term, no: Term) -> Term:
     if z3.is_false(test) or yes is None:
         return no
     if is_dataclass(yes) and not isinstance(yes, type) and type(yes) is type(no):
-        parts = {one.name: choice(test, getattr(yes, one.name), getattr(no, one.name)) for one in fields(yes)}
+        parts = {
+            field.name: choice(test, getattr(yes, field.name), getattr(no, field.name))
+            for field in fields(yes)
+        }
         return replace(yes, **parts)
     if isinstance(yes, z3.ExprRef) and isinstance(no, z3.ExprRef):
         if z3.is_bool(yes) != z3.is_bool(no):
-            yes, no = (as_bits(one) if z3.is_bool(one) else one for one in (yes, no))
+            yes, no = (as_bits(truth) if z3.is_bool(truth) else truth for truth in (yes, no))
         if yes.sort() == no.sort():
             return yes if yes.eq(no) else z3.If(test, yes, no)
     elif isinstance(yes, int | str) and yes == no:
@@ -200,10 +203,12 @@ def abstracted(terms: Sequence[Term]) -> list[Term]:
             continue
         new = [known[part.get_id()] for part in parts]
         result = (
-            term.decl()(*new) if any(not one.eq(part) for one, part in zip(new, parts, strict=True)) else term
+            term.decl()(*new)
+            if any(not argument.eq(part) for argument, part in zip(new, parts, strict=True))
+            else term
         )
         if term.decl().kind() in _COSTLY and not _is_cheap(term.decl().kind(), new):
-            sorts = [*(one.sort() for one in new), result.sort()]
+            sorts = [*(argument.sort() for argument in new), result.sort()]
             result = z3.Function(" ".join(map(str, (term.decl(), *sorts))), *sorts)(*new)
         kept.append(term)
         known[term.get_id()] = result
@@ -212,7 +217,7 @@ def abstracted(terms: Sequence[Term]) -> list[Term]:
 
 def _is_cheap(kind: int, operands: Sequence[Term]) -> bool:
     """Whether it is an operation on constants, or a product with a small one."""
-    small = any(z3.is_bv_value(one) and one.as_long() < _SMALL for one in operands)
+    small = any(z3.is_bv_value(operand) and operand.as_long() < _SMALL for operand in operands)
     return (kind == z3.Z3_OP_BMUL and small) or all(map(_is_number, operands))
 
 
