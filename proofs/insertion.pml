@@ -149,7 +149,7 @@ byte last[PAIRS];                                                /* the number t
     :: linked -> assert(nfull(to_relay)); to_relay!message(a, b) \
     :: else \
     fi
-/* = appliance/specifications/stating.py Stating._answer */
+/* = appliance/specifications/rollout.py Rollout._answer */
 #ifdef MUTANT_ANY_ANSWER
 #define ANSWERS(revision, how) (waiting && (how) & ASKED)
 #else
@@ -200,7 +200,7 @@ inline take_grant(p, s) {
 
 /* --- control: specifications ------------------------------------------------------------------------------ */
 
-/* = appliance/specifications/stating.py Stating._settle */
+/* = appliance/specifications/rollout.py Rollout._settle */
 inline settle() {
     HAPPENS(loaded, trying, monitored[trying]);
     in_force = trying;
@@ -211,7 +211,7 @@ inline settle() {
     answered = in_force
 }
 
-/* = appliance/specifications/stating.py Stating._restate */
+/* = appliance/specifications/rollout.py Rollout._restate */
 inline take_back_trial() {
     trying = 0;
     waiting = false;
@@ -376,7 +376,7 @@ inline carry_out() {
     to_relay?message, number, flags;
     if
     /* = appliance/relay/monitors/middle.py Middle.state
-       = appliance/relay/monitors/compiling.py Compiler.later */
+       = appliance/relay/monitors/compiler.py Compiler.later */
     :: message == spec ->
         if
         :: AS_BEFORE -> SAY(taken, number, flags)
@@ -387,7 +387,7 @@ inline carry_out() {
             awaited = awaited || (flags & AHEAD);
             assert(nfull(compiling));
             compiling!number, flags
-        /* = appliance/relay/monitors/compiling.py Compiler.now */
+        /* = appliance/relay/monitors/compiler.py Compiler.now */
         :: !has && !blocked && len(compiling) == 0 && !monitored[number] -> swap(number, flags)
         :: !has && !blocked ->
             awaited = true;
@@ -565,9 +565,9 @@ inline find_upstream(p) {
 proctype RVMaster() POSSIBLE {
 end:
     do
-    /* = appliance/specifications/stating.py Stating._taken */
+    /* = appliance/specifications/rollout.py Rollout._taken */
     :: atomic { said == taken && waiting -> settle() }
-    /* = appliance/specifications/stating.py Stating._refused */
+    /* = appliance/specifications/rollout.py Rollout._refused */
     :: atomic { said == refused && waiting -> take_back_trial() }
     /* = appliance/master/reach/relays.py RelayControl._find_upstream */
     :: atomic { asked[0] == ASKING -> find_upstream(0) }
@@ -575,7 +575,7 @@ end:
     :: atomic { asked[1] == ASKING -> find_upstream(1) }
 #endif
     :: atomic { orders_done -> answer_policy() }
-    /* = appliance/specifications/stating.py Stating.lost */
+    /* = appliance/specifications/rollout.py Rollout.lost */
     :: atomic {
         lost -> lost = false;
         if
@@ -584,22 +584,22 @@ end:
         fi
        }
 #ifdef TRACE
-    /* = appliance/master/reach/carried.py Carried.opened
-       = appliance/master/reach/carried.py Carried.closed */
+    /* = appliance/master/reach/traffic.py Carried.opened
+       = appliance/master/reach/traffic.py Carried.closed */
     :: atomic { reports?[opened] && NEXT_IS(opened, 0, 0) -> reports?opened; at++ }
     :: atomic { reports?[closed] && NEXT_IS(closed, 0, 0) -> reports?closed; at++ }
     /* = appliance/master/upkeep/reminders.py Reminders._remind */
     :: atomic { linked && subscribed[0] && len(news[0]) == 0 && connection[0] == NONE && !request[0] -> tell(0) }
 #endif
     /* The relay does not answer in time.
-       = appliance/specifications/stating.py Stating._findings */
+       = appliance/specifications/rollout.py Rollout._findings */
     :: atomic { waiting -> take_back_trial() }
     od
 }
 
 /* Monitors are loaded, replaced and removed, one change after the other.
    = appliance/specifications/monitors.py Monitors._change
-   = appliance/specifications/stating.py Stating._try */
+   = appliance/specifications/rollout.py Rollout._try */
 proctype Specifications() POSSIBLE {
 end:
     do
@@ -683,7 +683,7 @@ end:
     :: atomic {
         up && HOLDS_NOTHING_BACK && len(to_relay) > 0 -> carry_out()
        }
-    /* = appliance/relay/monitors/compiling.py Compiler._ready */
+    /* = appliance/relay/monitors/compiler.py Compiler._ready */
     :: atomic {
         up && len(compiling) > 0 -> compiling?number, flags;
         if
@@ -805,7 +805,7 @@ end:
         fi
        }
     /* = appliance/master/reach/relays.py RelayControl.attach
-       = appliance/specifications/stating.py Stating.statement
+       = appliance/specifications/rollout.py Rollout.statement
        = appliance/master/reach/relays.py RelayControl._place
        = appliance/control/process.py _Control._relay_link
        = appliance/master/graph/graph.py Graph.tell_everybody */

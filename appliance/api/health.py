@@ -15,7 +15,7 @@ from appliance.api.services import Services
 from appliance.channel.admin import InventoryWanted, StatusWanted
 from appliance.channel.answers.inventory import Inventory
 from appliance.channel.answers.status import Status
-from appliance.channel.serving import unserved
+from appliance.channel.health import unserved
 
 _PATIENCE_SECONDS = 1.0
 

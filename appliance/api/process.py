@@ -20,12 +20,12 @@ from appliance.api.access import Doorkeeper
 from appliance.api.app import build_app
 from appliance.api.certificate import pin_of, tls_context
 from appliance.api.control import ControlLink
+from appliance.api.etags import Unchanged
 from appliance.api.gate import Gate
 from appliance.api.history import History, measures_of
 from appliance.api.journal import FOLD_SECONDS, Journal
 from appliance.api.listener import Listener
 from appliance.api.services import Services
-from appliance.api.unchanged import Unchanged
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.config import Settings, load_resolved

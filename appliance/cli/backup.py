@@ -10,7 +10,7 @@ from appliance.backup.create import back_up
 from appliance.backup.purge import purge as remove
 from appliance.backup.restore import restore as put_back
 from appliance.cli.output import Json, printable, refused, say, say_json
-from appliance.cli.running import DEFAULT_STATE, State
+from appliance.cli.target import DEFAULT_STATE, State
 
 _NewState = Annotated[
     Path,

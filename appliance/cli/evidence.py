@@ -19,8 +19,8 @@ from appliance.cli.audit.errors import Errors, fail
 from appliance.cli.output import Json, say, say_json, usage_error
 from appliance.cli.rest.orders import RestWay
 from appliance.cli.rest.session import ProblemError
-from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import Since, Until
+from appliance.cli.target import Appliance, speaks
 from appliance.evidence import verify as verifier_module
 from appliance.evidence.bundle import VERIFIER, BundleError, Kept, Span, export
 from appliance.fingerprints import fingerprint

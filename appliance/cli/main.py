@@ -22,7 +22,7 @@ VERBS: dict[str, Verb | Group] = {
     "audit": Group(
         "Review the audit log and prove that it is complete.",
         {
-            "why": Verb("policy.granting:why"),
+            "why": Verb("policy.grant:why"),
             "search": Verb("audit.verbs:search"),
             "tail": Verb("audit.verbs:tail"),
             "show": Verb("audit.verbs:show"),
@@ -43,15 +43,15 @@ VERBS: dict[str, Verb | Group] = {
         "Check, explain, test, compare, learn and change access policies.",
         {
             "learn": Verb("policy.learning:learn_policy"),
-            "reload": Verb("policy.running:reload"),
+            "reload": Verb("policy.in_force:reload"),
             "rollback": Verb(
-                "policy.running:rollback", "Bring a kept revision of the policy into force again."
+                "policy.in_force:rollback", "Bring a kept revision of the policy into force again."
             ),
-            "confirm": Verb("policy.running:confirm", _CONFIRM),
+            "confirm": Verb("policy.in_force:confirm", _CONFIRM),
             "revisions": Verb(
-                "policy.running:revisions", "List the kept revisions of the policy, the newest first."
+                "policy.in_force:revisions", "List the kept revisions of the policy, the newest first."
             ),
-            "grant": Verb("policy.granting:grant"),
+            "grant": Verb("policy.grant:grant"),
             "check": Verb("policy.verbs:check"),
             "explain": Verb("policy.verbs:explain_request"),
             "test": Verb("policy.verbs:test"),
@@ -64,16 +64,16 @@ VERBS: dict[str, Verb | Group] = {
             "check": Verb("monitor.verbs:check"),
             "run": Verb("monitor.verbs:run"),
             "learn": Verb("monitor.learning:learn_monitors"),
-            "replay": Verb("monitor.replaying:replay_monitor"),
+            "replay": Verb("monitor.replay:replay_monitor"),
             "coverage": Verb("monitor.coverage:coverage"),
-            "list": Verb("monitor.running:list_monitors"),
-            "margins": Verb("monitor.running:margins"),
-            "enable": Verb("monitor.running:enable"),
-            "promote": Verb("monitor.running:promote"),
-            "disable": Verb("monitor.running:disable"),
-            "load": Verb("monitor.running:load"),
-            "remove": Verb("monitor.running:remove"),
-            "reload": Verb("monitor.running:reload"),
+            "list": Verb("monitor.in_force:list_monitors"),
+            "margins": Verb("monitor.in_force:margins"),
+            "enable": Verb("monitor.in_force:enable"),
+            "promote": Verb("monitor.in_force:promote"),
+            "disable": Verb("monitor.in_force:disable"),
+            "load": Verb("monitor.in_force:load"),
+            "remove": Verb("monitor.in_force:remove"),
+            "reload": Verb("monitor.in_force:reload"),
             "revisions": Verb(
                 "monitor.revisions:revisions",
                 "List the kept revisions of the specifications, the newest first.",
@@ -85,9 +85,9 @@ VERBS: dict[str, Verb | Group] = {
                 "Bring a kept revision of the specifications into force again; what comes back is switched as it was.",
             ),
             "confirm": Verb("monitor.revisions:confirm", _CONFIRM),
-            "resume": Verb("monitor.running:resume"),
+            "resume": Verb("monitor.in_force:resume"),
             "reset": Verb("monitor.offline:reset"),
-            "rvstate": Verb("monitor.running:rv_state", hidden=True),
+            "rvstate": Verb("monitor.in_force:rv_state", hidden=True),
         },
     ),
     "topic": Group(

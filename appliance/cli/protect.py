@@ -16,7 +16,7 @@ import typer
 
 from appliance.channel.admin import HostPorts, StatusWanted
 from appliance.cli.admin_socket import NotRunningError
-from appliance.cli.running import Appliance, speaks
+from appliance.cli.target import Appliance, speaks
 from appliance.network import protect as protection
 from appliance.network.firewall.rules import PortRange
 from appliance.network.namespaces import Namespace, NetworkError

@@ -19,8 +19,8 @@ from appliance.channel.answers.recordings import RecordedMessages, Recording, Ti
 from appliance.cli import completion
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
 from appliance.cli.output import counted, printable, refused, say, say_json, usage_error
-from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
+from appliance.cli.target import Appliance, speaks
 from appliance.cli.topic import lines_of
 from appliance.recorder.bag_reader import Place
 from appliance.recorder.mcap import as_mcap

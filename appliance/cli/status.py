@@ -13,10 +13,10 @@ from appliance.api.moments import in_full
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.hosts import PortsSeen
 from appliance.channel.answers.status import FirewallState, IpsecState, PolicyState, Status
-from appliance.channel.serving import no_relay, probe_failed
+from appliance.channel.health import no_relay, probe_failed
 from appliance.cli.output import counted, say_json
-from appliance.cli.running import Appliance, speaks
 from appliance.cli.status_view import age, doubted_clock, lacking_walls, processes_table, shortened
+from appliance.cli.target import Appliance, speaks
 
 _PORT_STATES = ("closed", "open", "unknown")
 _MOST_NAMED = 8

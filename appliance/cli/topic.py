@@ -11,7 +11,7 @@ from appliance.channel import admin
 from appliance.channel.answers.graph import Topic, TopicMessage
 from appliance.cli import completion
 from appliance.cli.output import printable, say, say_json, usage_error
-from appliance.cli.running import Appliance, speaks
+from appliance.cli.target import Appliance, speaks
 
 _AT_ONCE = 20  # messages of one look
 _Topic = Annotated[str, typer.Argument(metavar="TOPIC", show_default=False, autocompletion=completion.topics)]

@@ -9,8 +9,8 @@ import typer
 from appliance.channel.admin import AdminRequest
 from appliance.channel.answers import monitors, policy
 from appliance.cli.output import say, say_json
-from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
+from appliance.cli.target import Appliance, speaks
 
 _Listed = TypeVar("_Listed", policy.PolicyRevisionList, monitors.MonitorRevisionList)
 _Confirmed = TypeVar("_Confirmed", policy.PolicyConfirmed, monitors.MonitorsConfirmed)

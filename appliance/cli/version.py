@@ -2,7 +2,7 @@
 
 from appliance.channel.admin import InventoryWanted
 from appliance.cli.output import say, say_json
-from appliance.cli.running import Appliance, speaks
+from appliance.cli.target import Appliance, speaks
 from appliance.inventory import inventory
 
 

@@ -41,12 +41,12 @@ from appliance.master.graph.registry import Life, Registry
 from appliance.master.graph.revocation import Revocation, revoked
 from appliance.master.parameter_charges import ParameterCharges
 from appliance.master.parameter_mirror import ParameterMirror
-from appliance.master.reach.carried import Carried
 from appliance.master.reach.delivery import Delivery
 from appliance.master.reach.faces import Faces, InnerFace
 from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Addresses, Places
 from appliance.master.reach.relays import RelayControl
+from appliance.master.reach.traffic import Carried
 from appliance.master.rosmaster import RosMaster, limits_of_answers, own_parameters
 from appliance.master.upkeep.arrivals import Arrivals
 from appliance.master.upkeep.enactor import Enactor

@@ -11,9 +11,9 @@ from appliance.channel.answers.status import Status
 from appliance.channel.messages import MonitorRow
 from appliance.control.assembly import Parts
 from appliance.master.graph.registry import Life
-from appliance.master.reach.carried import MOST_RESOURCES, OTHERS, Carried, Traffic
+from appliance.master.reach.traffic import MOST_RESOURCES, OTHERS, Carried, Traffic
 from appliance.policy.model import Category
-from appliance.specifications.observed import KINDS
+from appliance.specifications.records import KINDS
 
 MOST_DELAYED = 200  # topics with a histogram of their own
 MOST_MARGINS = 1000  # series

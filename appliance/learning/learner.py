@@ -17,7 +17,7 @@ from appliance.learning.fields import Fields, MessageError
 from appliance.learning.orders import Orders
 from appliance.learning.recordings import Part, Received, Recording, Windows, split
 from appliance.learning.topics import Content, Rhythm
-from appliance.learning.writing import on, specifications
+from appliance.learning.writer import on, specifications
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.rosmop.engine import MonitorSet

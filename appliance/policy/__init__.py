@@ -8,7 +8,7 @@ from appliance.policy.compiler import compile_policy
 from appliance.policy.diff import Difference, diff
 from appliance.policy.explain import Explanation, explain
 from appliance.policy.findings import Finding, PolicyError, Severity
-from appliance.policy.judging import Judged, Known, judge
+from appliance.policy.judgement import Judged, Known, judge
 from appliance.policy.live import Ending, Live, endings
 from appliance.policy.model import Address, Category, Decision, Request, Rule
 from appliance.policy.policy import Policy

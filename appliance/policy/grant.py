@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from appliance.policy.compiler import compile_policy
 from appliance.policy.findings import Findings, PolicyError
-from appliance.policy.judging import Known, judge
+from appliance.policy.judgement import Known, judge
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
 from appliance.policy.reader import Entry, SectionText, Word, read

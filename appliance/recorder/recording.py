@@ -23,7 +23,7 @@ from appliance.audit.record import Severity
 from appliance.channel.answers.recordings import RecordedTopic, Recording, Trigger
 from appliance.channel.messages import RevisionsStated
 from appliance.recorder.bag import BagWriter, Message
-from appliance.recorder.reading import MOST_MESSAGES, Found, Place, RingReader
+from appliance.recorder.ring_reader import MOST_MESSAGES, Found, Place, RingReader
 from appliance.recorder.shelf import ABOUT, BAG, PROGRESS
 from appliance.ros.log_message import ERROR, INFO, TYPE, WARN, log_message
 from appliance.ros.standard import standard_definitions

@@ -1,7 +1,7 @@
 """A recording on a time line, and its messages around a moment: what people ask after an incident.
 
 Both are bounded, however large the recording is: a time line has so many columns, topics and events, and says what it
-leaves out; of messages so many are read. Messages are read within the bounds of `ros/reading.py`.
+leaves out; of messages so many are read. Messages are read within the bounds of `ros/message_view.py`.
 
 What happened is read from the bag as well, from the audit records that the recorder has written into it: retention may
 have removed them from the log since. A publisher of the same topic has a host in its header; the recorder has none.
@@ -32,7 +32,7 @@ from appliance.recorder.bag import INDEX_ENTRY
 from appliance.recorder.bag_reader import BagReader, Place
 from appliance.recorder.recording import LOG, RECORDS
 from appliance.recorder.triggers import kinds_of
-from appliance.ros.reading import PublisherReader
+from appliance.ros.message_view import PublisherReader
 
 COLUMNS, MOST_COLUMNS = 200, 1000
 NEIGHBOURS, MOST_NEIGHBOURS = 5, 25

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from appliance.relay.monitors.places import Place
-from appliance.rosmop.walking import Walked, Walker
+from appliance.rosmop.walks import Walked, Walker
 
 
 class Count(NamedTuple):

@@ -40,7 +40,7 @@ from appliance.relay.loop import Loop
 from appliance.relay.monitors.middle import Middle
 from appliance.relay.monitors.own import OwnPublisher
 from appliance.relay.monitors.places import Place
-from appliance.relay.recorded import Recorded
+from appliance.relay.recorder_ring import Recorded
 from appliance.relay.report import Reporter
 from appliance.shares.pool import Standing
 

@@ -1,8 +1,8 @@
 """Looks into topics: a few messages, read for a person as subscribers get them, and told to control.
 
 A message is read here, where strangers' bytes are, by the definition in its publisher's header; what goes to control
-is bounded: `ros/reading.py` cuts long values, and a look has at most `MOST_MESSAGES`. The definition is read once for
-a look and a publisher. A topic that nobody looks into costs nothing.
+is bounded: `ros/message_view.py` cuts long values, and a look has at most `MOST_MESSAGES`. The definition is read once
+for a look and a publisher. A topic that nobody looks into costs nothing.
 """
 
 import time
@@ -13,7 +13,7 @@ from typing import Any
 from appliance.channel.messages import LookWanted, Message, MessageSeen
 from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.topic import RelayedTopic
-from appliance.ros.reading import PublisherReader
+from appliance.ros.message_view import PublisherReader
 
 MOST_LOOKS = 8
 MOST_MESSAGES = 20

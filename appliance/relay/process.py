@@ -18,7 +18,7 @@ from appliance.relay.connections.sockets import congestion_control
 from appliance.relay.engine import Engine
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
-from appliance.relay.recorded import Recorded
+from appliance.relay.recorder_ring import Recorded
 
 _DESCRIPTORS_BESIDE = 1024
 

@@ -12,7 +12,7 @@ Theory of operation:
    a message, and deadlines before it, happen first; `process` returns them in `before`. While no message comes,
    the caller calls `advance` when `next_due` has come; a deadline may have been put off since. Ticks that take longer
    than the caller's `patience` allows are left out, and that is logged; deadlines wait for the next time.
-4. `walker` offers, for most topics, a walk that does what `process` does to many messages at once (`walking.py`), as
+4. `walker` offers, for most topics, a walk that does what `process` does to many messages at once (`walks.py`), as
    far as these need nothing that is recorded or explained. Its results differ in nothing but the time that they take.
 5. `replaced` makes the set that follows: one swap between two messages. Specifications whose text is the same
    keep their variables and runs.
@@ -46,7 +46,7 @@ from appliance.rosmop.slices import LIMIT, Key, Slice
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.parser import parse
-from appliance.rosmop.walking import Walker, Walks, walks_of
+from appliance.rosmop.walks import Walker, Walks, walks_of
 from appliance.rosmop.why import NOBODY, Bound, Sender, of_slice
 
 OnFault = Literal["drop", "pass"]

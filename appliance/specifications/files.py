@@ -13,7 +13,7 @@ import msgspec
 
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
-from appliance.ros.reading import read_fields
+from appliance.ros.message_view import read_fields
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.certify.properties import certificates_of
 from appliance.rosmop.engine import MonitorSet

@@ -46,9 +46,9 @@ from appliance.specifications.files import (
     check,
 )
 from appliance.specifications.folder import SpecificationFolder
-from appliance.specifications.observed import MonitorRecords
+from appliance.specifications.records import MonitorRecords
 from appliance.specifications.relays import Relays
-from appliance.specifications.stating import TRIAL, Revision, Stating, Switch
+from appliance.specifications.rollout import TRIAL, Revision, Rollout, Switch
 from appliance.store.revisions import Trial, UnknownRevisionError, wanted
 from appliance.store.state import MonitorRevisionRow, StateStore
 
@@ -113,7 +113,7 @@ class Monitors:
         self.site_keys = site_keys
         self._store = store
         self._trail = trail
-        self._stating = Stating(allocation, trail, on_fault, self._states_of, relays, slices=slices)
+        self._rollout = Rollout(allocation, trail, on_fault, self._states_of, relays, slices=slices)
         self._switches: dict[str, Switch] = {}
         self._states: dict[str, Switch] = {}  # of those in force
         self._acts = 0  # switches and resumptions, ever
@@ -158,7 +158,7 @@ class Monitors:
                 if sources.files or last is not None:
                     self._keep(sources, checked, who=_DISK, note="read at start")
         now = Revision(self.revision, self.sources, self.checked)
-        self._stating.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
+        self._rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
         unknown = sorted(self._named() - self.checked.monitors.keys())
         if unknown and self.who == _DISK and not restarted:
             raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
@@ -175,17 +175,17 @@ class Monitors:
     @property
     def refused(self) -> list[str]:
         """Why a relay does not take what is in force; empty when all do."""
-        return self._stating.refused
+        return self._rollout.refused
 
     @property
     def held(self) -> set[str]:
         """The monitors that hold their topics."""
-        return self._stating.held
+        return self._rollout.held
 
     @property
     def rows(self) -> Mapping[str, messages.MonitorRow]:
         """State and counters of the monitors."""
-        return self._stating.rows
+        return self._rollout.rows
 
     @property
     def differs_from_folder(self) -> bool:
@@ -233,7 +233,7 @@ class Monitors:
 
     def statement(self, relay: int = 0) -> messages.SpecificationsStated:
         """What a relay is told before anything else."""
-        return self._stating.statement(relay)
+        return self._rollout.statement(relay)
 
     # --- changing ---
 
@@ -367,7 +367,7 @@ class Monitors:
                 text = f"{', '.join(disabled)} is disabled, not on trial: rosrv monitor enable"
                 raise SpecificationsRefusedError([text])
             names = await self._switch(request.names, TRIAL if request.trial else True, who)
-            return self._switched(names, self._stating.began(names))
+            return self._switched(names, self._rollout.began(names))
 
     def _switched(self, names: list[str], began: Sequence[str] = ()) -> Switched:
         return Switched(names, self.revision, self.tag, [*began])
@@ -385,7 +385,7 @@ class Monitors:
         self._switches = after
         if retried:
             try:
-                await self._stating.take(Revision(self.revision, self.sources, self.checked))
+                await self._rollout.take(Revision(self.revision, self.sources, self.checked))
             except SpecificationsRefusedError:
                 self._switches = before
                 raise
@@ -393,11 +393,11 @@ class Monitors:
         for name in changed:
             self._states[name] = to
             if not retried:
-                self._stating.tell(name, messages.MonitorSwitched(name, to is True))
+                self._rollout.tell(name, messages.MonitorSwitched(name, to is True))
             self._say_switched(name, word, who, f"{name} is {word}")
         self._store.save_setting(_SWITCHES, json.dumps(self._switches))
         await self._store.settled()
-        await self._stating.carried_out()
+        await self._rollout.carried_out()
         return changed
 
     def _say_switched(self, name: str, word: str, who: str, text: str) -> None:
@@ -423,10 +423,10 @@ class Monitors:
                 await self._count()
             away = []
             for name in held:
-                if not self._stating.tell(name, messages.MonitorResumed(name)):
+                if not self._rollout.tell(name, messages.MonitorResumed(name)):
                     away.append(name)
                     continue
-                self._stating.resumed(name)
+                self._rollout.resumed(name)
                 self._trail.happened(
                     "monitor resumed",
                     f"the topics of {name} go on",
@@ -440,7 +440,7 @@ class Monitors:
                     f"{', '.join(away)} not resumed: the relay process is away; resume when it is there again"
                 )
                 raise SpecificationsRefusedError([text])
-            await self._stating.carried_out()
+            await self._rollout.carried_out()
             return self._switched(held)
 
     # --- what the relay says ---
@@ -450,11 +450,11 @@ class Monitors:
         if isinstance(message, messages.MonitorsReported):
             self.records.reported(message.events, message.lost)
         else:
-            self._stating.received(message, relay)
+            self._rollout.received(message, relay)
 
     def relay_lost(self, relay: int) -> None:
         """A relay is gone."""
-        self._stating.lost(relay)
+        self._rollout.lost(relay)
 
     # --- inside ---
 
@@ -538,7 +538,7 @@ class Monitors:
             torn = self._torn(self._states_of(checked) | in_force, checked)
             if torn:
                 raise SpecificationsRefusedError([torn])
-            moved = await self._stating.take(Revision(before + 1, sources, checked))
+            moved = await self._rollout.take(Revision(before + 1, sources, checked))
         except SpecificationsRefusedError as error:
             self._switches = switched
             hint = [f"not of the folder, and kept: {', '.join(kept)} (prune removes them)"] if kept else []
@@ -551,14 +551,14 @@ class Monitors:
                 who=who,
             )
             raise SpecificationsRefusedError(findings) from error
-        began = self._stating.began(checked.monitors)
+        began = self._rollout.began(checked.monitors)
         self._trial.announce(before, confirm_within)
         self._keep(sources, checked, who=keeper, note=note, by=who, began=began)
         self._trial.changed(before, confirm_within)
         await self._store.settled()
-        await self._stating.all_taken()
+        await self._rollout.all_taken()
         self._published()
-        began = self._stating.began(checked.monitors)  # by those that have it only now, too
+        began = self._rollout.began(checked.monitors)  # by those that have it only now, too
         return self._replaced(before, sources.difference(previous), moved, began, kept)
 
     def _replaced(

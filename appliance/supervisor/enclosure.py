@@ -31,11 +31,11 @@ from appliance.network.endpoint import Endpoint, only_address
 from appliance.network.esp import Esp, choose_esp
 from appliance.network.firewall.firewall import Firewall
 from appliance.network.firewall.rules import FirewallSettings, Forwarder, OwnNode, PortRange
+from appliance.network.host_namespace import bridges, is_contained, lives_on_the_machines_network
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.probe import probe_port
 from appliance.network.protect import local_port_range
-from appliance.network.shared import bridges, is_contained, lives_on_the_machines_network
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.users import account_of
 

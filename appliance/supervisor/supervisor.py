@@ -31,10 +31,8 @@ from appliance.ipsec.charon import PROGRAM as CHARON
 from appliance.supervisor import health, signals
 from appliance.supervisor.clock import clock_is_synchronised
 from appliance.supervisor.enclosure import Enclosure
-from appliance.supervisor.ending import end_all
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.guard import Guard
-from appliance.supervisor.kept import KeptSockets, RefusedSocketError
 from appliance.supervisor.life import (
     ANSWER_SECONDS,
     FIRST_ANSWER_SECONDS,
@@ -43,9 +41,11 @@ from appliance.supervisor.life import (
     Reports,
     link,
 )
+from appliance.supervisor.listeners import KeptSockets, RefusedSocketError
 from appliance.supervisor.post import Post
 from appliance.supervisor.rings import Rings
 from appliance.supervisor.roles import Facts, Role
+from appliance.supervisor.shutdown import end_all
 from appliance.supervisor.users import account_of
 
 ADMIN = "admin"

@@ -19,10 +19,10 @@ from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
 from appliance.master.graph.revocation import Revocation, revoked
-from appliance.master.reach.carried import Carried
 from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Places
 from appliance.master.reach.relays import RelayControl
+from appliance.master.reach.traffic import Carried
 from appliance.master.rosmaster import RosMaster
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import Entries

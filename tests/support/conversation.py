@@ -36,9 +36,9 @@ from appliance.master.graph.effects import (
     WithdrawNode,
 )
 from appliance.master.graph.registry import Incarnation
-from appliance.master.reach.carried import Carried
 from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.relays import RelayControl
+from appliance.master.reach.traffic import Carried
 from appliance.ros.xmlrpc import Value
 from appliance.specifications.allocation import Allocation
 from tests.support.control_parts import ControlParts

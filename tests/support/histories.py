@@ -38,9 +38,9 @@ from appliance.master.graph.effects import Effect, Place, PlaceGrant, PlaceNode,
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Registry, SaveRegistration
 from appliance.master.graph.revocation import Revocation
-from appliance.master.reach.carried import Carried
 from appliance.master.reach.delivery import Delivery
 from appliance.master.reach.relays import RelayControl
+from appliance.master.reach.traffic import Carried
 from appliance.master.upkeep import arrivals as arrivals_module
 from appliance.master.upkeep import liveness as liveness_module
 from appliance.master.upkeep.arrivals import Arrivals

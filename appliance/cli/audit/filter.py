@@ -12,8 +12,8 @@ from appliance.audit.moment import parse_moment
 from appliance.audit.query import Filter
 from appliance.audit.record import Severity
 from appliance.cli.audit.errors import Errors
-from appliance.cli.running import Appliance
 from appliance.cli.spans import Since, Until
+from appliance.cli.target import Appliance
 
 _P = ParamSpec("_P")
 

@@ -32,7 +32,7 @@ from appliance.cli.audit.output import (
     write,
 )
 from appliance.cli.progress import progress
-from appliance.cli.running import Appliance, speaks
+from appliance.cli.target import Appliance, speaks
 
 _POLL_SECONDS = 0.2
 _CHECKPOINT_SECONDS = 5.0  # between two looks: one is made a minute, and a look over REST is itself recorded

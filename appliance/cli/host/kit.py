@@ -11,7 +11,7 @@ from appliance.channel.admin import HostEndpoint
 from appliance.channel.answers.hosts import EnrolmentToken, KitParts
 from appliance.cli.host.output import Output, usage_error
 from appliance.cli.output import moment, say_json
-from appliance.cli.running import Appliance
+from appliance.cli.target import Appliance
 from appliance.ipsec.kit import archive
 from appliance.ipsec.requests import make_key, signing_request
 

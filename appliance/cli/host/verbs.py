@@ -13,8 +13,8 @@ from appliance.cli import completion
 from appliance.cli.host.kit import KitWriter, placed, wishes_of, write_script
 from appliance.cli.host.output import new_output, usage_error
 from appliance.cli.output import moment, say, say_json
-from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import span_given
+from appliance.cli.target import Appliance, speaks
 
 _Name = Annotated[
     str,

@@ -6,7 +6,7 @@ from typing import Any
 
 from appliance.audit.why import lines_of_why
 from appliance.cli.output import say, say_json
-from appliance.rosmop.explained import why_of
+from appliance.rosmop.explanations import why_of
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.outcomes import Fault, Outcome, Verdict, bound
 from appliance.rosmop.positions import Finding

@@ -7,9 +7,9 @@ import typer
 
 from appliance.channel.admin import MonitorConfirm, MonitorRevisions, MonitorRevisionWanted, MonitorRollback
 from appliance.channel.answers.monitors import RevisionTexts
-from appliance.cli.monitor.running import say_replaced
+from appliance.cli.monitor.in_force import say_replaced
 from appliance.cli.output import say, say_json, usage_error
-from appliance.cli.running import Appliance, speaks
+from appliance.cli.target import Appliance, speaks
 from appliance.cli.trials import verbs_of
 
 _Revision = Annotated[int | None, typer.Argument(help="A kept revision; without it, the one in force")]

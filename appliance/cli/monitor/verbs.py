@@ -74,7 +74,7 @@ def check(
         ]
         _draw(properties, dot, svg)
         if prove:
-            from appliance.cli.monitor.proving import say_proofs  # noqa: PLC0415  its package may be missing
+            from appliance.cli.monitor.proof import say_proofs  # noqa: PLC0415  its package may be missing
 
             errors += say_proofs(monitors, as_json=as_json)
     raise typer.Exit(1 if errors else 0)

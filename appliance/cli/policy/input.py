@@ -16,7 +16,7 @@ from appliance.audit.query import Filter, FilterError
 from appliance.channel.admin import RegistrationsWanted
 from appliance.cli import output
 from appliance.cli.admin_socket import NotRunningError
-from appliance.cli.running import Appliance
+from appliance.cli.target import Appliance
 from appliance.policy import Address, Category, Known, Live, Policy, Request
 from appliance.policy.actions import BadWordError, find_hosts
 from appliance.policy.hosts import Network, canonical_address, canonical_network

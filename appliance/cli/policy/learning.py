@@ -15,8 +15,8 @@ from appliance.audit.query import Filter, FilterError
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.output import counted, printable, say_json
 from appliance.cli.policy.input import Robot, networks_of, request_of, usage_error
-from appliance.cli.running import Appliance, speaks
 from appliance.cli.spans import Since
+from appliance.cli.target import Appliance, speaks
 from appliance.policy import Category, PolicyError, compile_policy
 from appliance.policy.learn import Learned, Observation, learn
 

@@ -12,7 +12,7 @@ from msgspec.structs import asdict
 
 from appliance.channel.admin import AdminAnswer, PolicyWanted
 from appliance.cli.policy.input import known_of, live_now, read_text
-from appliance.cli.running import Appliance
+from appliance.cli.target import Appliance
 from appliance.policy import Ending, Finding, Known, PolicyError, Severity, endings, judge
 from appliance.site_keys import read_signature
 

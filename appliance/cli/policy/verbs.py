@@ -25,7 +25,7 @@ from appliance.cli.policy.input import (
     usage_error,
 )
 from appliance.cli.policy.trial import Trial, try_policy
-from appliance.cli.running import Appliance, speaks
+from appliance.cli.target import Appliance, speaks
 from appliance.policy import (
     Category,
     Decision,

@@ -14,9 +14,9 @@ from rich.text import Text
 
 from appliance.cli.admin_socket import ADMIN_SOCKET, AdminSocket
 from appliance.cli.output import counted, printable, say_json
-from appliance.cli.running import Appliance, speaks
 from appliance.cli.selftest.findings import Found, fail
 from appliance.cli.tables import say_table
+from appliance.cli.target import Appliance, speaks
 from appliance.config import Settings, load_resolved
 from appliance.config_sources import ConfigError, resolve
 
@@ -66,7 +66,7 @@ def selftest(
 
 
 def _all(appliance: Appliance, config: Path | None) -> Iterator[Found]:
-    from appliance.cli.selftest.running import running  # noqa: PLC0415  after what can be said without it
+    from appliance.cli.selftest.live import running  # noqa: PLC0415  after what can be said without it
 
     if appliance.place is not None:
         yield from running(appliance)

@@ -16,10 +16,10 @@ from appliance.channel.answers.graph import Flow
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reach.carried import Carried, Connection, Traffic
 from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Places
 from appliance.master.reach.topic_looks import TopicLooks
+from appliance.master.reach.traffic import Carried, Connection, Traffic
 from appliance.policy import Policy
 from appliance.policy.limits import Part, Rate
 from appliance.policy.model import address_of

@@ -1,6 +1,6 @@
 """One topic of one incarnation on its way through the monitors.
 
-The messages of a batch are taken many at a time where they need nothing but the common (`rosmop/walking.py`), one by
+The messages of a batch are taken many at a time where they need nothing but the common (`rosmop/walks.py`), one by
 one where there is something to tell; what nobody changed or dropped leaves in the buffer it came in.
 
 A message that comes alone costs little work and much fetching: at a thousand a second other programs have filled
@@ -16,14 +16,14 @@ from typing import Protocol
 from appliance.relay.connections.frames import Batch
 from appliance.relay.counts import Counts
 from appliance.relay.monitors.observations import SHOWN
+from appliance.relay.monitors.observer import Observer
 from appliance.relay.monitors.passage import Passage
 from appliance.relay.monitors.places import HEAD, Place, Senders, Sighting
-from appliance.relay.monitors.telling import Telling
 from appliance.relay.monitors.trials import Trials
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.context import BUDGET
-from appliance.rosmop.walking import Prepared, Walked, Walker
+from appliance.rosmop.walks import Prepared, Walked, Walker
 
 LONGEST = 2.0
 """Seconds of processor time that monitors may take until the loop comes to its timers again."""
@@ -52,7 +52,7 @@ class Monitors(Protocol):
     sight: object
     """Another one whenever something has happened that changes what may be prepared."""
 
-    telling: Telling
+    observer: Observer
     """What is told to control."""
 
     trials: Trials
@@ -101,7 +101,7 @@ class Lane:
             self._failed(error, self._walker, now)
             return self._through(batch, Passage(batch, now))
         if not self._counts.begun:
-            middle.telling.owe(self._counts)
+            middle.observer.owe(self._counts)
         if walked is None:
             return batch
         gone = self._counts.add(walked, now)
@@ -116,7 +116,7 @@ class Lane:
 
     def _failed(self, error: Exception, walker: Walker, now: int) -> None:
         """The walk of this topic is not right: tell it, and leave everything to the engine from now on."""
-        self._middle.telling.defect(error, self._place, now)
+        self._middle.observer.defect(error, self._place, now)
         self._defect = walker
         self._sight = None
 
@@ -158,7 +158,7 @@ class Lane:
         if began is not None:
             middle.spent += time.thread_time() - began
         if not counts.begun:
-            middle.telling.owe(counts)
+            middle.observer.owe(counts)
         if walked is None:
             passage.walked(passage.end, passage.run, 0)
             return True
@@ -177,21 +177,21 @@ class Lane:
             first = position + 4
             size = _unpack_length(passage.view, position)[0]
             sighting = Sighting(passage, position, bytes(passage.view[first : first + min(size, head)]))
-            self._middle.telling.said(line, self._place, passage.time, sighting)
+            self._middle.observer.said(line, self._place, passage.time, sighting)
 
     def _prepare(self, monitors: MonitorSet, walker: Walker) -> tuple[Prepared, Counts]:
         """Ask once what holds for all batches until something happens."""
-        telling, place = self._middle.telling, self._place
+        observer, place = self._middle.observer, self._place
         prepared, counts = self._prepared, self._counts
         if counts is None or counts.walker is not walker:
             counts = self._counts = Counts(walker, place)
         if prepared is None or self._sight is not self._middle.sight or self._walker is not walker:
             prepared = self._prepared = walker.prepare(
-                loud=walker.changes and telling.shows(place),
-                told=[not telling.hides_drop(monitor, place) for monitor in walker.monitors]
+                loud=walker.changes and observer.shows(place),
+                told=[not observer.hides_drop(monitor, place) for monitor in walker.monitors]
                 if walker.drops
                 else (),
-                counted=[telling.hides_verdict(verdict, place) for verdict in walker.verdicts],
+                counted=[observer.hides_verdict(verdict, place) for verdict in walker.verdicts],
                 source=self._source,
                 changed=counts.changed,
             )
@@ -201,10 +201,10 @@ class Lane:
 
     def _one_by_one(self, monitors: MonitorSet, passage: Passage, count: int) -> None:
         """Give so many messages to the engine."""
-        middle, place, now, telling = self._middle, self._place, passage.time, self._middle.telling
+        middle, place, now, observer = self._middle, self._place, passage.time, self._middle.observer
         view, position, end = passage.view, passage.position, passage.end
         process, topic = monitors.process, place[1]
-        shows = telling.shows(place)
+        shows = observer.shows(place)
         contexts = monitors.contexts(topic)
         head = HEAD if monitors.stamped(topic) else 0
         number = passage.number_at(position) if monitors.taps(topic) else 0
@@ -224,19 +224,19 @@ class Lane:
                     else dropped(body, now, TOO_LONG)
                 )
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-                outcome = dropped(body, now, telling.defect(error, place, now, sighting))
+                outcome = dropped(body, now, observer.defect(error, place, now, sighting))
             if monitors.tapped:
                 middle.trials.wait(place, sighting.at(number + looked))
             if outcome.events or outcome.log or outcome.faults or outcome.before:
-                telling.told(outcome, place, sighting)
+                observer.told(outcome, place, sighting)
             result = outcome.result
             if result == "dropped":
                 if outcome.overwritten:
                     outcome.restore(body)  # it is told as it was received
-                telling.dropped(outcome, place, body, sighting)
+                observer.dropped(outcome, place, body, sighting)
                 passage.cut(position, following)
             elif result == "changed":
-                telling.changed(outcome, place, before, len(body), sighting)
+                observer.changed(outcome, place, before, len(body), sighting)
                 shows = False
                 if outcome.buffer is not body:
                     passage.replace(position, following, outcome.buffer)
@@ -259,7 +259,7 @@ class Lane:
             following = position + 4 + _unpack_length(passage.view, position)[0]
             body = passage.view[position + 4 : following]
             outcome = dropped(body, passage.time, self._middle.blocked)
-            self._middle.telling.dropped(outcome, self._place, body, Sighting(passage, position, b""))
+            self._middle.observer.dropped(outcome, self._place, body, Sighting(passage, position, b""))
             position = following
         return None
 

@@ -26,12 +26,12 @@ from appliance.channel.messages import (
     SpecificationsTaken,
 )
 from appliance.relay.loop import Loop, Timer
-from appliance.relay.monitors.compiling import Compiler, Result
+from appliance.relay.monitors.compiler import Compiler, Result
 from appliance.relay.monitors.lane import LONGEST, TOO_LONG, Lane, dropped
 from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
+from appliance.relay.monitors.observer import Observer, refusal
 from appliance.relay.monitors.places import NOWHERE, Place, Senders
-from appliance.relay.monitors.telling import Telling, refusal
 from appliance.relay.monitors.trials import Trials
 from appliance.relay.report import Reporter
 from appliance.rosmop.engine import MonitorSet
@@ -82,8 +82,8 @@ class Middle:
         self._changed = changed
         self.senders = Senders()
         self._margins = Margins()
-        self.telling = Telling(self.observations, publish, self._margins, self.senders)
-        self._on_trial = Telling(
+        self.observer = Observer(self.observations, publish, self._margins, self.senders)
+        self._on_trial = Observer(
             self.observations, lambda _published: None, self._margins, self.senders, "trial "
         )
         self.trials = Trials(loop, self.now, self._on_trial)
@@ -112,7 +112,7 @@ class Middle:
         if isinstance(result, list):
             self._refuse(message, result)
             return
-        result.explain_when(self.telling.asks, self._on_trial.asks)
+        result.explain_when(self.observer.asks, self._on_trial.asks)
         before, now, blocked = self.monitors, self.now(), self.blocked
         if before is None:
             outcome = result.start(now, restarted=message.restarted)
@@ -127,8 +127,8 @@ class Middle:
             monitor.held = monitor.held or (
                 monitor.code.hold and monitor.name in message.moved and monitor.name in began
             )
-        self.telling.keep([monitor.name for monitor in result.monitors], began, now)
-        self.telling.told(outcome, NOWHERE)
+        self.observer.keep([monitor.name for monitor in result.monitors], began, now)
+        self.observer.told(outcome, NOWHERE)
         self.trials.take(result, outcome)
         anew = None if before is None or blocked else _topics(_replaced(before, result))
         self._taken(message, began, anew)
@@ -248,7 +248,7 @@ class Middle:
         """A second is over."""
         self.look_again()
         self.spent = 0.0
-        self.telling.tick(self.now())
+        self.observer.tick(self.now())
         self.trials.tick()
         if self.monitors is not None:
             self._margins.take(self.monitors, self.now())
@@ -266,7 +266,7 @@ class Middle:
     def _rows(self) -> list[MonitorRow]:
         if self.monitors is None:
             return []
-        rows = self.telling.rows(self.monitors.monitors, self.now())
+        rows = self.observer.rows(self.monitors.monitors, self.now())
         return rows + self._on_trial.rows(self.monitors.tried, self.now())
 
     def _service(self, place: Place, part: str, body: bytes) -> Judged:
@@ -285,17 +285,17 @@ class Middle:
                 service, part, bytearray(body), now, Sender(self.senders.number(place))
             )
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-            outcome = dropped(view, now, self.telling.defect(error, place, now))
+            outcome = dropped(view, now, self.observer.defect(error, place, now))
         if self.monitors.tapped:
             self.trials.wait(place, None)
-        self.telling.told(outcome, place)
+        self.observer.told(outcome, place)
         self.spent += time.thread_time() - began
         self.schedule()
         if outcome.result == "dropped":
-            self.telling.dropped(outcome, place, view)
+            self.observer.dropped(outcome, place, view)
             return Judged(b"", refusal(outcome, part))
         if outcome.result == "changed":
-            self.telling.changed(outcome, place, body[:SHOWN], len(body))
+            self.observer.changed(outcome, place, body[:SHOWN], len(body))
             return Judged(bytes(outcome.buffer))
         return Judged(body)
 
@@ -323,10 +323,10 @@ class Middle:
         began = time.thread_time()
         try:
             for outcome in self.monitors.advance(self.now()):
-                self.telling.told(outcome, NOWHERE)
+                self.observer.told(outcome, NOWHERE)
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
             now = self.now()
-            self.telling.defect(error, NOWHERE, now)
+            self.observer.defect(error, NOWHERE, now)
             self._due = now + int(_AFTER_DEFECT * 1e9)
             self._timer = self._loop.after(_AFTER_DEFECT, self._advance)
             return

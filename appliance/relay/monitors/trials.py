@@ -15,8 +15,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from appliance.relay.loop import Loop, Timer
+from appliance.relay.monitors.observer import Observer
 from appliance.relay.monitors.places import NOWHERE, Place, Sighting
-from appliance.relay.monitors.telling import Telling
 from appliance.rosmop.engine import TRIAL_BUDGET, MonitorSet, Tapped
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.why import Sender
@@ -43,10 +43,10 @@ class _Waiting(NamedTuple):
 class Trials:
     """What waits for the specifications on trial, and when they have their turn."""
 
-    def __init__(self, loop: Loop, now: Callable[[], int], telling: Telling) -> None:
+    def __init__(self, loop: Loop, now: Callable[[], int], observer: Observer) -> None:
         self._loop = loop
         self._now = now
-        self._telling = telling
+        self._observer = observer
         self._monitors: MonitorSet | None = None
         self.waiting: deque[_Waiting] = deque()
         self._bytes = 0
@@ -64,14 +64,14 @@ class Trials:
             self._miss(waiting.tapped.trial, waiting.place, _TOO_SLOW)
         self.waiting.clear()
         self._bytes = 0
-        return self._telling.incomplete
+        return self._observer.incomplete
 
     def take(self, monitors: MonitorSet, outcome: Outcome) -> None:
         """These have taken over, and this came of their beginning."""
         self._monitors = monitors
-        self._telling.keep([monitor.name for monitor in monitors.tried], list(monitors.began), self._now())
+        self._observer.keep([monitor.name for monitor in monitors.tried], list(monitors.began), self._now())
         for tried in outcome.tried:
-            self._telling.told(tried, NOWHERE)
+            self._observer.told(tried, NOWHERE)
         self.schedule()
 
     def understand(self, resource: str, objection: str) -> None:
@@ -106,7 +106,7 @@ class Trials:
         """A second is over."""
         self._spent = 0.0
         self._resting.clear()
-        self._telling.tick(self._now())
+        self._observer.tick(self._now())
         self.schedule()
 
     def close(self) -> None:
@@ -154,21 +154,21 @@ class Trials:
 
     def _give(self, waiting: _Waiting) -> None:
         (trial, _, _, data, _), place, sighting = waiting
-        telling, view = self._telling, memoryview(data)
+        observer, view = self._observer, memoryview(data)
         try:
-            source = telling.senders.number(place)
+            source = observer.senders.number(place)
             outcome = waiting.tapped.give(sighting.sender(source) if sighting is not None else Sender(source))
         except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
             self._resting.add(trial)
-            self._miss(trial, place, telling.defect(error, place, self._now(), sighting), sighting)
+            self._miss(trial, place, observer.defect(error, place, self._now(), sighting), sighting)
             return
-        telling.told(outcome, place, sighting)
+        observer.told(outcome, place, sighting)
         if self._rests(trial):
             self._miss(trial, place, _TOO_LONG, sighting)
         elif outcome.result == "dropped":
-            telling.dropped(outcome, place, view, sighting)
+            observer.dropped(outcome, place, view, sighting)
         elif outcome.result == "changed":
-            telling.changed(outcome, place, data, len(data), sighting)
+            observer.changed(outcome, place, data, len(data), sighting)
 
     def _advance(self) -> None:
         now = self._now()
@@ -179,10 +179,10 @@ class Trials:
                 outcomes = trial.advance(now)
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
                 self._resting.add(trial)
-                self._miss(trial, NOWHERE, self._telling.defect(error, NOWHERE, now))
+                self._miss(trial, NOWHERE, self._observer.defect(error, NOWHERE, now))
                 continue
             for outcome in outcomes:
-                self._telling.told(outcome, NOWHERE)
+                self._observer.told(outcome, NOWHERE)
             if self._rests(trial):
                 self._miss(trial, NOWHERE, _TOO_LONG)
 
@@ -195,4 +195,4 @@ class Trials:
 
     def _miss(self, trial: MonitorSet, place: Place, text: str, sighting: Sighting | None = None) -> None:
         for monitor in trial.monitors:
-            self._telling.missed(monitor.name, place, self._now(), text, sighting)
+            self._observer.missed(monitor.name, place, self._now(), text, sighting)

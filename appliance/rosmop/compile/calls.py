@@ -5,14 +5,14 @@ import re
 from collections.abc import Mapping, Sequence
 
 from appliance.rosmop.compile import cursors, members
+from appliance.rosmop.compile.assignments import require_place, store
 from appliance.rosmop.compile.conversion import condition, convert, number
 from appliance.rosmop.compile.initializers import ValueOf, elements
 from appliance.rosmop.compile.invocation import Invocation
 from appliance.rosmop.compile.output import Stream, formatted
 from appliance.rosmop.compile.places import Value, path, root
-from appliance.rosmop.compile.provided import LIBRARY, Arguments, find_function
 from appliance.rosmop.compile.scope import HelperFunction, Scope
-from appliance.rosmop.compile.storing import require_place, store
+from appliance.rosmop.compile.standard_functions import LIBRARY, Arguments, find_function
 from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax import tree

@@ -6,10 +6,10 @@ A cursor is an index into a vector that is known when the code is compiled; it i
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from appliance.rosmop.compile.assignments import mark, marked, require_place
 from appliance.rosmop.compile.conversion import convert, number
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Scope
-from appliance.rosmop.compile.storing import mark, marked, require_place
 from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax.errors import SpecificationError

@@ -4,13 +4,13 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from appliance.rosmop.compile import calls, initializers, members, operators, storing, vector_members
+from appliance.rosmop.compile import assignments, calls, initializers, members, operators, vector_members
 from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
 from appliance.rosmop.compile.margins import noted
 from appliance.rosmop.compile.places import CharacterPlace, Value, Variable, VariablePlace
-from appliance.rosmop.compile.provided import CONSTANTS
 from appliance.rosmop.compile.python import constant_of
 from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.compile.standard_functions import CONSTANTS
 from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.runtime.context import FaultError
@@ -188,7 +188,7 @@ def _unary(scope: Scope, node: tree.Unary) -> Value:
 
 def _step(scope: Scope, node: tree.Step) -> Value:
     target = value_of(scope, node.target)
-    storing.require_place(target, f"`{node.operator}`")
+    assignments.require_place(target, f"`{node.operator}`")
     if not target.pure:
         raise SpecificationError.at(
             node.target.position, "too much in one step; put the index into a variable first"
@@ -196,7 +196,7 @@ def _step(scope: Scope, node: tree.Step) -> Value:
     one = constant_value(node.position, kinds.INT, 1)
     operands = operators.Operands(scope, node.position, target, one, scope.site(node))
     changed = convert(scope, operators.binary(node.operator[0], operands), target.type)
-    stored = storing.store(scope, target, changed)
+    stored = assignments.store(scope, target, changed)
     before = form.Sequence(target.type, (target.form, stored), 0)
     return Value(stored if node.prefix else before, node.position, pure=False)
 
@@ -215,7 +215,7 @@ def _binary(scope: Scope, node: tree.Binary) -> Value:
 
 def _assign(scope: Scope, node: tree.Assign) -> Value:
     target, value = assignment(scope, node)
-    return Value(storing.store(scope, target, value), node.position, owned=False, pure=False)
+    return Value(assignments.store(scope, target, value), node.position, owned=False, pure=False)
 
 
 def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, form.Expression]:
@@ -225,12 +225,12 @@ def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, form.Expression]
             node.position, "`MESSAGE` cannot be assigned; bind the fields you want to change"
         )
     target = value_of(scope, node.target)
-    storing.require_place(target, f"`{node.operator}`")
+    assignments.require_place(target, f"`{node.operator}`")
     if node.operator == "=":
         if isinstance(target.type, kinds.String) and not isinstance(node.value, tree.Elements):
             return target, _character_or_text(scope, node.value)
         if isinstance(target.type, kinds.Characters) and isinstance(node.value, tree.Name):
-            storing.note_copy(target, value_of(scope, node.value))
+            assignments.note_copy(target, value_of(scope, node.value))
         return target, converted(scope, node.value, target.type)
     if not target.pure:
         raise SpecificationError.at(

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Sequence
 
+from appliance.rosmop.compile.assignments import mark, marked, require_place, store
 from appliance.rosmop.compile.conversion import convert, number
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Scope
-from appliance.rosmop.compile.storing import mark, marked, require_place, store
 from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax.errors import SpecificationError

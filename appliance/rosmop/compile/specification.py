@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from appliance.ros.definitions import Definitions
-from appliance.rosmop.compile.enforcing import (
+from appliance.rosmop.compile.enforcement import (
     blocking_refused,
     enforcement,
     topics_of_remedy,

@@ -9,11 +9,11 @@ from typing import Any
 
 from appliance.ros import names
 from appliance.rosmop.compile import calls, loops
+from appliance.rosmop.compile.assignments import write_store
 from appliance.rosmop.compile.conversion import condition, convert
 from appliance.rosmop.compile.cursors import Cursor
 from appliance.rosmop.compile.expressions import assignment, converted, elements, value_of
 from appliance.rosmop.compile.scope import Scope
-from appliance.rosmop.compile.storing import write_store
 from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime import numbers

@@ -8,8 +8,8 @@ import pytest
 from appliance.channel.messages import TopicTraffic
 from appliance.control.measures import by_resource, carried_of, from_zero
 from appliance.master.graph.registry import Incarnation, Registry
-from appliance.master.reach import carried
-from appliance.master.reach.carried import MOST_RESOURCES, OTHERS, Carried
+from appliance.master.reach import traffic
+from appliance.master.reach.traffic import MOST_RESOURCES, OTHERS, Carried
 from appliance.ros.uris import parse_node_uri
 
 
@@ -41,7 +41,7 @@ def test_few_topics_have_a_histogram_of_their_own() -> None:
 
 def test_counters_of_a_topic_outlive_the_nodes_that_published_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A node that restarts is another incarnation: its topic counts on, bounded in names."""
-    monkeypatch.setattr(carried, "MOST_RESOURCES", 2)
+    monkeypatch.setattr(traffic, "MOST_RESOURCES", 2)
     registry, host = Registry(), ipaddress.ip_address("10.0.0.5")
     for number in range(4):
         uri = f"http://10.0.0.5:400{number}/"

@@ -13,7 +13,7 @@ import pytest
 
 from appliance.channel.admin import PolicyConfirm, PolicyLoad, PolicyReload
 from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
-from appliance.policy import Policy, judging
+from appliance.policy import Policy, judgement
 from appliance.policy.model import Address, Category, Request
 from appliance.store.state import StateStore
 from tests.support.control_parts import OPEN, Records
@@ -130,7 +130,7 @@ class Slow:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, appliance: Appliance) -> None:
         self.rounds = 0
         self.begun, self.over = threading.Event(), threading.Event()
-        monkeypatch.setattr(judging, "run_cases", self._run)
+        monkeypatch.setattr(judgement, "run_cases", self._run)
         appliance.file.with_name("policy.ini.tests.yaml").write_text("cases: []\n")
 
     def _run(self, *_given: object) -> list[object]:

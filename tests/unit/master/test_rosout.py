@@ -5,7 +5,7 @@ import pytest
 
 from appliance.channel.messages import MonitorEvent, OwnPublished
 from appliance.master.rosout import Rosout, header
-from appliance.ros.reading import read_fields
+from appliance.ros.message_view import read_fields
 from appliance.ros.standard import standard_definitions
 
 DEFINITIONS = standard_definitions()

@@ -8,7 +8,7 @@ import pytest
 
 from appliance.policy.compiler import compile_policy
 from appliance.policy.grant import Asked, UngrantableError, asked, grant
-from appliance.policy.judging import Known
+from appliance.policy.judgement import Known
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, rights_of, rights_of_call

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance.recorder import reading
-from appliance.recorder.reading import Found, RingReader
+from appliance.recorder import ring_reader
 from appliance.recorder.ring import DATA, SMALLEST, RingWriter, Stream, birth_at, geometry, rows, words_of
+from appliance.recorder.ring_reader import Found, RingReader
 
 EVER = 0, 1 << 63
 HEADER = {
@@ -140,7 +140,7 @@ def test_table_that_changes_while_it_is_copied(memory: memoryview, monkeypatch: 
             break
         full += 1
     mixed = [(at, early[at] if early[at].sound else row) for at, row in rows(memory)]
-    monkeypatch.setattr(reading, "rows", lambda _memory: mixed)
+    monkeypatch.setattr(ring_reader, "rows", lambda _memory: mixed)
     found = list(RingReader(memory).read(*EVER))
     assert texts(found) == [bytes([number]) * 100 for number in range(1, full + 1)]
     assert not found[0].torn

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from appliance.rosmop.compile.loops import MAX_NESTED
-from appliance.rosmop.compile.provided import LIBRARY
+from appliance.rosmop.compile.standard_functions import LIBRARY
 from appliance.rosmop.compile.string_members import TEXT_METHODS
 from appliance.rosmop.compile.time_members import MOMENT_METHODS
 from appliance.rosmop.compile.vector_members import VECTOR_METHODS

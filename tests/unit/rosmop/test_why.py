@@ -10,11 +10,11 @@ from random import Random
 import pytest
 
 from appliance.rosmop import why
-from appliance.rosmop.deciding import Meaning, deciding
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics import mtl, ptcaret, ptltl
 from appliance.rosmop.logics.formula import read_formula
 from appliance.rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError, Run
+from appliance.rosmop.subformulas import Meaning, deciding
 from appliance.rosmop.why import NOBODY, SEQ, ClockedSteps, Explanation, Happened, Sender, Steps, history_of
 from tests.unit.rosmop.acting import definitions, message
 from tests.unit.rosmop.logics.driving import compiled, seeded

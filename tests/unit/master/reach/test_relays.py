@@ -14,11 +14,11 @@ from appliance.channel.channel import Channel
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reach.carried import Carried
 from appliance.master.reach.delivery import Delivery
 from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Places
 from appliance.master.reach.relays import RelayControl
+from appliance.master.reach.traffic import Carried
 from appliance.master.upkeep.enactor import Enactor
 from appliance.policy import Policy, compile_policy
 from appliance.policy.model import Address

@@ -19,8 +19,8 @@ from appliance.audit.why import lines_of
 from appliance.audit_trail import AuditTrail
 from appliance.channel.messages import MonitorEvent
 from appliance.relay.monitors.places import Place
-from appliance.rosmop.explained import moment
-from appliance.specifications.observed import MonitorRecords
+from appliance.rosmop.explanations import moment
+from appliance.specifications.records import MonitorRecords
 from tests.support.idle import idle_class
 from tests.unit.relay.monitors.test_passage import Monitored
 from tests.unit.rosmop.acting import message

@@ -24,7 +24,7 @@ from appliance.channel.messages import (
     UpstreamWanted,
 )
 from appliance.relay.connections.frames import Batch
-from appliance.relay.monitors.compiling import Compiler
+from appliance.relay.monitors.compiler import Compiler
 from appliance.relay.monitors.lane import TOO_LONG
 from appliance.relay.monitors.places import Place
 from appliance.ros.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply

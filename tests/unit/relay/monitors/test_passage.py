@@ -22,7 +22,7 @@ from appliance.ros.definitions import Definitions
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import ClockedRun, FiniteRun
 from appliance.rosmop.syntax.errors import SpecificationError
-from appliance.rosmop.walking import Walked
+from appliance.rosmop.walks import Walked
 from tests.support.relay_memory import share
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.random_specifications import Messages, Specifications, Traffic, definitions
@@ -116,7 +116,7 @@ class Monitored:
 
     def rows(self) -> list[MonitorRow]:
         """The counters."""
-        return self.middle.telling.rows(self.set.monitors, self.middle.now())
+        return self.middle.observer.rows(self.set.monitors, self.middle.now())
 
     def state(self) -> list[object]:
         """Variables, states of properties, what is due (`next_due` may be too early: what moves on is asked later)."""

@@ -11,7 +11,7 @@ import pytest
 import appliance.rosmop.certify
 from appliance.channel.messages import SpecificationsStated
 from appliance.relay.loop import Loop
-from appliance.relay.monitors.compiling import Compiler
+from appliance.relay.monitors.compiler import Compiler
 from appliance.rosmop.certify.check import MOST_STEPS, Tables, certify
 from appliance.rosmop.certify.properties import certificate_of
 from appliance.rosmop.engine import MonitorSet

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.channel.messages import RingGiven
-from appliance.recorder.reading import RingReader
 from appliance.recorder.ring import SMALLEST
-from appliance.relay.recorded import Recorded
+from appliance.recorder.ring_reader import RingReader
+from appliance.relay.recorder_ring import Recorded
 from tests.unit.relay.connections.test_topic import HEADER, Story, batch
 
 EVER = 0, 1 << 63

@@ -9,7 +9,7 @@ from appliance.audit.query import Filter
 from appliance.audit.search import export
 from appliance.audit_trail import AuditTrail
 from appliance.channel.messages import MonitorEvent
-from appliance.specifications.observed import MonitorRecords
+from appliance.specifications.records import MonitorRecords
 from tests.support.audit import settle
 
 NAMES = ("event", "reason", "severity", "host", "category", "resource", "rule", "decision", "more", "self")

@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.ending`, with processes that end by what a test says."""
+"""Tests of `appliance.supervisor.shutdown`, with processes that end by what a test says."""
 
 import asyncio
 import signal
@@ -6,7 +6,7 @@ from typing import cast
 
 import pytest
 
-from appliance.supervisor import ending
+from appliance.supervisor import shutdown
 from appliance.supervisor.life import Life
 from appliance.supervisor.post import Post
 from appliance.supervisor.roles import Role
@@ -29,7 +29,7 @@ class Crowd:
 
     def end(self) -> list[tuple[str, str]]:
         """What was done."""
-        asyncio.run(ending.end_all(self.posts, self.died))
+        asyncio.run(shutdown.end_all(self.posts, self.died))
         return self.done
 
 
@@ -60,7 +60,7 @@ class Process:
 def crowd(monkeypatch: pytest.MonkeyPatch) -> Crowd:
     """Nobody yet; patience is short."""
     for name in ("_STOP_SECONDS", "_TERMINATE_SECONDS", "_LAST_SECONDS"):
-        monkeypatch.setattr(ending, name, 0.05)
+        monkeypatch.setattr(shutdown, name, 0.05)
     return Crowd()
 
 
@@ -102,7 +102,7 @@ def test_a_life_that_was_due_does_not_begin(crowd: Crowd) -> None:
         post = crowd.posts[0]
         post.life = None
         post.due = asyncio.get_running_loop().call_later(60, lambda: None)
-        await ending.end_all(crowd.posts, crowd.died)
+        await shutdown.end_all(crowd.posts, crowd.died)
         return post.due.cancelled()
 
     assert asyncio.run(scene())

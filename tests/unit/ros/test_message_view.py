@@ -3,7 +3,7 @@
 import struct
 
 from appliance.ros.definitions import Definitions
-from appliance.ros.reading import CUT, MOST_BYTES, MOST_CHARACTERS, MOST_ELEMENTS, read_fields
+from appliance.ros.message_view import CUT, MOST_BYTES, MOST_CHARACTERS, MOST_ELEMENTS, read_fields
 
 DEFINITIONS = Definitions.from_files(
     {

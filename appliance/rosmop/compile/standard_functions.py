@@ -4,11 +4,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 
+from appliance.rosmop.compile.assignments import require_original, store
 from appliance.rosmop.compile.conversion import convert, number, require_number
 from appliance.rosmop.compile.output import formatted
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Scope
-from appliance.rosmop.compile.storing import require_original, store
 from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime import numbers, texts

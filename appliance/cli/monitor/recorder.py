@@ -17,7 +17,7 @@ from appliance.channel.answers.recordings import Recording, Recordings
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.monitor.input import usage_error
 from appliance.cli.record import bag_of
-from appliance.cli.running import Appliance
+from appliance.cli.target import Appliance
 
 _SECOND = 1_000_000_000
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from appliance.network.shared import bridges, is_contained, lives_on_the_machines_network
+from appliance.network.host_namespace import bridges, is_contained, lives_on_the_machines_network
 
 
 def test_the_machines_network_has_settings_that_no_other_has(tmp_path: Path) -> None:

@@ -15,8 +15,8 @@ from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitors import MonitorState, Replaced, Switched
 from appliance.cli import completion
 from appliance.cli.output import counted, printable, say, say_json, usage_error
-from appliance.cli.running import Appliance, speaks
 from appliance.cli.tables import say_table, table_of
+from appliance.cli.target import Appliance, speaks
 from appliance.cli.trials import ConfirmWithin, say_deadline, seconds_within
 
 _Names = Annotated[

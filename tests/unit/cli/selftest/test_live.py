@@ -7,8 +7,8 @@ from typing import Any, cast
 import pytest
 
 from appliance.cli.admin_socket import NotRunningError
-from appliance.cli.running import Appliance
-from appliance.cli.selftest import running as selftest_running
+from appliance.cli.selftest import live as selftest_running
+from appliance.cli.target import Appliance
 
 OURS = SimpleNamespace(
     sequence=7, record=SimpleNamespace(caller_id="/rosrv_selftest_00c0ffee", id="0192-ours", host="10.0.0.1")

@@ -10,10 +10,10 @@ from appliance.audit.query import Filter, FilterError
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.status import ProcessInfo, Status
 from appliance.cli.admin_socket import NotRunningError
-from appliance.cli.running import Appliance
 from appliance.cli.selftest.findings import Found, fail, ok, skip, told, warn
 from appliance.cli.selftest.nodes import TOPIC, RefusedError, call, message_through_the_relay
 from appliance.cli.status import troubles_of
+from appliance.cli.target import Appliance
 
 _CALLER = "/rosrv_selftest"  # and a number of its own each time: what one caller reads again is counted only
 _MANY_RESTARTS = 3

@@ -7,8 +7,8 @@ import datetime
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from appliance.rosmop.deciding import deciding
 from appliance.rosmop.outcomes import DROPPED, Fault, Outcome, Verdict, named
+from appliance.rosmop.subformulas import deciding
 from appliance.rosmop.why import SEQ, Happened
 
 _EACH_END = 5

@@ -12,8 +12,8 @@ from appliance.channel.answers.policy import Granted, Why
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.audit.errors import Errors, fail
 from appliance.cli.output import printable, say, say_json, usage_error
-from appliance.cli.policy.running import say_loaded
-from appliance.cli.running import Appliance, speaks
+from appliance.cli.policy.in_force import say_loaded
+from appliance.cli.target import Appliance, speaks
 from appliance.cli.trials import ConfirmWithin, seconds_within
 
 

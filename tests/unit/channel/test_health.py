@@ -1,11 +1,11 @@
-"""Tests of `appliance.channel.serving`."""
+"""Tests of `appliance.channel.health`."""
 
 from typing import Any
 
 import pytest
 
 from appliance.channel.answers.status import ProcessInfo, Status
-from appliance.channel.serving import no_relay, process_names, unserved
+from appliance.channel.health import no_relay, process_names, unserved
 from tests.support.answers import example
 
 SERVING: dict[str, Any] = {

@@ -12,7 +12,7 @@ from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.specifications.allocation import TOPIC, Allocation, Move, Resource
 from appliance.specifications.files import Sources, SpecificationsRefusedError, check
-from appliance.specifications.stating import Revision, Stating
+from appliance.specifications.rollout import Revision, Rollout
 from tests.support.audit import HeardTrail
 
 pytestmark = pytest.mark.anyio
@@ -41,7 +41,7 @@ class Fleet:
     """Two relays and what was done with them, in order; `answer(relay, statement)` is what one says to it."""
 
     def __init__(self, trail: AuditTrail) -> None:
-        self.stating = Stating(
+        self.rollout = Rollout(
             Allocation(2),
             trail,
             "drop",
@@ -68,7 +68,7 @@ class Fleet:
         )
         answer = self.answer(relay, message)
         if answer is not None:
-            asyncio.get_running_loop().call_soon(self.stating.received, answer, relay)
+            asyncio.get_running_loop().call_soon(self.rollout.received, answer, relay)
         return True
 
     async def carried_out(self) -> None:
@@ -81,13 +81,13 @@ class Fleet:
     def withdraw(self, moves: Sequence[Move]) -> None:
         """As `Relays`."""
         self.story += [
-            ("withdrawn", move.name, self.stating.allocation.of(move.kind, move.name)) for move in moves
+            ("withdrawn", move.name, self.rollout.allocation.of(move.kind, move.name)) for move in moves
         ]
 
     def place(self, moves: Sequence[Move]) -> None:
         """As `Relays`."""
         self.story += [
-            ("placed", move.name, self.stating.allocation.of(move.kind, move.name)) for move in moves
+            ("placed", move.name, self.rollout.allocation.of(move.kind, move.name)) for move in moves
         ]
 
 
@@ -98,9 +98,9 @@ class World:
         self.log = AuditLog(home / "audit.db")
         self.trail = HeardTrail(self.log)
         self.fleet = Fleet(self.trail)
-        self.stating = self.fleet.stating
+        self.rollout = self.fleet.rollout
         self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
-        self.stating.start(revision(1, **self.files), restarted=False, kept="")
+        self.rollout.start(revision(1, **self.files), restarted=False, kept="")
         self.fleet.carried = {(TOPIC, "/a"), (TOPIC, "/b")}
 
 
@@ -114,10 +114,10 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 async def test_each_relay_is_told_its_own(world: World) -> None:
     """And of a change, before anything comes into force. What a relay is told first goes ahead of all else."""
-    assert world.stating.statement(0).ahead
-    assert [name for name, _ in world.stating.statement(0).files] == ["a.rv"]
-    assert [name for name, _ in world.stating.statement(1).files] == ["b.rv"]
-    assert await world.stating.take(revision(2, **world.files, c=spec("c", "/b"))) == []
+    assert world.rollout.statement(0).ahead
+    assert [name for name, _ in world.rollout.statement(0).files] == ["a.rv"]
+    assert [name for name, _ in world.rollout.statement(1).files] == ["b.rv"]
+    assert await world.rollout.take(revision(2, **world.files, c=spec("c", "/b"))) == []
     assert not any(one.ahead for _, one in world.fleet.stated)
     assert world.fleet.story[:2] == [("stated", 0, 2, ["a.rv"], ()), ("stated", 1, 2, ["b.rv", "c.rv"], ())]
 
@@ -132,30 +132,30 @@ async def test_what_one_refuses_none_has(world: World) -> None:
 
     world.fleet.answer = answer
     with pytest.raises(SpecificationsRefusedError, match="no"):
-        await world.stating.take(revision(2, **world.files, c=spec("c", "/b")))
+        await world.rollout.take(revision(2, **world.files, c=spec("c", "/b")))
     assert [one[:3] for one in world.fleet.story] == [
         ("stated", 0, 2), ("stated", 1, 2), ("stated", 0, 1), ("stated", 1, 1)
     ]  # fmt: skip
-    assert world.stating.relay_of("b") == 1
+    assert world.rollout.relay_of("b") == 1
 
 
 async def test_a_relay_that_dies_of_it_refuses_it(world: World) -> None:
     """One that is away is told when it comes, and does not keep the others from it."""
     world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
-    taking = asyncio.ensure_future(world.stating.take(revision(2, **world.files, c=spec("c", "/b"))))
+    taking = asyncio.ensure_future(world.rollout.take(revision(2, **world.files, c=spec("c", "/b"))))
     while len(world.fleet.story) < 2:
         await asyncio.sleep(0)
-    world.stating.lost(1)
+    world.rollout.lost(1)
     with pytest.raises(SpecificationsRefusedError, match="try again"):
         await taking
     world.fleet.away = {1}
-    await world.stating.take(revision(2, **world.files, c=spec("c", "/b")))
-    assert [name for name, _ in world.stating.statement(1).files] == ["b.rv", "c.rv"]
+    await world.rollout.take(revision(2, **world.files, c=spec("c", "/b")))
+    assert [name for name, _ in world.rollout.statement(1).files] == ["b.rv", "c.rv"]
 
 
 async def test_a_topic_moves_only_between_monitors(world: World) -> None:
     """The new relay has them before, the old one until the topic is withdrawn; what began anew holds and is told."""
-    moved = await world.stating.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
+    moved = await world.rollout.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
     assert moved == ["b"]
     assert world.fleet.story == [
         ("stated", 0, 2, ["a.rv", "b.rv", "c.rv"], ("b",)),
@@ -172,10 +172,10 @@ async def test_a_topic_moves_only_between_monitors(world: World) -> None:
 async def test_what_would_cross_goes_one_way_and_is_tried_first(world: World) -> None:
     """Two loads in one that join monitors of both relays: every topic is placed where its monitors are already."""
     files = {name: spec(name, f"/{name}") for name in "abcd"}
-    await world.stating.take(revision(2, **files))
+    await world.rollout.take(revision(2, **files))
     world.fleet.carried = {(TOPIC, f"/{name}") for name in "abcd"}
     world.fleet.story.clear()
-    await world.stating.take(revision(3, **files, x=spec("x", "/a", "/b"), y=spec("y", "/c", "/d")))
+    await world.rollout.take(revision(3, **files, x=spec("x", "/a", "/b"), y=spec("y", "/c", "/d")))
     tried = world.fleet.story[0]
     assert tried[:2] == ("stated", 0)
     assert {"a.rv", "b.rv", "c.rv", "d.rv", "x.rv", "y.rv"} == set(tried[3])
@@ -191,26 +191,26 @@ async def test_a_relay_that_comes_while_a_load_is_tried_has_it_before_anything_i
 
     def answer(at: int, statement: messages.SpecificationsStated) -> messages.Message:
         world.fleet.away = set()
-        stated.append(world.stating.statement(relay))
+        stated.append(world.rollout.statement(relay))
         return taken(statement)
 
     world.files["c"] = spec("c", "/c")
     world.fleet.answer = answer
-    await world.stating.take(revision(2, **world.files))
+    await world.rollout.take(revision(2, **world.files))
     assert stated[0].revision == 2
 
 
 async def test_a_load_is_over_when_those_that_gave_something_up_have_it(world: World) -> None:
     """One that does not say so within the time is told of as one that has other specifications in force."""
     world.fleet.answer = lambda relay, statement: None if relay == 1 else taken(statement)
-    await world.stating.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
-    over = asyncio.ensure_future(world.stating.all_taken())
+    await world.rollout.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
+    over = asyncio.ensure_future(world.rollout.all_taken())
     for _ in range(5):
         await asyncio.sleep(0)
     assert not over.done()
-    world.stating.received(taken([one for at, one in world.fleet.stated if at == 1][-1]), 1)
+    world.rollout.received(taken([one for at, one in world.fleet.stated if at == 1][-1]), 1)
     await over
-    assert world.stating.refused == []
+    assert world.rollout.refused == []
 
 
 async def test_a_topic_that_comes_while_a_load_is_tried_moves_as_well(world: World) -> None:
@@ -222,7 +222,7 @@ async def test_a_topic_that_comes_while_a_load_is_tried_moves_as_well(world: Wor
         return taken(statement)
 
     world.fleet.answer = answer
-    await world.stating.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
+    await world.rollout.take(revision(2, **world.files, c=spec("c", "/a", "/b")))
     assert ("withdrawn", "/b", 1) in world.fleet.story
     assert world.fleet.story[-1] == ("placed", "/b", 0)
 
@@ -231,21 +231,21 @@ async def test_an_answer_to_the_try_before_is_none_to_this_one(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two tries of one revision are two statements: one that came too late does not bring another text into force."""
-    monkeypatch.setattr("appliance.specifications.stating._RELAY_SECONDS", 0.01)
+    monkeypatch.setattr("appliance.specifications.rollout._RELAY_SECONDS", 0.01)
     world.fleet.answer = lambda _relay, _statement: None
     with pytest.raises(SpecificationsRefusedError, match="try again"):
-        await world.stating.take(revision(2, **world.files, c=spec("c", "/b")))
+        await world.rollout.take(revision(2, **world.files, c=spec("c", "/b")))
     late = [one for _, one in world.fleet.stated if one.revision == 2]
-    monkeypatch.setattr("appliance.specifications.stating._RELAY_SECONDS", 15)
-    again = asyncio.ensure_future(world.stating.take(revision(2, **world.files, d=spec("d", "/b"))))
+    monkeypatch.setattr("appliance.specifications.rollout._RELAY_SECONDS", 15)
+    again = asyncio.ensure_future(world.rollout.take(revision(2, **world.files, d=spec("d", "/b"))))
     await asyncio.sleep(0)
     for relay, statement in enumerate(late):
-        world.stating.received(taken(statement), relay)
+        world.rollout.received(taken(statement), relay)
     for _ in range(5):
         await asyncio.sleep(0)
     assert not again.done()
     for relay, statement in world.fleet.stated[-2:]:
-        world.stating.received(taken(statement), relay)
+        world.rollout.received(taken(statement), relay)
     await again
 
 
@@ -254,36 +254,36 @@ async def test_who_began_in_the_initial_state_is_said(world: World) -> None:
     world.fleet.answer = lambda relay, statement: messages.SpecificationsTaken(
         statement.revision, ["c", "b"] if relay else [], [], statement.statement
     )
-    world.stating.received(messages.SpecificationsTaken(1, ["a"], []), 0)
-    await world.stating.take(revision(2, **world.files, c=spec("c", "/b")))
-    assert world.stating.began(["a", "b", "c"]) == ["b", "c"]
+    world.rollout.received(messages.SpecificationsTaken(1, ["a"], []), 0)
+    await world.rollout.take(revision(2, **world.files, c=spec("c", "/b")))
+    assert world.rollout.began(["a", "b", "c"]) == ["b", "c"]
 
 
 async def test_held_monitors_and_rows_of_both(world: World) -> None:
     """A row of a monitor that has moved counts only where it is now."""
-    stating = world.stating
+    rollout = world.rollout
 
     def row(name: str, events: int) -> messages.MonitorRow:
         return messages.MonitorRow(name, f"{name}.rv", True, False, False, events, 0, 0, 0, 0)
 
-    stating.received(messages.SpecificationsTaken(1, ["a"], ["a"]), 0)
-    stating.received(messages.SpecificationsTaken(1, ["b"], ["b"]), 1)
-    stating.received(messages.MonitorsCounted([row("a", 1), row("b", 9)]), 0)
-    stating.received(messages.MonitorsCounted([row("b", 2)]), 1)
-    assert stating.held == {"a", "b"}
-    assert {name: one.events for name, one in stating.rows.items()} == {"a": 1, "b": 2}
-    stating.resumed("b")
-    assert stating.held == {"a"}
+    rollout.received(messages.SpecificationsTaken(1, ["a"], ["a"]), 0)
+    rollout.received(messages.SpecificationsTaken(1, ["b"], ["b"]), 1)
+    rollout.received(messages.MonitorsCounted([row("a", 1), row("b", 9)]), 0)
+    rollout.received(messages.MonitorsCounted([row("b", 2)]), 1)
+    assert rollout.held == {"a", "b"}
+    assert {name: one.events for name, one in rollout.rows.items()} == {"a": 1, "b": 2}
+    rollout.resumed("b")
+    assert rollout.held == {"a"}
 
 
 async def test_a_relay_that_does_not_take_what_is_in_force_is_told_of_until_it_does(world: World) -> None:
     """Whatever the other one says."""
-    stating = world.stating
-    stating.received(messages.SpecificationsRefused(1, ["no memory"]), 1)
-    stating.received(messages.SpecificationsTaken(1, ["a"], []), 0)
-    assert stating.refused == ["no memory"]
-    stating.received(messages.SpecificationsTaken(1, ["b"], []), 1)
-    assert stating.refused == []
+    rollout = world.rollout
+    rollout.received(messages.SpecificationsRefused(1, ["no memory"]), 1)
+    rollout.received(messages.SpecificationsTaken(1, ["a"], []), 0)
+    assert rollout.refused == ["no memory"]
+    rollout.received(messages.SpecificationsTaken(1, ["b"], []), 1)
+    assert rollout.refused == []
 
 
 async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) -> None:
@@ -295,7 +295,7 @@ async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) 
     here = {name: allocation.of_file(f"{name}.rv") for name in files}
     log = AuditLog(tmp_path / "other.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False)
-    after = Fleet(trail).stating
+    after = Fleet(trail).rollout
     after.start(revision(1, **files), restarted=True, kept=kept[-1])
     assert {name: after.relay_of(name) for name in files} == here
     assert after.statement(0).restarted is True
@@ -313,7 +313,7 @@ async def test_a_crash_of_control_in_the_middle_of_a_change_leaves_no_topic_with
     before = revision(1, **files)
     allocation.adopt(allocation.plan(before.checked))
     allocation.adopt(allocation.plan(revision(2).checked))
-    after = Fleet(world.trail).stating
+    after = Fleet(world.trail).rollout
     after.start(before, restarted=True, kept=kept[-1])
     for number, name in enumerate(names):
         assert after.relay_of(f"x{number}") == after.allocation.of(TOPIC, name)

@@ -1,4 +1,4 @@
-"""Tests of `appliance.cli.running`: what a user is told who may not, or cannot, speak to the appliance."""
+"""Tests of `appliance.cli.target`: what a user is told who may not, or cannot, speak to the appliance."""
 
 import socket
 import subprocess

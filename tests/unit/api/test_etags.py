@@ -1,4 +1,4 @@
-"""Tests of `appliance.api.unchanged`: what a client has already is not sent to it again."""
+"""Tests of `appliance.api.etags`: what a client has already is not sent to it again."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -9,7 +9,7 @@ from starlette.applications import Starlette
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from appliance.api.unchanged import Unchanged
+from appliance.api.etags import Unchanged
 
 
 def _app() -> Unchanged:

@@ -13,7 +13,7 @@ from appliance.relay.counts import Counts
 from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.places import NOWHERE, Place, Senders, Sighting
-from appliance.rosmop.explained import of_change, of_drop, of_fault, of_published, of_verdict
+from appliance.rosmop.explanations import of_change, of_drop, of_fault, of_published, of_verdict
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.outcomes import Outcome, Verdict, bound, named
 from appliance.rosmop.runtime.context import LogLine, Published
@@ -30,7 +30,7 @@ class _Counters:
     missed: int = 0
 
 
-class Telling:
+class Observer:
     """Counts what monitors do, and tells the first of each second in full. `publish` sends what they publish.
 
     What those on trial would have done is told in kinds of its own, with `prefix`.

@@ -40,7 +40,7 @@ class Revision:
     checked: Checked = field(default_factory=Checked)
 
 
-class Stating:
+class Rollout:
     """What the relays were told and what they said; `states(checked)` says of each monitor whether it is in force.
 
     `rows` has state and counters of the monitors, as far as their relays have told.

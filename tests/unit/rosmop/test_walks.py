@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.rosmop import walking
+from appliance.rosmop import walks
 from appliance.rosmop.engine import MonitorSet, OnFault
 from appliance.rosmop.ir.feed import AREA, MAX_EFFECTS
 from appliance.rosmop.ir.module import LINES, MOST_TEXTS
@@ -18,7 +18,7 @@ from appliance.rosmop.outcomes import Outcome, Verdict, named
 from appliance.rosmop.runtime.context import LogLine
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.syntax.errors import SpecificationError
-from appliance.rosmop.walking import BEGINNING, Walker
+from appliance.rosmop.walks import BEGINNING, Walker
 from appliance.rosmop.why import Sender
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.interpreted import beside, check_same
@@ -493,7 +493,7 @@ def test_without_fuel_the_message_at_hand_is_left(monkeypatch: pytest.MonkeyPatc
     """Wherever it ends: what is done is done, what is begun is taken back."""
     text = event("for (int i = 0; i < 50; i++) { n += i; } count = n;")
     for fuel in range(2000, 12000, 500):
-        monkeypatch.setattr(walking, "FUEL", fuel)
+        monkeypatch.setattr(walks, "FUEL", fuel)
         Fed(text).check([plain(number) for number in range(20)])
 
 
@@ -501,7 +501,7 @@ def test_fuel_lasts_for_many_calls_and_where_it_ends_one_message_is_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """As if it had not been looked at; the next ones have fuel again."""
-    monkeypatch.setattr(walking, "FUEL", 1000)
+    monkeypatch.setattr(walks, "FUEL", 1000)
     fed = Fed(event("n++;"))
     walker, one = fed.walker(), frames([plain()])
     assert fed.monitors.area is not None

@@ -3,7 +3,7 @@
 from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
 from appliance.channel.answers.policy import Loaded
 from appliance.cli.output import counted, say
-from appliance.cli.running import Appliance, speaks
+from appliance.cli.target import Appliance, speaks
 from appliance.cli.trials import ConfirmWithin, say_deadline, seconds_within, verbs_of
 
 

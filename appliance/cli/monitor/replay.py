@@ -15,11 +15,11 @@ from appliance.channel import admin
 from appliance.cli.monitor.bag import Replayed, definitions_of, open_bag, refusals, replay
 from appliance.cli.monitor.input import Folders, read_definitions, read_specifications, usage_error
 from appliance.cli.monitor.output import BILLION, because
-from appliance.cli.monitor.recorded import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
+from appliance.cli.monitor.recorder import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
 from appliance.cli.output import counted, refused, say, say_json
 from appliance.cli.progress import progress
-from appliance.cli.running import Appliance, speaks
 from appliance.cli.tables import say_table, table_of
+from appliance.cli.target import Appliance, speaks
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.engine import Margin, MonitorSet, sharing
