@@ -35,7 +35,9 @@ def read_public_key(path: Path) -> bytes:
     """The raw Ed25519 public key (32 bytes) in a PEM file. Raises `KeyUnreadableError`."""
     try:
         key = load_pem_public_key(path.read_bytes())
-    except (OSError, ValueError, UnsupportedAlgorithm) as error:
+    except OSError as error:
+        raise KeyUnreadableError(f"{path}: {error.strerror}") from error
+    except (ValueError, UnsupportedAlgorithm) as error:
         raise KeyUnreadableError(f"{path}: not a public key in PEM: {error}") from error
     if not isinstance(key, Ed25519PublicKey):
         raise KeyUnreadableError(f"{path}: not an Ed25519 public key")

@@ -374,7 +374,10 @@ def main(arguments: list[str]) -> int:
             copies = {copy["number"]: copy for copy in map(json.loads, lines)}
             verifier = Verifier(given.bundle, given.key, Path(folder), copies)
         except Exception as error:
-            print(printable(f"nothing can be verified: {error}"))
+            why = str(error)
+            if isinstance(error, OSError) and error.filename:
+                why = f"{error.filename}: {error.strerror}"
+            print(printable(f"nothing can be verified: {why}"))
             return 2
         verifier.run()
     findings = [*dict.fromkeys(map(printable, verifier.findings))]

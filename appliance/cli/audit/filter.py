@@ -8,7 +8,7 @@ from typing import Annotated, Concatenate, ParamSpec
 
 import typer
 
-from appliance.audit.moment import parse_moment
+from appliance.audit.moment import MomentError, parse_moment
 from appliance.audit.query import Filter
 from appliance.audit.record import Severity
 from appliance.cli.audit.errors import Errors
@@ -54,10 +54,14 @@ def _filter(
 ) -> Filter:
     now = time.time_ns()
     wanted = {"deny": deny, "allow": allow, "would deny": would_deny}
+    begin = None if since is None else parse_moment(since, now)
+    end = None if until is None else parse_moment(until, now)
+    if begin is not None and end is not None and begin > end:
+        raise MomentError(f"--since {since} is later than --until {until}: nothing is between them")
     return Filter(
         decision=tuple(name for name, asked in wanted.items() if asked),
-        since=None if since is None else parse_moment(since, now),
-        until=None if until is None else parse_moment(until, now),
+        since=begin,
+        until=end,
         host=host,
         caller_id=caller,
         resource=topic,

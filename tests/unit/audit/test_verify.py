@@ -470,6 +470,12 @@ def test_a_key_of_another_kind(tmp_path: Path, curve: str) -> None:
         read_public_key(file)
 
 
+def test_a_key_that_is_not_there(tmp_path: Path) -> None:
+    """The file is named, and what is wrong with it in words."""
+    with pytest.raises(KeyUnreadableError, match=r"gone\.pem: No such file or directory$"):
+        read_public_key(tmp_path / "gone.pem")
+
+
 def unsign(path: Path, first: int) -> None:
     """Take the signatures from the checkpoint `first` on away."""
     attack(path, f"UPDATE checkpoint SET signature = NULL, public_key = NULL WHERE number >= {first}")

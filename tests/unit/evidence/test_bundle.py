@@ -218,6 +218,12 @@ def test_nothing_in_a_bundle_reaches_the_terminal_as_it_is(
     assert reviewer.said.splitlines()[-1] == "not as it was exported"
 
 
+def test_a_bundle_that_is_not_there_is_named(tmp_path: Path, reviewer: Reviewer) -> None:
+    """In words, without the number of an error."""
+    assert reviewer.status(tmp_path / "gone.zip") == 2
+    assert reviewer.said == f"nothing can be verified: {tmp_path}/gone.zip: No such file or directory\n"
+
+
 @pytest.mark.parametrize("name", ["manifest.json", "proof.json", "records.ndjson"])
 def test_members_that_unpack_to_much_take_no_memory(
     bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str

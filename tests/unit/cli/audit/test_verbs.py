@@ -54,6 +54,13 @@ def lines(done: subprocess.CompletedProcess[str]) -> list[dict[str, object]]:
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
+def test_a_time_that_ends_before_it_begins_is_refused(state: Path) -> None:
+    """It would find nothing, and nobody would know why; `1h` is an hour ago."""
+    done = rosrv("search", "--since", "1h", "--until", "2h", state=state)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "rosrv: --since 1h is later than --until 2h: nothing is between them\n"
+
+
 def test_search_json(state: Path) -> None:
     """`search --json` prints the records that match as NDJSON, newest first."""
     found = lines(
