@@ -38,7 +38,8 @@ unit:
 	$(PYTEST) tests/unit $(addprefix --ignore=,$(LONG_UNIT)) -n auto --quiet
 
 test: check ## check, the long unit tests, and those with real ROS nodes (root: they make network namespaces)
-	$(PYTEST) tests/integration $(LONG_UNIT) tests/proofs/test_insertion.py -n auto --dist loadfile --quiet --durations=10
+	$(PYTEST) tests/proofs/test_insertion.py tests/integration $(LONG_UNIT) -n auto --dist loadfile --no-loadscope-reorder \
+	    --quiet --durations=10
 
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
