@@ -18,21 +18,6 @@ def driver() -> Iterator[RelayDriver]:
         yield driver
 
 
-@pytest.fixture(scope="module")
-def common_driver() -> Iterator[RelayDriver]:
-    """The same for all tests of a file in which no more than nodes come and go."""
-    needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
-    with RelayDriver() as driver:
-        yield driver
-
-
-@pytest.fixture
-def common_ros(common_driver: RelayDriver, tmp_path: Path) -> Iterator[RosSession]:
-    """Nodes of one test of those."""
-    with RosSession(common_driver.uri, tmp_path) as session:
-        yield session
-
-
 @pytest.fixture
 def ros(driver: RelayDriver, tmp_path: Path) -> Iterator[RosSession]:
     """Nodes of the test, whose master is the driver's."""

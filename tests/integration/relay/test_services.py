@@ -35,16 +35,11 @@ def _refused(message: object, resource: str) -> bool:
 @pytest.mark.parametrize("caller", BOTH)
 @pytest.mark.parametrize("server", BOTH)
 def test_calls_are_answered(
-    common_driver: RelayDriver,
-    common_ros: RosSession,
-    server: Client,
-    caller: Client,
-    options: tuple[str, ...],
+    driver: RelayDriver, ros: RosSession, server: Client, caller: Client, options: tuple[str, ...]
 ) -> None:
     """Every pair of client libraries, on a connection per call and on one for all calls."""
-    before = len(common_driver.link.messages)
-    service = common_ros.service_server(server, "/mode", name="server")
-    client = common_ros.service_client(caller, "/mode", *options, name="client")
+    service = ros.service_server(server, "/mode", name="server")
+    client = ros.service_client(caller, "/mode", *options, name="client")
     for count, value in enumerate(("true", "false", "true"), start=1):
         client.send(value)
         answers = client.wait_for_count(count, event="answered")
@@ -52,7 +47,7 @@ def test_calls_are_answered(
     assert service.wait_for(event="called")["client"] == "/client"
 
     def opened() -> list[str]:
-        messages = [m for m in common_driver.link.messages[before:] if isinstance(m, ConnectionOpened)]
+        messages = [m for m in driver.link.messages if isinstance(m, ConnectionOpened)]
         return [m.kind for m in messages if m.caller_id == "/client"]
 
     expected = ["service"] * (1 if options else 3)
@@ -61,34 +56,32 @@ def test_calls_are_answered(
 
 
 @pytest.mark.parametrize("server", BOTH)
-def test_the_stock_tools_find_type_and_call(
-    common_driver: RelayDriver, common_ros: RosSession, server: Client
-) -> None:
+def test_the_stock_tools_find_type_and_call(driver: RelayDriver, ros: RosSession, server: Client) -> None:
     """rosservice probes the service for its type before it calls."""
-    common_ros.service_server(server, "/mode", name="server")
-    assert common_ros.run("/usr/bin/rosservice", "type", "/mode").stdout.strip() == "std_srvs/SetBool"
-    assert "negated" in common_ros.run("/usr/bin/rosservice", "call", "/mode", "data: true").stdout
+    ros.service_server(server, "/mode", name="server")
+    assert ros.run("/usr/bin/rosservice", "type", "/mode").stdout.strip() == "std_srvs/SetBool"
+    assert "negated" in ros.run("/usr/bin/rosservice", "call", "/mode", "data: true").stdout
 
 
 @pytest.mark.parametrize("server", BOTH)
 def test_a_probe_is_answered_with_the_services_header(
-    common_driver: RelayDriver, common_ros: RosSession, server: Client
+    driver: RelayDriver, ros: RosSession, server: Client
 ) -> None:
     """As a client that waits for a service sends it, with an open md5sum."""
-    common_ros.service_server(server, "/mode", name="server")
+    ros.service_server(server, "/mode", name="server")
     fields = {"callerid": "/probe", "service": "/mode", "md5sum": "*", "probe": "1"}
-    header = ask_header(common_driver.faces["/server"], fields)
+    header = ask_header(driver.faces["/server"], fields)
     assert header["type"] == "std_srvs/SetBool"
 
 
 @pytest.mark.parametrize("server", BOTH)
 def test_a_service_of_another_type_says_so_itself(
-    common_driver: RelayDriver, common_ros: RosSession, server: Client
+    driver: RelayDriver, ros: RosSession, server: Client
 ) -> None:
     """The service's own error header comes back."""
-    common_ros.service_server(server, "/mode", name="server")
+    ros.service_server(server, "/mode", name="server")
     fields = {"callerid": "/client", "service": "/mode", "md5sum": "0" * 32}
-    assert "md5sum" in ask_header(common_driver.faces["/server"], fields)["error"]
+    assert "md5sum" in ask_header(driver.faces["/server"], fields)["error"]
 
 
 def test_a_failed_call_fails_with_the_services_words(driver: RelayDriver, ros: RosSession) -> None:

@@ -62,34 +62,34 @@ def read_frame(stream: BinaryIO) -> bytes:
 @pytest.mark.parametrize("subscriber", BOTH)
 @pytest.mark.parametrize("publisher", BOTH)
 def test_messages_arrive_with_the_publishers_name(
-    common_driver: RelayDriver, common_ros: RosSession, publisher: Client, subscriber: Client
+    driver: RelayDriver, ros: RosSession, publisher: Client, subscriber: Client
 ) -> None:
     """Every pair of client libraries talks through the relay as it does without, and nothing is dropped."""
-    before = len(common_driver.link.messages)
-    common_ros.talker(publisher, "/chatter", name="talker")
-    listener = common_ros.listener(subscriber, "/chatter", name="listener")
+    ros.talker(publisher, "/chatter", name="talker")
+    listener = ros.listener(subscriber, "/chatter", name="listener")
     events = listener.wait_for_count(5, event="received")
     assert {event["publisher"] for event in events} == {"/talker"}
     numbers = [int(event["data"].split()[1]) for event in events]
     assert numbers == list(range(numbers[0], numbers[0] + 5))
-    opened = common_driver.link.wait_for(lambda message: isinstance(message, ConnectionOpened), after=before)
+    opened = driver.link.wait_for(lambda message: isinstance(message, ConnectionOpened))
     assert (opened.resource, opened.kind, opened.caller_id) == ("/chatter", "topic", "/listener")
     listener.stop()
-    common_driver.link.wait_for(lambda message: message == ConnectionClosed(opened.number, ""))
+    closed = driver.link.wait_for(lambda message: isinstance(message, ConnectionClosed))
+    assert closed == ConnectionClosed(opened.number, "")
 
 
 @pytest.mark.parametrize("publisher", BOTH)
 def test_a_latched_message_reaches_early_and_late_subscribers_once(
-    common_driver: RelayDriver, common_ros: RosSession, publisher: Client
+    driver: RelayDriver, ros: RosSession, publisher: Client
 ) -> None:
     """The first gets it from the publisher, the later ones from the relay's memory."""
-    talker = common_ros.talker(publisher, "/map", "--latch")
-    first = common_ros.listener("rospy", "/map")
+    talker = ros.talker(publisher, "/map", "--latch")
+    first = ros.listener("rospy", "/map")
     first.wait_for(event="received")
-    second = common_ros.listener("roscpp", "/map")
+    second = ros.listener("roscpp", "/map")
     second.wait_for(event="received")
     talker.wait_for(event="connected")
-    third = common_ros.listener("rospy", "/map")
+    third = ros.listener("rospy", "/map")
     third.wait_for(event="received")
     for listener in (first, second, third):
         assert [event["data"] for event in listener.seen(event="received")] == ["hello 1"]
