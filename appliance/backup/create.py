@@ -105,7 +105,13 @@ def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:
 
 
 def _files(state: Path) -> Iterator[tuple[str, int]]:
-    """What is kept, by name, open for reading: the log first, for the signer's memory is cut to it."""
+    """What is kept, by name, open for reading: the log first, for the signer's memory is cut to it.
+
+    The others are looked for when it is copied: the key that its signatures need is there by then.
+    """
+    log = opened(state, AUDIT_LOG) if (state / AUDIT_LOG).exists() else None
+    if log is not None:
+        yield AUDIT_LOG, log
     names = [
         name
         for part in sorted(KEPT_PARTS)
@@ -118,8 +124,8 @@ def _files(state: Path) -> Iterator[tuple[str, int]]:
             f"{state} has more than {MOST_FILES} files, most of them in {parts.most_common(1)[0][0]}: see who put them"
             " there, and take them away"
         )
-    for name in sorted(names, key=lambda candidate: candidate != AUDIT_LOG):
-        descriptor = opened(state, name)
+    for name in names:
+        descriptor = opened(state, name) if name != AUDIT_LOG else None
         if descriptor is not None:
             yield name, descriptor
 

@@ -20,6 +20,7 @@ from appliance.audit.verify import verify
 from appliance.backup import create as backup
 from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up
+from appliance.backup.database import copy_database
 from appliance.backup.restore import restore
 from appliance.ipsec.checkpoints import SignedCheckpoints
 from tests.support.audit import decision, settle
@@ -79,6 +80,24 @@ def test_there_and_back(state: Path, tmp_path: Path) -> None:
     with closing(sqlite3.connect(other / "control" / "state.db")) as connection:
         assert connection.execute("SELECT value FROM thing").fetchall() == [("kept",)]
     assert [one.name for one in tmp_path.iterdir() if one.name.startswith(".rosrv-backup")] == []
+
+
+def test_the_key_that_is_pinned_meanwhile_is_taken(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first checkpoint may be signed, and its key pinned, while a backup begins: its log proves itself."""
+    pin, file = state / "control" / "audit.pub", tmp_path / "backup.tar.gz"
+    key = pin.read_bytes()
+    pin.unlink()
+
+    def copied(source: Path, given: os.stat_result, target: Path) -> None:
+        pin.write_bytes(key)
+        copy_database(source, given, target)
+
+    monkeypatch.setattr(backup, "copy_database", copied)
+    assert back_up(state, file)[0] == "control/audit.db"
+    restore(file, tmp_path / "other")
+    assert verify(tmp_path / "other" / "control" / "audit.db", signer=tmp_path / "other" / "signer").ok
 
 
 def test_no_ros_is_needed(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
