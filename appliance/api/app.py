@@ -135,6 +135,6 @@ def _methods(request: Request) -> set[str]:
 async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)  # noqa: S101  registered for it
     errors = error.errors()
-    bad = [BadInput(where=".".join(map(str, error["loc"])), text=str(error["msg"])) for error in errors]
+    bad = [BadInput(where=".".join(map(str, found["loc"])), text=str(found["msg"])) for found in errors]
     detail = "; ".join(f"{problem.where}: {problem.text}" for problem in bad[:5])
     return _answer(request, ProblemError(422, "bad-input", detail, errors=bad))

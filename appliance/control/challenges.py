@@ -45,7 +45,7 @@ class Challenges:
             raise ChallengeRefusedError("the challenge has ended: ask for another one")
         if challenge in self._taken:
             raise ChallengeRefusedError("the proof was used already: each is good once")
-        for old in [challenge for challenge, end in self._taken.items() if end <= now]:
+        for old in [taken for taken, end in self._taken.items() if end <= now]:
             del self._taken[old]
         if len(self._taken) >= _MOST_TAKEN:
             raise ChallengeRefusedError(f"{_MOST_TAKEN} orders were signed within {SECONDS:g} s: wait")

@@ -111,7 +111,9 @@ class Tokens:
         name, now = request.name, time.time()
         row = self._named(name, now)
         if row is None:
-            known = ", ".join(sorted(row.name for row in self._rows.values() if row.usable(now))) or "none"
+            known = (
+                ", ".join(sorted(token.name for token in self._rows.values() if token.usable(now))) or "none"
+            )
             raise TokenRefusedError(f"there is no token {name[:80]!r} that can be used; there are: {known}")
         revoked = row._replace(revoked=now)
         self._keep(revoked)

@@ -22,7 +22,6 @@ BYTES = BYTES_PER_INSTRUCTION // 4
 
 _PIECE = 512  # bytes that a number may take
 _SHORT = 1024  # bytes of a text whose size is not charged
-_ADDRESS = 0xFFFFFFFF
 _Make = Callable[[Sequence[object]], object]
 
 
