@@ -113,6 +113,11 @@ class Monitor:
         """Whether it has faulted so often, or could not even begin, that somebody should look."""
         return self.broken or self.faults >= FAILING_AFTER
 
+    def come_home(self) -> None:
+        """Before Python looks at its state, or at that of others on its topics, it is with Python."""
+        if self.home is not None:
+            self.home.leave()
+
 
 def monitors_of(
     compiled: Compiled, nodes: list[tree.Specification], time_ns: int, slices: int

@@ -9,7 +9,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet, OnFault, Patience
+from appliance.rosmop.agenda import Patience
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.execution import OnFault
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding
 from appliance.rosmop.runtime.context import BUDGET

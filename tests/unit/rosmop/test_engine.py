@@ -7,7 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from appliance.ros.definitions import Definitions
-from appliance.rosmop.engine import MAX_TICKS, MonitorSet
+from appliance.rosmop.agenda import MAX_TICKS
+from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.wire import Message
 from appliance.rosmop.syntax.errors import SpecificationError

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet, OnFault
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.execution import OnFault
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds

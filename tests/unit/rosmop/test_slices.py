@@ -13,7 +13,8 @@ import pytest
 
 from appliance.rosmop.certify.properties import certificates_of
 from appliance.rosmop.compile.specification import compile_files
-from appliance.rosmop.engine import EXPLAINED, MonitorSet
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.execution import EXPLAINED
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.slices import GROWING_LIMIT, MAX_BINDING
 from appliance.rosmop.syntax.parser import parse

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.rosmop.engine import MonitorSet, OnFault
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.execution import OnFault
 from appliance.rosmop.logics.catalogue import LOGICS
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.syntax.errors import SpecificationError

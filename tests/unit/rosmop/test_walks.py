@@ -10,7 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.rosmop import walks
-from appliance.rosmop.engine import MonitorSet, OnFault
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.execution import OnFault
 from appliance.rosmop.ir.feed import AREA, MAX_EFFECTS
 from appliance.rosmop.ir.module import LINES, MOST_TEXTS
 from appliance.rosmop.logics.interface import ClockedRun, FiniteRun

@@ -1,0 +1,428 @@
+"""What happens to one message, or at one tick or deadline: events, properties, handlers, faults. No I/O, no clock.
+
+The events of a message happen specification by specification, in source order. After the action of an event that did
+not drop the message, every property of its specification steps, and the handlers of the categories it is in run.
+What drops the message ends its way; what faults drops it, too, or with `on_fault="pass"` is passed over. Of a
+parametric specification each slice that an event belongs to takes its turn (`slices.py`).
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+from appliance.rosmop.compile.specification import Compiled
+from appliance.rosmop.faults import explain
+from appliance.rosmop.logics.interface import Categories, RunFaultError
+from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step
+from appliance.rosmop.outcomes import DROPPED, Fault, Outcome, Verdict
+from appliance.rosmop.positions import Position
+from appliance.rosmop.runtime.context import FOLDED_NS, FaultError, LogLine
+from appliance.rosmop.runtime.wire import Buffer, Message
+from appliance.rosmop.slices import Key, Slice
+from appliance.rosmop.why import NOBODY, Bound, Sender, of_slice
+
+OnFault = Literal["drop", "pass"]
+Asked = Callable[[Verdict, int], bool]
+
+EXPLAINED = 20
+"""Verdicts of slices that are explained of those which one message brings about: each takes a millisecond."""
+
+
+class Execution:
+    """Carries out what compiled specifications say, on the state that their monitors have."""
+
+    def __init__(self, compiled: Compiled, on_fault: OnFault) -> None:
+        self.on_fault: OnFault = on_fault
+        self.asked: Asked | None = None
+        """Which verdicts to explain: by themselves and the source of the message; None: all."""
+        self._module = compiled.module
+        self._namespace = compiled.namespace
+        self._turn = compiled.turn
+        self._sender = NOBODY
+        self._bound: Bound | None = None
+        self._explains = True
+
+    def begin(self, monitors: Sequence[Monitor], time_ns: int) -> Outcome:
+        """Constants, first values, `init`: each for all before the next, as one may read another's variables."""
+        outcome = Outcome(time=time_ns)
+        self._turn.now = time_ns
+        for monitor in monitors:
+            monitor.context.begin()
+            for running in monitor.properties:
+                running.begin(time_ns)
+        self._begin_variables(monitors, outcome)
+        for monitor in monitors:
+            if monitor.slices is not None:
+                codes = [running.code for running in monitor.properties]
+                monitor.slices.begin(codes, tuple(running.run for running in monitor.properties))
+        self.collect(outcome)
+        return outcome
+
+    def message(self, steps: Sequence[Step], buffer: Buffer, outcome: Outcome, sender: Sender) -> None:
+        """Let the events of a message happen that is received at the time of the outcome; at least one step."""
+        steps[0].monitor.come_home()
+        self._turn.now = outcome.time
+        self._sender = sender
+        message = Message(buffer, outcome.time)
+        writers: tuple[tuple[Step, Sequence[int]], ...] = ()
+        for step in steps:
+            if step.first:
+                monitor = step.monitor
+                monitor.context.budget = monitor.context.most
+                if (not monitor.seen or monitor.held) and self._first(monitor, message, outcome):
+                    outcome.dropped_by = monitor.name
+                    break
+            if (self._happen if step.key is None else self._happen_in_slices)(step, message, outcome):
+                outcome.dropped_by = step.monitor.name
+                break
+            if message.touched:
+                sites = [site for bit, site in enumerate(message.marks) if message.touched >> bit & 1]
+                message.touched = 0
+                writers = (*writers, (step, sites))
+        self._finish(message, writers, outcome)
+
+    def tick(self, step: Step, time_ns: int) -> Outcome:
+        """Let an event without a topic happen; `collect` is the caller's."""
+        self._sender = NOBODY
+        step.monitor.come_home()
+        outcome = Outcome(time=time_ns)
+        outcome.timer = step.name
+        self._turn.now = time_ns
+        step.monitor.context.begin()
+
+        def act(outcome: Outcome, message: Message | None) -> bool:
+            outcome.events = (step.name,)
+            try:
+                step.function(message)
+            except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
+                self._fault(error, step.monitor, step.event.position, outcome)
+            else:
+                self._step_properties(step, message, time_ns, outcome)
+            return False
+
+        if step.monitor.slices is None:
+            act(outcome, None)
+        else:
+            self._bound = Bound(step.index, (), (True,), time_ns, NOBODY, step.event.creates)
+            self._each(step, (True,), None, outcome, act)
+            outcome.events = (step.name,)
+        return outcome
+
+    def expire(self, monitor: Monitor, running: RunningProperty) -> Outcome:
+        """Tell a property that its deadline has passed."""
+        self._sender = NOBODY
+        monitor.come_home()
+        deadline = running.run.deadline or 0
+        word = "timeout" if running.code.property.logic == "tfsm" else "deadline"
+        outcome = Outcome(time=deadline)
+        outcome.timer = f"{monitor.name}.{word}"
+        self._turn.now = deadline
+        monitor.context.begin()
+        categories = running.history.expire(running.run)
+        self._tell(monitor, running, categories, None, outcome, in_order_told=True)
+        self.collect(outcome)
+        return outcome
+
+    def warn(self, monitor: Monitor, text: str) -> None:
+        """A line of the monitor's log, for the next `collect`."""
+        self._turn.log.append(LogLine("WARN", text, monitor.name))
+
+    def collect(self, outcome: Outcome) -> None:
+        """Take what was put out, published and looked at since it was collected last."""
+        turn = self._turn
+        outcome.log, outcome.published, outcome.looked = turn.log, turn.published, turn.looked
+        outcome.sites = self._module.sites
+        turn.log, turn.published, turn.looked = [], [], {}
+
+    # One event
+
+    def _happen(self, step: Step, message: Message, outcome: Outcome) -> bool:
+        """Give the message to an event; whether it was dropped."""
+        try:
+            has_happened = step.function(message)
+        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
+            if self._module.has_begun(step.event.action_line, error):
+                outcome.events = (*outcome.events, step.name)
+            self._fault(error, step.monitor, step.event.position, outcome)
+            self._block(message, outcome)
+            return message.dropped
+        if not has_happened:
+            if message.past:
+                self._past(step, message)
+            return False
+        outcome.events = (*outcome.events, step.name)
+        if message.dropped:
+            return True
+        if step.monitor.properties:
+            self._step_properties(step, message, message.time, outcome)
+            return message.dropped
+        return False
+
+    def _happen_in_slices(self, step: Step, message: Message, outcome: Outcome) -> bool:
+        """Give the message to an event of a parametric specification; whether it was dropped."""
+        assert step.key is not None  # noqa: S101  who asks has looked
+        try:
+            found = step.key(message)
+        except Exception as error:  # noqa: BLE001  the bytes are not of its type
+            self._fault(error, step.monitor, step.event.position, outcome)
+            self._block(message, outcome)
+            return message.dropped
+        if not found:
+            if message.past:
+                self._past(step, message)
+            return False
+
+        key = (True,) if found is True else tuple(found)
+        self._bound = Bound(step.index, step.event.binds, key, message.time, self._sender, step.event.creates)
+        happened = step.monitor.slices.step(step.index, key)  # type: ignore[union-attr]  # who has a key has slices
+        if happened is not None:
+            if happened:
+                step.monitor.trail.append(self._bound)
+                outcome.events = (*outcome.events, step.name)
+            return False
+
+        def act(outcome: Outcome, message: Message | None) -> bool:
+            assert message is not None  # noqa: S101  each has one
+            if not step.event.plain:
+                return self._happen(step, message, outcome)
+            outcome.events = (*outcome.events, step.name)
+            self._step_properties(step, message, message.time, outcome)
+            return message.dropped
+
+        self._each(step, key, message, outcome, act)
+        return message.dropped
+
+    def _each(
+        self,
+        step: Step,
+        key: Key,
+        message: Message | None,
+        outcome: Outcome,
+        act: Callable[[Outcome, Message | None], bool],
+    ) -> None:
+        """Let an event happen in each slice that it belongs to, until one has dropped the message.
+
+        In a slice that lacks a parameter it happens to a copy of the message, and what it puts out is not put out.
+        """
+        slices = step.monitor.slices
+        assert slices is not None  # noqa: S101  who asks has looked
+        whole, seeds = slices.targets(step.event, key)
+        refused, why = slices.refused, slices.why
+        before, verdicts, faults = outcome.events, [*outcome.verdicts], [*outcome.faults]
+        names: Sequence[str] = before
+        turn, dropped, reached = self._turn, False, 0
+        if len(whole) + len(seeds) > 1:
+            try:
+                step.monitor.context.spend(len(whole) + len(seeds), -1)
+            except FaultError as error:
+                self._fault(error, step.monitor, step.event.position, outcome)
+                self._block(message, outcome)
+                return
+        for slice_ in whole:
+            outcome.events, outcome.verdicts, outcome.faults = before, (), ()
+            self._explains = len(verdicts) < EXPLAINED
+            dropped = self._in_slice(step.monitor, slice_, outcome, message, act)
+            if outcome.events is not before:
+                names, reached = outcome.events, reached + 1
+            verdicts += outcome.verdicts  # many slices: a tuple would be copied with each
+            faults += outcome.faults
+            if dropped:
+                break
+        self._explains = False  # of seeds nothing is told
+        for slice_ in () if dropped else seeds:
+            unseen = Outcome(time=outcome.time)
+            lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
+            copied = None if message is None else Message(bytes(message.buffer), message.time)
+            self._in_slice(step.monitor, slice_, unseen, copied, act)
+            reached += bool(unseen.events)
+            del turn.log[lines:], turn.published[published:]
+            turn.looked = looked
+            faults += unseen.faults
+        self._explains = True
+        trail = step.monitor.trail
+        if 0 < reached < len(whole) + len(seeds) and trail and trail[-1] is self._bound:
+            trail[-1] = self._bound._replace(everywhere=False)
+        outcome.events, outcome.verdicts, outcome.faults = names, tuple(verdicts), tuple(faults)
+        if refused is not None and not dropped:
+            self._refuse_slice(step, refused, why, message, outcome)
+
+    def _in_slice(
+        self,
+        monitor: Monitor,
+        slice_: Slice,
+        outcome: Outcome,
+        message: Message | None,
+        act: Callable[[Outcome, Message | None], bool],
+    ) -> bool:
+        """Make the slice the state of the monitor and let the event happen; whether the message was dropped."""
+        slices = monitor.slices
+        assert slices is not None  # noqa: S101  it has a slice
+        for running, run in zip(monitor.properties, slices.select(slice_), strict=True):
+            running.run = run
+        before, monitor.slice = outcome.events, slice_
+        dropped = act(outcome, message)
+        runs = tuple(running.run for running in monitor.properties)
+        slices.settle(slice_, runs, happened=outcome.events is not before)
+        return dropped
+
+    def _refuse_slice(
+        self,
+        step: Step,
+        binding: Mapping[str, object],
+        why: str,
+        message: Message | None,
+        outcome: Outcome,
+    ) -> None:
+        """There can be no slice of what an event binds: that is a fault."""
+        monitor = step.monitor
+        monitor.faults += 1
+        text = f"{why}: {step.name} is not monitored for this binding"
+        outcome.faults = (*outcome.faults, Fault(monitor.name, step.event.position, text, binding))
+        self._block(message, outcome)
+
+    def _finish(
+        self, message: Message, writers: tuple[tuple[Step, Sequence[int]], ...], outcome: Outcome
+    ) -> None:
+        turn = self._turn
+        if turn.log or turn.published or turn.looked:
+            self.collect(outcome)
+        if message.dropped:
+            outcome.result = "dropped"
+            outcome.overwritten = message.overwritten
+            if outcome.fatal is not None:
+                outcome.dropped_at = outcome.fatal.position
+            elif message.cause is not None:
+                outcome.dropped_at = self._module.sites[message.cause].position
+        elif message.changed:
+            outcome.result = "changed"
+            outcome.buffer = message.buffer
+            sites = self._module.sites
+            outcome.changed_by = tuple([step.name for step, _ in writers])
+            outcome.changed_at = tuple([sites[site].position for _, at in writers for site in at])
+
+    def _first(self, monitor: Monitor, message: Message, outcome: Outcome) -> bool:
+        """A message for a monitor that has seen none yet, or that holds its topics; whether it was dropped."""
+        if monitor.held:
+            outcome.reason = f"{monitor.name} holds its topics until it is resumed"
+        elif monitor.broken and self.on_fault == "drop":
+            outcome.reason = f"{monitor.name} could not begin: its first values or `init` faulted"
+        if outcome.reason is not None:
+            outcome.dropped_at = monitor.node.position
+            message.dropped = True
+            return True
+        monitor.seen = True
+        for timer in monitor.timers:
+            if not timer.ticked:
+                timer.due = message.time + timer.period
+        return False
+
+    def _step_properties(self, step: Step, message: Message | None, time_ns: int, outcome: Outcome) -> None:
+        trail = step.monitor.trail
+        if (
+            self._bound is not None
+            and step.monitor.slices is not None
+            and (not trail or trail[-1] is not self._bound)
+        ):
+            trail.append(self._bound)
+        for running in step.monitor.properties:
+            try:
+                if step.monitor.slices is None:
+                    categories = running.history.step(running.run, step.index, time_ns, self._sender)
+                else:
+                    categories = running.run.step(step.index, time_ns)
+            except RunFaultError as error:
+                self._fault(error, step.monitor, running.code.property.source.origin, outcome)
+                self._block(message, outcome)
+                continue
+            if categories:
+                self._tell(step.monitor, running, categories, message, outcome)
+
+    def _tell(
+        self,
+        monitor: Monitor,
+        running: RunningProperty,
+        categories: Categories,
+        message: Message | None,
+        outcome: Outcome,
+        *,
+        in_order_told: bool = False,
+    ) -> None:
+        """Run the handlers of these categories, in source order (after a deadline: in the order they are told)."""
+        handlers = [(category, handler) for category, handler in running.handlers if category in categories]
+        if in_order_told:
+            handlers.sort(key=lambda pair: categories.index(pair[0]))
+        self._turn.reset = False
+        for category, handler in handlers:
+            verdict = self._verdict(monitor, running, category)
+            outcome.verdicts = (*outcome.verdicts, verdict)
+            published, dropped = len(self._turn.published), message is not None and message.dropped
+            self._handle(monitor, handler, message, running, outcome)
+            made = [*range(published, len(self._turn.published))]
+            if message is not None and message.dropped and not dropped:
+                made.append(DROPPED)
+            if made:
+                outcome.handling = {**outcome.handling, **dict.fromkeys(made, verdict)}
+        if self._turn.reset:
+            running.begin(self._turn.now)
+
+    def _verdict(self, monitor: Monitor, running: RunningProperty, category: str) -> Verdict:
+        source, index = running.code.property.source, running.index
+        slices, slice_ = monitor.slices, monitor.slice
+        binding = {} if slices is None or slice_ is None else slices.binding(slice_)
+        verdict = Verdict(monitor.name, index, source.logic, category, source, binding=binding)
+        if self.asked is not None and not self.asked(verdict, self._sender.source):
+            return verdict
+        if slices is None or slice_ is None:
+            return replace(verdict, why=running.history.explain(category))
+        if not self._explains:
+            return verdict
+        why = of_slice(running.code.property, monitor.trail, slices.values(slice_), category)
+        return replace(verdict, why=why)
+
+    def _handle(
+        self,
+        monitor: Monitor,
+        handler: Handler,
+        message: Message | None,
+        running: RunningProperty,
+        outcome: Outcome,
+    ) -> None:
+        try:
+            handler(message)
+        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this handler and is recorded
+            self._fault(error, monitor, running.code.property.source.origin, outcome)
+            self._block(message, outcome)
+
+    def _block(self, message: Message | None, outcome: Outcome) -> None:
+        """What the last fault does to the message."""
+        if message is not None and self.on_fault == "drop":
+            message.dropped = True
+            outcome.fatal = outcome.faults[-1]
+
+    def _fault(self, error: Exception, monitor: Monitor, otherwise: Position, outcome: Outcome) -> None:
+        fault: Fault = explain(error, self._module, monitor.name, otherwise)
+        monitor.faults += 1
+        outcome.faults = (*outcome.faults, fault)
+
+    def _past(self, step: Step, message: Message) -> None:
+        """Count an event that did not happen, and tell it once in a while."""
+        step.past += 1
+        now = message.time
+        if step.told is None or now - step.told >= FOLDED_NS:
+            _, index, count = message.past or (0, 0, 0)
+            times = "" if step.past == 1 else f" ({step.past} times)"
+            text = f"{step.name} did not happen: index {index} is past the end of {count} elements{times}"
+            self.warn(step.monitor, text)
+            step.told, step.past = now, 0
+        message.past = None
+
+    def _begin_variables(self, monitors: Sequence[Monitor], outcome: Outcome) -> None:
+        beginning = list(monitors)
+        for stage in range(3):
+            for monitor in tuple(beginning):
+                try:
+                    self._namespace[monitor.code.start[stage]]()
+                except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of its beginning and is recorded
+                    self._fault(error, monitor, monitor.node.position, outcome)
+                    monitor.broken = True
+                    beginning.remove(monitor)
