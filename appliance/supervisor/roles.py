@@ -17,6 +17,7 @@ from appliance.supervisor.walls.folders import around, runnable
 from appliance.supervisor.walls.plan import NETWORK, ROUTES, Walls
 
 ROSMASTER = Path("/usr/bin/rosmaster")
+_ROSMASTER_LOGGING = Path(__file__).with_name("rosmaster_logging.conf")
 ROSOUT = Path("/usr/lib/rosout/rosout")
 SYSTEM_PYTHON = Path("/usr/bin/python3")
 ROS_PROGRAMS = {ROSMASTER: "python3-rosmaster", ROSOUT: "rosout"}
@@ -97,6 +98,7 @@ def _of_ros(facts: Facts, part: str, master: str) -> dict[str, str]:
         "ROS_IP": "127.0.0.1",
         "ROS_MASTER_URI": master,
         "ROS_LOG_DIR": str(facts.part(part) / "log"),
+        "ROS_PYTHON_LOG_CONFIG_FILE": str(_ROSMASTER_LOGGING),
         # rosout would write a gigabyte of what nodes say, which nobody reads: they say it to who subscribes.
         "ROSOUT_DISABLE_FILE_LOGGING": "1",
     }

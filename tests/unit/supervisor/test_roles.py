@@ -1,11 +1,12 @@
 """Tests of `appliance.supervisor.roles`."""
 
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.roles import ROLES, Facts, require_programs, roles_of
+from appliance.supervisor.roles import ROLES, SYSTEM_PYTHON, Facts, require_programs, roles_of
 from appliance.supervisor.users import NUMERIC_IDS
 
 FACTS = Facts(Path("/s"), Path("/s/run/config.json"), 12311, "http://127.0.0.1:5")
@@ -27,6 +28,26 @@ def test_rosmaster_runs_nothing_of_its_home() -> None:
     role = BY_NAME["rosmaster"]
     assert role.program is not None
     assert role.program(FACTS).argv[:2] == ("/usr/bin/python3", "-s")
+
+
+def test_rosmaster_logs_warnings_and_no_calls(tmp_path: Path) -> None:
+    """A line for each call would cost it half of its time; what goes wrong in it is still written."""
+    role = BY_NAME["rosmaster"]
+    assert role.program is not None
+    says = (
+        "import logging; from rosgraph.roslogging import configure_logging;"
+        "configure_logging('rosmaster', filename='master.log');"
+        "log = logging.getLogger('rosmaster.master');"
+        "log.info('+PARAM [/a] by /b'); log.warning('subscriber data stale')"
+    )
+    environment = {**role.program(FACTS).environment, "ROS_LOG_DIR": str(tmp_path), "HOME": str(tmp_path)}
+    done = subprocess.run(
+        [str(SYSTEM_PYTHON), "-s", "-c", says], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == ""
+    [line] = (tmp_path / "master.log").read_text().splitlines()
+    assert "WARNING" in line
+    assert "subscriber data stale" in line
 
 
 def test_rosout_writes_no_files() -> None:
