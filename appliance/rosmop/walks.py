@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 from appliance.rosmop.compile.program import groups
 from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, SOONER, TOLD, Feed, FeedModule, module_of
-from appliance.rosmop.ir.module import POSITION, SURE, UNDO, Cells
+from appliance.rosmop.ir.layout import POSITION, SURE, UNDO, Cells
 from appliance.rosmop.ir.output import HEAD
 from appliance.rosmop.ir.values import Values, struct_code
 from appliance.rosmop.machine import Machine, MachineTrap

@@ -23,23 +23,10 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.module import (
-    CHANGED,
-    DROPPED,
-    ELSEWHERE,
-    HAPPENED,
-    NOW,
-    POSITION,
-    RESET,
-    SAID,
-    SURE,
-    UNDO,
-    Cells,
-    NotScalarError,
-    Writer,
-    Written,
-)
+from appliance.rosmop.ir.layout import NOW, POSITION, SAID, SURE, UNDO, Cells, NotScalarError
+from appliance.rosmop.ir.module import CHANGED, DROPPED, HAPPENED, RESET, Writer, Written
 from appliance.rosmop.ir.output import Line
+from appliance.rosmop.ir.parts import ELSEWHERE
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.ir.wasm import (
     ELSE,

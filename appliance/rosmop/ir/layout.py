@@ -1,0 +1,144 @@
+"""What stands where in the memory of a module, and how large the values of a type are there.
+
+A variable of the set stands at its address, in 8 bytes.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from appliance.rosmop.ir import form
+from appliance.rosmop.ir.output import Line
+from appliance.rosmop.ir.values import Values, struct_code, struct_size
+from appliance.rosmop.ir.wasm import F32, F64, I32, I64
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
+
+POSITION, UNDO, SAID, NOW, SURE, FIRST = 0, 8, 12, 16, 24, 32
+"""Where it stands which frame is looked at, where the log and the lines end, the time, and where the lines end of the
+messages before; and what is given out begins.
+"""
+
+LINES = 64 << 10
+"""Bytes for lines of output; a message whose line has no room is left."""
+
+
+class NotScalarError(Exception):
+    """A function has something that this part of the form does not have."""
+
+
+def machine_type(kind: Type) -> int:
+    """The type of the machine for one of the language. Raises `NotScalarError`."""
+    if isinstance(kind, kinds.Bool) or (isinstance(kind, kinds.Integer) and kind.bits <= 32):
+        return I32
+    if isinstance(kind, kinds.Integer | kinds.Time | kinds.Duration | kinds.Index):
+        return I64
+    if isinstance(kind, kinds.Floating):
+        return F32 if kind.bits == 32 else F64
+    raise NotScalarError(str(kind))
+
+
+def is_signed(kind: Type) -> bool:
+    """Whether numbers of the type may be negative."""
+    return not isinstance(kind, kinds.Integer) or kind.signed
+
+
+@dataclass
+class Cells:
+    """Where the state of specifications that share topics or variables stands: 8 bytes for each property's state, then
+    for each variable that is used. Those that are `noted` only are not undone.
+    """
+
+    base: int
+    properties: int
+    source: int = 0
+    """Where the sender of what is looked at stands (`Sender.source` from bit 32 on), what is told, and which are
+    enabled: three i64 (see `feed.py`).
+    """
+    noted: frozenset[str] = frozenset()
+    exits: dict[int, int] = field(default_factory=dict)
+    """Where it is kept how the states of a property were left (`why.Exits`, `why.ClockedSteps`), by its number."""
+    clocks: dict[int, int] = field(default_factory=dict)
+    """Where it stands when the clock of a property began, and its time (`ClockedRun`), by its number."""
+    until: int = 0
+    """Where it stands (i64) when the next is due that Python knows of: an earlier deadline is told."""
+    variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
+    """Where each stands, and its type; in the order of the places."""
+
+    def address(self, name: str, kind: Type) -> int:
+        """Where a variable stands."""
+        machine_type(kind)
+        place = self.base + 8 * (self.properties + len(self.variables))
+        return self.variables.setdefault(name, (place, kind))[0]
+
+
+class Layout:
+    """Gives out the memory of a module."""
+
+    def __init__(
+        self, functions: Mapping[str, form.Function], shared: Mapping[str, Cells], values: Values
+    ) -> None:
+        self._values = values
+        self.functions = functions
+        self.shared = shared
+        self.budgets: dict[str, int] = {}
+        self.throttles: dict[tuple[str, int], int] = {}
+        """Where it stands when output at a site of a specification was last due."""
+        self.lines: list[Line] = []
+        self._used = FIRST
+        self.said = self.take(LINES)
+        """Where lines stand."""
+
+    def size(self, kind: Type) -> int:
+        """The bytes of every value of a type in a message. Raises `NotScalarError` where they differ."""
+        code = struct_code(kind)
+        if code is not None:
+            return struct_size(code)
+        if isinstance(kind, kinds.Record):
+            return sum(map(self.size, self._values.fields(kind)))
+        if isinstance(kind, kinds.Vector) and kind.length is not None:
+            return kind.length * self.size(kind.element)
+        raise NotScalarError(str(kind))
+
+    def offset(self, kind: Type, number: int) -> int:
+        """Where a field of a message begins in it. Raises `NotScalarError` where that differs."""
+        if not isinstance(kind, kinds.Record):
+            raise NotScalarError(str(kind))
+        return sum(map(self.size, self._values.fields(kind)[:number]))
+
+    def element(self, kind: Type) -> tuple[Type, int]:
+        """The type of the elements of a string or vector, and the bytes from one to the next (strings: in the table).
+
+        Raises `NotScalarError`.
+        """
+        if isinstance(kind, kinds.String):
+            return kinds.UINT8, 1
+        if not isinstance(kind, kinds.Vector):
+            raise NotScalarError(str(kind))
+        return kind.element, 4 if isinstance(kind.element, kinds.String) else self.size(kind.element)
+
+    def copied(self, kind: Type) -> Type:
+        """A message whose copy costs nothing. Raises `NotScalarError` of another."""
+        if isinstance(kind, kinds.Record):
+            for field in self._values.fields(kind):
+                self.copied(field)
+        elif struct_code(kind) is None:
+            raise NotScalarError(str(kind))
+        return kind
+
+    def take(self, size: int) -> int:
+        """The address of so many bytes of memory."""
+        at = self._used
+        self._used += -(-size // 8) * 8
+        return at
+
+    def budget(self, context: str) -> int:
+        """Where the budget of a specification stands."""
+        if context not in self.budgets:
+            self.budgets[context] = self.take(8)
+        return self.budgets[context]
+
+    def throttle(self, context: str, site: int) -> int:
+        """Where it stands when output at a site was last due."""
+        if (context, site) not in self.throttles:
+            self.throttles[context, site] = self.take(8)
+        return self.throttles[context, site]
