@@ -11,7 +11,7 @@ Invariants:
 """
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
@@ -56,7 +56,7 @@ class Walked(NamedTuple):
     `position` is where the first message begins that is left; `run` where what goes on in its buffer begins (behind the
     last dropped message). `dropped` are counts for each of the walker's events, if any was, `told` for each of its
     verdicts, if there was any. `sooner`: something is due earlier than it was. `lines` were put out, each with where
-    the frame begins of the message that it is about.
+    the frame begins of the message that it is about; their text took so many `seconds` (`Prepared.clock`).
     """
 
     position: int
@@ -65,12 +65,14 @@ class Walked(NamedTuple):
     told: Sequence[int] = ()
     sooner: bool = False
     lines: Sequence[tuple[int, LogLine]] = ()
+    seconds: float = 0.0
 
 
 class Prepared(NamedTuple):
     """What holds for all walks of a topic until the engine, or anything else, has done something: the sender of
     the messages; bits of `told` (and whether no message may be changed), `enabled` and `counted`, as the module takes
-    them; and where walks add up how many messages a set of events (see `Walker.writers`) has changed.
+    them; where walks add up how many messages a set of events (see `Walker.writers`) has changed; and what tells
+    seconds of processor time.
     """
 
     source: int
@@ -78,6 +80,7 @@ class Prepared(NamedTuple):
     enabled: int
     counted: int
     changed: dict[int, int]
+    clock: Callable[[], float]
 
 
 class Due(Protocol):
@@ -192,7 +195,7 @@ class Walker:
         self.changes = bool(feed.writers)
         """Whether messages may be changed."""
         self.brief = feed.brief
-        """Whether the time that a message takes is little enough not to be counted."""
+        """Whether the time that a message takes is little enough not to be counted, but for that of its lines."""
         self._lines = [(line, home.named(line.context)) for line in module.lines] if feed.says else []
         self._said = module.said
         self._monitors = tuple(dict.fromkeys(monitors))
@@ -236,6 +239,7 @@ class Walker:
         counted: Sequence[bool] = (),
         source: int = 0,
         changed: dict[int, int] | None = None,
+        clock: Callable[[], float] = lambda: 0.0,
     ) -> Prepared:
         """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none,
         `counted` for each verdict whether there may be more. Good until the engine is asked for anything.
@@ -243,7 +247,7 @@ class Walker:
         bits = sum(1 << number for number, silent in enumerate(told) if silent) - (LOUD if loud else 0)
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
         only = sum(1 << number for number, silent in enumerate(counted) if silent)
-        return Prepared(source, bits, enabled, only, {} if changed is None else changed)
+        return Prepared(source, bits, enabled, only, {} if changed is None else changed, clock)
 
     def walk(  # noqa: PLR0917  called for every batch: keywords would cost a tenth of it
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
@@ -261,13 +265,14 @@ class Walker:
         end = frames + len(view)
         begun, said = run, 0
         lines: list[tuple[int, LogLine]] = []
+        seconds = 0.0
         while True:
             try:
                 answer = self._call(frames + position, end, time_ns) or 0
             except MachineTrap:
                 answer = self._stopped()
             said |= answer
-            lines += self._put_out() if self._lines else ()
+            seconds += self._put_out(lines, prepared.clock) if self._lines else 0
             if answer >= LEFT:
                 self._undo()
             effects = (answer >> 32 & 0xFFFFFF) * _EFFECT.size
@@ -288,7 +293,7 @@ class Walker:
                 if sooner:
                     self._home.hasten()
                 dropped, told = self._counted() if run != begun or said & TOLD else ((), ())
-                return Walked(position, run, dropped, told, sooner, lines)
+                return Walked(position, run, dropped, told, sooner, lines, seconds)
 
     def take(
         self, message: Buffer, time_ns: int, source: int = 0
@@ -319,6 +324,7 @@ class Walker:
         dropped: Sequence[int] = ()
         told: Sequence[int] = ()
         lines: list[tuple[int, LogLine]] = []
+        seconds = 0.0
         sooner = False
         while position < len(view) and not sooner:
             following = position + 4 + _LENGTH.unpack_from(view, position)[0]
@@ -336,22 +342,27 @@ class Walker:
                 sooner = walked.sooner
                 told = _sums(told, walked.told)
                 lines += [(position, line) for _, line in walked.lines]
+                seconds += walked.seconds
                 if walked.run:
                     if position > run:
                         pieces.append(view[run:position])
                     run = following
                     dropped = _sums(dropped, walked.dropped)
             position = following
-        return Walked(position, run, dropped, told, sooner, lines)
+        return Walked(position, run, dropped, told, sooner, lines, seconds)
 
-    def _put_out(self) -> Iterator[tuple[int, LogLine]]:
-        """What is put out, each line with where its frame begins."""
+    def _put_out(self, lines: list[tuple[int, LogLine]], clock: Callable[[], float]) -> float:
+        """Append what is put out, each line with where its frame begins; the seconds that it took."""
         at, end = self._said, _LENGTH.unpack_from(self._memory, SURE)[0]
+        if at == end:
+            return 0.0
+        began = clock()
         while at < end:
             number, frame = HEAD.unpack_from(self._memory, at)
             line, monitor = self._lines[number]
-            yield frame - self._frames, line_of(line.level, line.text(self._memory, at), monitor)
+            lines.append((frame - self._frames, line_of(line.level, line.text(self._memory, at), monitor)))
             at += line.size
+        return clock() - began
 
     def _stopped(self) -> int:
         """What the module would have answered where it was stopped: the message that it looked at is left."""

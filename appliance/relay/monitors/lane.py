@@ -105,9 +105,12 @@ class Lane:
         if walked is None:
             return batch
         gone = self._counts.add(walked, now)
-        if walked.position == len(batch.view) and not gone and not walked.sooner:
+        if walked.position == len(batch.view) and not gone and not walked.sooner and not walked.lines:
             return batch
         passage = Passage(batch, now)
+        if walked.lines:
+            middle.spent += walked.seconds
+            self._say(walked, passage)
         passage.pieces = pieces
         passage.walked(walked.position, walked.run, gone)
         if walked.sooner:
@@ -153,10 +156,12 @@ class Lane:
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, walker, passage.time)
             return False
-        if walked is not None:
-            self._said(walked, passage)
         if began is not None:
             middle.spent += time.thread_time() - began
+        elif walked is not None:
+            middle.spent += walked.seconds
+        if walked is not None and walked.lines:
+            self._say(walked, passage)
         if not counts.begun:
             middle.observer.owe(counts)
         if walked is None:
@@ -167,17 +172,19 @@ class Lane:
             middle.look_again()
         return passage.position == passage.end
 
-    def _said(self, walked: Walked, passage: Passage) -> None:
+    def _say(self, walked: Walked, passage: Passage) -> None:
         """Tell what was put out."""
-        monitors = self._middle.monitors
-        if monitors is None or not walked.lines:
-            return
+        middle, monitors, began = self._middle, self._middle.monitors, time.thread_time()
+        assert monitors is not None  # noqa: S101  they have put it out
         head = HEAD if monitors.stamped(self._place[1]) else 0
         for position, line in walked.lines:
             first = position + 4
             size = _unpack_length(passage.view, position)[0]
             sighting = Sighting(passage, position, bytes(passage.view[first : first + min(size, head)]))
-            self._middle.observer.said(line, self._place, passage.time, sighting)
+            middle.observer.said(line, self._place, passage.time, sighting)
+        middle.spent += time.thread_time() - began
+        if middle.spent > LONGEST:
+            middle.look_again()
 
     def _prepare(self, monitors: MonitorSet, walker: Walker) -> tuple[Prepared, Counts]:
         """Ask once what holds for all batches until something happens."""
@@ -194,6 +201,7 @@ class Lane:
                 counted=[observer.hides_verdict(verdict, place) for verdict in walker.verdicts],
                 source=self._source,
                 changed=counts.changed,
+                clock=time.thread_time,
             )
         self._walker, self._sight = walker, self._middle.sight
         self._until = (_NEVER if monitors.next_due is None else monitors.next_due) if walker.brief else 0

@@ -76,7 +76,7 @@ class Feed:
 
     `verdicts` have the place of an event, of its step of a property, and of the handler. `log` is where the log of
     patches begins, `undo` the addresses of variables and of what they held before the message that is left. `brief`:
-    it has no loops, nor lines. `functions` are the numbers of those of the events in the module. `says`: it may put out
+    it has no loops. `functions` are the numbers of those of the events in the module. `says`: it may put out
     lines; all before the address at `SURE` are.
     """
 
@@ -261,7 +261,7 @@ class _Walk:
             self._counters,
             self._log,
             self._undo,
-            not self._says and all(written.brief for written in (*self._written, *self._run())),
+            all(written.brief for written in (*self._written, *self._run())),
             [written.number for written in self._written],
             self._says,
         )

@@ -347,6 +347,36 @@ def test_the_time_that_lines_take_is_counted() -> None:
     monitored.close()
 
 
+@pytest.mark.parametrize("does", ["count = 3;", 'count = 3; } @fail { puts("never");', 'puts("came");'])
+def test_nothing_is_asked_again_for_a_batch_until_something_happens(
+    does: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However much a monitor might say: that is told, and the next batch goes the prepared way as before."""
+    event, _, handler = does.partition("}")
+    logic = f"fsm: one [ e -> other ] other [ e -> one ] {handler} }}" if handler else ""
+    text = f"s() {{ event e(int count) /plain own/Plain '{{count:count}}' {{ {event} }} {logic} }}"
+    monitored = Monitored({"x.rv": text}, definitions(), together=True)
+    body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
+    batch = Traffic("/plain", (struct.pack("<I", len(body)) + body) * 50, 50)
+    for _ in range(2):  # the engine takes the first message, and the first change
+        monitored.through(batch)
+    asked = []
+    walks = MonitorSet.walks
+
+    def watched(*given: Any) -> bool:
+        asked.append(given)
+        return walks(*given)
+
+    monkeypatch.setattr(MonitorSet, "walks", watched)
+    for _ in range(3):
+        monitored.through(batch)
+    assert not asked
+    monitored.middle.tick()
+    monitored.through(batch)
+    assert asked
+    monitored.close()
+
+
 def test_what_several_change_is_counted_for_each_of_them() -> None:
     """Taken together, by bits and runs, as one by one: a message counts for each monitor that changed it."""
     body = struct.pack("<BidfBII3qI", 1, 5, 2.0, 1.0, 1, 5, 7, 1, 2, 3, 0)
