@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import socket
 import sys
 from collections.abc import Iterator
@@ -60,7 +61,7 @@ class Keeper:
                 "the keeper takes connections",
             )
             yield
-            process.stop()
+            process.stop(with_signal=signal.SIGTERM)  # it does not listen to SIGINT
 
     def lines(self) -> list[str]:
         """What it has written."""
