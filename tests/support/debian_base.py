@@ -3,8 +3,9 @@
     tree = make_base(directory, packages=["systemd-sysv", "iproute2"])
 
 The first call of a suite and package list takes a minute or two; what it made is kept under `build/debian/` and
-later calls unpack it in seconds. The tree can fetch more packages: it has this machine's sources of Debian
-packages, proxy, certificate authorities and pip settings, none of which then has to be named by what is built on it.
+later calls unpack it in seconds. A tree with packages is made from that of its suite without any. The tree can fetch
+more packages: it has this machine's sources of Debian packages, proxy, certificate authorities and pip settings, none
+of which then has to be named by what is built on it.
 """
 
 import fcntl
@@ -67,16 +68,7 @@ def make_base(directory: Path, packages: Sequence[str] = (), *, suite: str = SUI
     """
     archive = base_archive(packages, suite=suite)
     directory.mkdir(parents=True, exist_ok=True)
-    _run(
-        "tar",
-        "--extract",
-        "--numeric-owner",
-        "--xattrs",
-        "--file",
-        str(archive),
-        "--directory",
-        str(directory),
-    )
+    _unpack(archive, directory)
     return directory
 
 
@@ -88,8 +80,8 @@ def base_archive(packages: Sequence[str] = (), *, suite: str = SUITE) -> Path:
     folder = ROOT / "build" / "debian"
     folder.mkdir(parents=True, exist_ok=True)
     archive = folder / f"{suite}-{_key(packages, settings)}.tar"
-    with (folder / "lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # one at a time; the second finds what the first has made
+    with archive.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # each is made once; the second finds what the first has made
         if not archive.exists():
             _make(archive, packages, suite, settings)
     return archive
@@ -155,10 +147,19 @@ def pip_settings(listed: str) -> str:
     return "\n".join(["[global]", *(f"{key} = {value}" for key, value in kept.items()), ""])
 
 
-def _make(archive: Path, packages: Iterable[str], suite: str, settings: MachineSettings) -> None:
+def _unpack(archive: Path, directory: Path) -> None:
+    options = ("--extract", "--numeric-owner", "--xattrs")
+    _run("tar", *options, "--file", str(archive), "--directory", str(directory))
+
+
+def _make(archive: Path, packages: Sequence[str], suite: str, settings: MachineSettings) -> None:
     tree = archive.with_suffix(f".{os.getpid()}.tree")
     try:
-        _run("debootstrap", "--variant=minbase", suite, str(tree), settings.mirror)
+        if packages:
+            tree.mkdir()
+            _unpack(base_archive(suite=suite), tree)
+        else:
+            _run("debootstrap", "--variant=minbase", suite, str(tree), settings.mirror)
         for name, text in settings.files.items():
             path = tree / name
             path.parent.mkdir(parents=True, exist_ok=True)
