@@ -11,9 +11,13 @@ PYTEST := $(BIN)/pytest
 CHECKED := appliance tests examples benchmarks distribution
 LONG_PROOFS := $(addprefix tests/proofs/test_,histories.py insertion_traces.py insertion_at_large.py certifier.py events.py)
 LONG_UNIT := $(shell grep --invert-match '^\#' tests/long.txt)
+# What fetches packages needs this machine's network: a worker of pytest-xdist has none but a loopback of its own.
+CONTAINERS := tests/system/containers
+FETCHING := tests/system/vm tests/system/test_examples.py tests/system/test_generated_client.py
+NAMESPACES := $(filter-out $(CONTAINERS) $(FETCHING),$(wildcard tests/system/test_*.py) $(patsubst %/.,%,$(wildcard tests/system/[a-z]*/.)))
 PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples' tests/unit)
 
-.PHONY: help setup demo check static unit test test-system test-package prove wheel package image site release bench clean
+.PHONY: help setup demo check static unit test test-system system-machine system-containers system-namespaces test-package prove wheel package image site release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -44,7 +48,16 @@ test: check ## check, the long unit tests, and those with real ROS nodes (root: 
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
 	TESTS_EXAMPLES=all $(PYTEST) $(LONG_PROOFS) $(PROPERTIES) -n auto --dist loadfile --quiet --durations=5
-	$(PYTEST) tests/system --quiet --durations=15
+	$(MAKE) --jobs=2 --keep-going --output-sync=target --no-print-directory system-machine system-containers system-namespaces
+
+system-machine:
+	$(PYTEST) $(FETCHING) --quiet --durations=5
+
+system-containers:
+	$(PYTEST) $(CONTAINERS) --quiet --durations=5
+
+system-namespaces:
+	$(PYTEST) $(NAMESPACES) -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
 
 test-package: ## what is installed: the package's life in a virtual machine, image and archive built, the wheel
 	@scripts/setup --system

@@ -75,7 +75,7 @@ def test_a_guest_of_the_real_docker_is_itself(
         for program in ("iptables", "ip6tables"):
             (tmp_path / program).symlink_to(need_program(f"{program}-legacy", "iptables"))
         monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    with Engine(machine), isolated(machine, tmp_path) as isolation:
+    with Engine(machine, data=tmp_path / "docker"), isolated(machine, tmp_path) as isolation:
         guest = plugged(machine.namespace, behind, "docker0", "172.17.0")
         assert any("FORWARD drops" in text for text in isolation.obstacles())
         for way in ("-i", "-o"):
