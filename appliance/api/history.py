@@ -118,6 +118,8 @@ class History:
             self._news.notify_all()
 
     def _keep(self, sample: Sample) -> None:
+        while self._samples and self._samples[-1].time > sample.time:  # the clock was set back since
+            self._samples.pop()
         while self._samples and self._samples[0].time < sample.time - _KEPT_SECONDS:
             self._samples.popleft()
         self._samples.append(sample)

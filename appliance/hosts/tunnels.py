@@ -62,7 +62,7 @@ class Tunnels:
         self._link: Channel | None = None
         self._certificate: bytes | None = None
         self._dirty = asyncio.Event()
-        # Of the last statement: greater than any of an earlier life, which charon's process may still report.
+        # Of the last statement: no number of an earlier life, which charon's process may still report, comes again.
         self._number = time.time_ns()
         self._wake = asyncio.Event()
         self._changes = 0  # that charon is to be told
@@ -225,8 +225,11 @@ class Tunnels:
                 )
             case messages.TunnelsReported(taken, rows):
                 self._reported(rows)
-                for number in [statement for statement in self._stated if statement <= taken]:
-                    self._taken_changes = self._stated.pop(number)
+                if (
+                    taken in self._stated
+                ):  # after the clock was set back, a greater one may be of an earlier life
+                    for number in [statement for statement in self._stated if statement <= taken]:
+                        self._taken_changes = self._stated.pop(number)
                 self._wake.set()
 
     def _spawn(self, request: bytes) -> None:

@@ -10,9 +10,11 @@ Invariants:
 3. No certificate lives longer than the authority's own, or than `LONGEST_DAYS`.
 4. With a proof, a request is only good when the key of a certificate in the same name, which this authority made and
    which has not ended, signed it.
-5. A list of revoked certificates has all that are given each time; its number only grows (it is the time).
+5. A list of revoked certificates has all that are given each time. Its number only grows, over restarts and with the
+   clock set back, too: charon keeps the list it has when one with a lower number comes.
 """
 
+import contextlib
 import datetime
 import re
 import secrets
@@ -35,6 +37,7 @@ from appliance.whole_files import write_whole
 
 KEY_FILE = "ca.key"
 CERTIFICATE_FILE = "ca.pem"
+LIST_FILE = "ca.list"  # has the number of the last list of revoked certificates, in decimal
 LONGEST_DAYS = 398
 AUTHORITY_DAYS = 3650
 REVOCATIONS_DAYS = 30
@@ -71,6 +74,15 @@ class Authority:
             raise SignerKeyError(
                 f"{certificate_path} is not the certificate of {key_path}: restore both from one backup"
             )
+        self._list_path = directory / LIST_FILE
+        self._list_number = 0
+        if self._list_path.exists():
+            text = self._list_path.read_bytes()
+            if not text.isdigit():
+                raise SignerKeyError(
+                    f"{self._list_path} is damaged, it has no number: restore it from a backup"
+                )
+            self._list_number = int(text)
 
     @property
     def certificate(self) -> bytes:
@@ -128,7 +140,7 @@ class Authority:
             .issuer_name(self._certificate.subject)
             .last_update(now - _CLOCKS_DIFFER)
             .next_update(now + datetime.timedelta(days=REVOCATIONS_DAYS))
-            .add_extension(x509.CRLNumber(time.time_ns()), critical=False)
+            .add_extension(x509.CRLNumber(self._next_list()), critical=False)
             .add_extension(self._identifier(), critical=False)
         )
         for serial, moment in serials:
@@ -139,6 +151,14 @@ class Authority:
                 .build()
             )
         return builder.sign(self._key, self._hash).public_bytes(Encoding.PEM)
+
+    def _next_list(self) -> int:
+        self._list_number = max(self._list_number + 1, time.time_ns())
+        with contextlib.suppress(
+            OSError
+        ):  # a full disk keeps nobody from revoking; this life knows the number
+            write_whole(self._list_path, b"%d" % self._list_number, 0o600)
+        return self._list_number
 
     def _identifier(self) -> x509.AuthorityKeyIdentifier:
         return x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key())

@@ -65,14 +65,14 @@ class Trial:
     def announce(self, present: int, within: float | None) -> None:
         """A change comes; it is in the store before the revision is: control may die while the change is made."""
         if within is not None:
-            self._save(self._target(present), time.time() + within)
+            self._save(self._target(present), time.time() + within, within)
 
     def changed(self, before: int, within: float | None) -> None:
         """The change is made: `before` was in force. Without `within` seconds nothing waits any more."""
         back_to = self._target(before)
         self.end()
         if within is not None:
-            self._await(back_to, time.time() + within)
+            self._await(back_to, time.time() + within, within)
 
     def end(self) -> None:
         """What is in force stays."""
@@ -85,18 +85,20 @@ class Trial:
         """Go on waiting after a start."""
         kept = self._store.settings().get(self._setting, "")
         if kept:
-            back_to, deadline = kept.split()
-            self._await(int(back_to), float(deadline))
+            back_to, deadline, length = (*kept.split(), "inf")[:3]  # up to 0.1.0 the length was not kept
+            within = float(length)
+            # Not later than after its whole length: the clock may have been set back since.
+            self._await(int(back_to), min(float(deadline), time.time() + within), within)
 
     def _target(self, present: int) -> int:
         return present if self.confirm_by is None else self._back_to
 
-    def _save(self, back_to: int, deadline: float) -> None:
-        self._store.save_setting(self._setting, f"{back_to} {deadline}")
+    def _save(self, back_to: int, deadline: float, within: float) -> None:
+        self._store.save_setting(self._setting, f"{back_to} {deadline} {within}")
 
-    def _await(self, back_to: int, deadline: float) -> None:
+    def _await(self, back_to: int, deadline: float, within: float) -> None:
         self._back_to, self.confirm_by = back_to, deadline
-        self._save(back_to, deadline)
+        self._save(back_to, deadline, within)
         self.task = asyncio.get_running_loop().create_task(self._run(back_to, deadline))
 
     async def _run(self, back_to: int, deadline: float) -> None:

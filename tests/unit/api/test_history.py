@@ -64,6 +64,24 @@ def test_followers_are_told_and_the_hour_is_kept(monkeypatch: Any) -> None:
     asyncio.run(scenario())
 
 
+def test_samples_grow_in_time_when_the_clock_is_set_back(monkeypatch: Any) -> None:
+    """Those of the time that comes again are gone: rates and curves would run backwards."""
+    monkeypatch.setattr(history, "BUSY_SECONDS", 0.001)
+    times = [1000.0, 1010.0, 8200.0, 1005.0, 1015.0]
+    clock = iter(times)
+    monkeypatch.setattr("time.time", lambda: next(clock, 1020.0))
+
+    async def measures() -> Measures:
+        return body()
+
+    async def scenario() -> list[float]:
+        history = History(measures)
+        await _running(history, len(times))
+        return [one.time for one in history.samples(1000) if one.time < 1020.0]
+
+    assert asyncio.run(scenario()) == [1005.0, 1015.0]
+
+
 def test_without_control_followers_are_told_why(monkeypatch: Any) -> None:
     """While RVMaster is away there is no sample and no status, but the reason; then it goes on."""
     monkeypatch.setattr(history, "BUSY_SECONDS", 0.001)

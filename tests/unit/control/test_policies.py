@@ -97,6 +97,21 @@ async def test_an_unconfirmed_change_goes_back_after_a_start_of_the_appliance(tm
         assert (policies.revision, policies.confirm_by) == (3, None)
 
 
+async def test_a_clock_that_was_set_back_makes_no_time_limit_longer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a power cut the clock may stand years ago; whoever locked himself out waits no longer than he asked for."""
+    appliance = Appliance(tmp_path)
+    with appliance.started() as policies:
+        appliance.file.write_text(OTHER)
+        await policies.reload(PolicyReload(confirm_within=0.5), "operator")
+    now = time.time
+    monkeypatch.setattr(time, "time", lambda: now() - 3e8)
+    with appliance.started() as policies:
+        await until(policies, 3)
+        assert policies.current.text == OPEN
+
+
 async def test_a_file_that_was_edited_ends_the_time_limit(tmp_path: Path) -> None:
     """Another file at the start is another policy: no old time limit goes off, at that start or after a crash."""
     appliance = Appliance(tmp_path)

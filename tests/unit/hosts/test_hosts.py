@@ -3,6 +3,7 @@
 import asyncio
 import ipaddress
 import itertools
+import socket
 import time
 from collections.abc import Callable, Coroutine
 from pathlib import Path
@@ -30,7 +31,17 @@ from appliance.channel.admin import (
     RevocationsWanted,
 )
 from appliance.channel.answers.hosts import Endpoint, EnrolmentToken, KitParts, PortsSeen
-from appliance.channel.messages import CertificateMade, Message, TunnelsEnclosed, TunnelsWanted
+from appliance.channel.channel import Channel
+from appliance.channel.messages import (
+    CertificateMade,
+    CertificateNeeded,
+    Message,
+    TunnelLink,
+    TunnelsEnclosed,
+    TunnelsReported,
+    TunnelsStated,
+    TunnelsWanted,
+)
 from appliance.hosts.authority import Authority, AuthorityError
 from appliance.hosts.certification import Certification
 from appliance.hosts.hosts import Hosts
@@ -759,5 +770,38 @@ def test_who_is_told_that_a_host_is_out_finds_its_connections_closed(
         assert not asked.done()
         bench.relays.set()
         await asked
+
+    run(tmp_path, work)
+
+
+def test_only_what_charon_took_of_this_life_counts_as_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its process may report a greater number of an earlier life of control: the clock was set back since."""
+    monkeypatch.setattr("appliance.hosts.tunnels._TAKEN_SECONDS", 0.05)
+
+    async def work(bench: Bench) -> None:
+        ours, theirs = socket.socketpair()
+        link, charon = Channel(ours, TunnelLink), Channel(theirs, TunnelLink)
+        stated: asyncio.Queue[int] = asyncio.Queue()
+
+        def heard(message: Message, _descriptors: tuple[int, ...]) -> None:
+            if isinstance(message, TunnelsStated):
+                stated.put_nowait(message.number)
+
+        charon.attach(asyncio.get_running_loop(), heard, lambda: None)
+        await add(bench, "a")
+        bench.tunnels.attach(link)
+        running = asyncio.create_task(bench.tunnels.run(lambda: None))
+        charon.send(CertificateNeeded(signing_request(make_key(), "rosrv-appliance")))
+        number = await stated.get()
+        charon.send(TunnelsReported(number + 3_600_000_000_000, []))
+        assert not await bench.tunnels.until_taken()
+        charon.send(TunnelsReported(number, []))
+        monkeypatch.setattr("appliance.hosts.tunnels._TAKEN_SECONDS", 30.0)
+        assert await bench.tunnels.until_taken()
+        running.cancel()
+        for one in (link, charon):
+            one.close()
 
     run(tmp_path, work)

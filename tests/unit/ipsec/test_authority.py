@@ -3,6 +3,7 @@
 import base64
 import datetime
 import stat
+import time
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from cryptography.x509.oid import NameOID
 from appliance.ipsec.authority import (
     CERTIFICATE_FILE,
     KEY_FILE,
+    LIST_FILE,
     LONGEST_REQUEST,
     Authority,
 )
@@ -116,20 +118,40 @@ def test_limits_of_a_request(tmp_path: Path) -> None:
 
 
 def test_the_list_of_revoked_certificates_is_signed_and_complete(tmp_path: Path) -> None:
-    """It has exactly the serial numbers given, is signed by the authority, and its number grows."""
+    """It has exactly the serial numbers given, and is signed by the authority."""
     authority = Authority(tmp_path)
     root = x509.load_pem_x509_certificate(authority.certificate)
     first = x509.load_pem_x509_crl(authority.revocations([]))
     second = x509.load_pem_x509_crl(authority.revocations([("a1b2", 1_700_000_000.0)]))
     assert len(first) == 0
     assert [one.serial_number for one in second] == [0xA1B2]
-    numbers = [
-        one.extensions.get_extension_for_class(x509.CRLNumber).value.crl_number for one in (first, second)
-    ]
-    assert numbers[0] < numbers[1]
     public_key = root.public_key()
     assert isinstance(public_key, ec.EllipticCurvePublicKey)
     assert second.is_signature_valid(public_key)
+
+
+def number_of(revocations: bytes) -> int:
+    """The number of a list."""
+    extension = x509.load_pem_x509_crl(revocations).extensions.get_extension_for_class(x509.CRLNumber)
+    return extension.value.crl_number
+
+
+def test_the_number_of_the_list_grows_whatever_the_clock_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """charon keeps the list it has when one with a lower number comes: what was revoked since would be good there."""
+    numbers = [number_of(Authority(tmp_path).revocations([]))]
+    an_hour_ago = time.time_ns() - 3_600_000_000_000
+    monkeypatch.setattr(time, "time_ns", lambda: an_hour_ago)
+    authority = Authority(tmp_path)  # the signer was started again
+    numbers += [number_of(authority.revocations([])) for _ in range(2)]
+    (tmp_path / LIST_FILE).unlink()
+    (tmp_path / f"{LIST_FILE}.new").mkdir()  # nothing can be written any more
+    numbers.append(number_of(authority.revocations([])))
+    assert numbers == sorted(set(numbers))
+    (tmp_path / LIST_FILE).write_bytes(b"")
+    with pytest.raises(SignerKeyError, match="damaged"):
+        Authority(tmp_path)
 
 
 def test_the_authority_is_made_once(tmp_path: Path) -> None:
