@@ -14,14 +14,16 @@ import os
 import re
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Self
 
+from tests.support import forks
 from tests.support.processes import LIMIT, Host, Process, ThisMachine
 
 Client = Literal["rospy", "roscpp"]
-PYTHON = "/usr/bin/python3"  # the interpreter rospy is installed for
+PYTHON = forks.PYTHON
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 BUILD = ROOT / "build" / "tests"
@@ -67,7 +69,7 @@ class RosSession:
     def start(self, command: Sequence[str], *, label: str | None = None, **environment: str) -> Process:
         """Any program, in the environment of a node."""
         process = Process(
-            self.host,
+            forks.Forking(self.host),
             command,
             env=self.environment(self.host) | environment,
             label=label or Path(command[0]).name,
@@ -111,25 +113,34 @@ class RosSession:
         self, *command: str, timeout: float = LIMIT, check: bool = True, text: str | None = None
     ) -> subprocess.CompletedProcess[str]:
         """A stock tool that ends by itself: its output. `check`: a failure is the test's failure."""
-        popen = self.host.popen(
-            command,
-            env=self.environment(self.host),
-            cwd=str(self.home),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-        try:
-            out, err = popen.communicate(text, timeout=timeout)
-        except subprocess.TimeoutExpired:
-            popen.kill()
-            out, err = popen.communicate()
-            raise AssertionError(f"{' '.join(command)}: no end in {timeout:.0f} s\n{out}\n{err}") from None
-        if check and popen.returncode:
-            raise AssertionError(f"{' '.join(command)}: exit status {popen.returncode}\n{out}\n{err}")
-        return subprocess.CompletedProcess(command, popen.returncode, out, err)
+        with (
+            tempfile.TemporaryFile("w+") as given,
+            tempfile.TemporaryFile("w+") as out,
+            tempfile.TemporaryFile("w+") as err,
+        ):
+            given.write(text or "")
+            given.seek(0)
+            popen = forks.Forking(self.host).popen(
+                command,
+                env=self.environment(self.host),
+                cwd=str(self.home),
+                stdin=given,
+                stdout=out,
+                stderr=err,
+                start_new_session=True,
+            )
+            try:
+                status, late = popen.wait(timeout), False
+            except subprocess.TimeoutExpired:
+                popen.kill()
+                status, late = popen.wait(), True
+            for file in (out, err):
+                file.seek(0)
+            done = subprocess.CompletedProcess(command, status, out.read(), err.read())
+        if late or (check and status):
+            how = f"no end in {timeout:.0f} s" if late else f"exit status {status}"
+            raise AssertionError(f"{' '.join(command)}: {how}\n{done.stdout}\n{done.stderr}")
+        return done
 
     def story(self) -> str:
         """What every process said, for the message of a failure."""

@@ -1,0 +1,91 @@
+"""Debian's Python with rospy loaded: forks for each program that `tests/support/forks.py` orders.
+
+An order is a message with the program, its environment and its folder, and with five descriptors: its standard input,
+output and error, its network namespace, and a socket for its process id and, when it has ended, for how it ended.
+"""
+
+import contextlib
+import ctypes
+import gc
+import importlib
+import json
+import os
+import runpy
+import selectors
+import socket
+import sys
+from pathlib import Path
+
+import rospy
+
+STOCK_TOOLS = ("rosbag", "rosmaster.main", "rosnode", "rosparam", "rosservice", "rostopic")
+LOADED = (*STOCK_TOOLS, "actionlib.msg", "std_srvs.srv")  # besides rospy
+LONGEST = 1 << 20  # bytes of an order
+CLONE_NEWNET = 0x40000000
+
+
+def serve(orders):
+    """Fork for each order; the fork returns with it."""
+    with selectors.PollSelector() as selector:
+        selector.register(orders, selectors.EVENT_READ)
+        while True:
+            for key, _ in selector.select():
+                if key.fileobj is orders:
+                    order, descriptors, *_ = socket.recv_fds(orders, LONGEST, 5)
+                    if not order:
+                        sys.exit()
+                    report = socket.socket(fileno=descriptors.pop())
+                    pid = os.fork()
+                    if not pid:
+                        orders.close()
+                        return json.loads(order), descriptors, report
+                    for descriptor in descriptors:
+                        os.close(descriptor)
+                    selector.register(os.pidfd_open(pid), selectors.EVENT_READ, (pid, report))
+                else:
+                    pid, report = key.data
+                    selector.unregister(key.fileobj)
+                    os.close(key.fileobj)
+                    _, status = os.waitpid(pid, 0)
+                    with contextlib.suppress(BrokenPipeError):  # if nobody waits for it any more
+                        report.send(str(os.waitstatus_to_exitcode(status)).encode())
+                    report.close()
+
+
+def become(order, descriptors, report):
+    """Be what a new process of Python would be at its first instruction."""
+    *standard, namespace = descriptors
+    elsewhere = os.fstat(namespace).st_ino != Path("/proc/self/ns/net").stat().st_ino
+    if elsewhere and ctypes.CDLL(None, use_errno=True).setns(namespace, CLONE_NEWNET):
+        raise OSError(ctypes.get_errno(), "the network namespace cannot be entered")
+    os.close(namespace)
+    for number, descriptor in enumerate(standard):
+        os.dup2(descriptor, number)
+        os.close(descriptor)
+    os.setsid()
+    report.send(str(os.getpid()).encode())
+    report.close()
+    os.chdir(order["folder"])
+    os.environ.clear()
+    os.environ.update(order["environment"])
+    sys.argv[:] = order["arguments"]  # in its place: rosmaster has taken hold of it
+    importlib.reload(rospy.names)  # what rospy takes of the arguments and of the environment as it is loaded
+
+
+def main():
+    """Serve; in the fork, run what is ordered."""
+    for module in LOADED:
+        importlib.import_module(module)
+    gc.freeze()  # what is there stays, and its pages need no copies
+    become(*serve(socket.socket(fileno=int(sys.argv[1]))))
+    if sys.argv[0] == "-c":
+        program = sys.argv.pop(1)
+        sys.path[0] = ""
+        exec(compile(program, "<string>", "exec"), {"__name__": "__main__"})  # noqa: S102  as ordered
+    else:
+        sys.path[0] = str(Path(sys.argv[0]).resolve().parent)
+        runpy.run_path(sys.argv[0], run_name="__main__")
+
+
+if __name__ == "__main__":
+    main()
