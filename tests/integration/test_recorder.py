@@ -40,8 +40,8 @@ audit: {reserve_bytes: 1MiB}
 """
 
 
-@pytest.fixture
-def appliance() -> Iterator[Appliance]:
+@pytest.fixture(scope="module")
+def recording() -> Iterator[Appliance]:
     """An appliance with a recorder, and a monitor that drops what is said on /rude."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with tempfile.TemporaryDirectory(prefix="rosrv-recorder-") as name:
@@ -55,6 +55,15 @@ def appliance() -> Iterator[Appliance]:
         )  # fmt: skip
         with Appliance(options=options) as appliance:
             yield appliance
+
+
+@pytest.fixture
+def appliance(recording: Appliance) -> Iterator[Appliance]:
+    """The same, without a recording; what other tests said on topics of their own is in its memory."""
+    recording.leave_out_what_was()
+    yield recording
+    for line in recording.rosrv("record", "list", "--json", check=False).stdout.splitlines():
+        recording.rosrv("record", "remove", json.loads(line)["id"])
 
 
 @pytest.fixture
@@ -198,8 +207,9 @@ def test_what_a_killed_relay_had_received_is_in_the_recording(
     appliance: Appliance, ros: RosSession, tmp_path: Path, victims: tuple[str, ...]
 ) -> None:
     """Every message that a subscriber got before and after is there, once; but that which was just being passed on."""
-    listener = ros.listener("roscpp", "/chatter", name="ear")
-    ros.talker("roscpp", "/chatter", name="voice")
+    topic = f"/chatter_{len(victims)}"
+    listener = ros.listener("roscpp", topic, name="ear")
+    ros.talker("roscpp", topic, name="voice")
     listener.wait_for_count(10, event="received")
     for row in appliance.status()["processes"]:
         if row["role"] in victims:
@@ -210,7 +220,7 @@ def test_what_a_killed_relay_had_received_is_in_the_recording(
     [row] = recordings(appliance)
     assert (row["id"], row["triggers"][0]["text"]) == (begun["id"], "operator: kill")
     assert (row["complete"], row["why_not"]) == (True, "")
-    chatter = said(ros, fetched(appliance, row["id"], tmp_path), "/chatter")
+    chatter = said(ros, fetched(appliance, row["id"], tmp_path), topic)
     assert len({event["data"] for event in listener.seen(event="received")[:through]} - set(chatter)) <= 1
     assert len(chatter) == len(set(chatter))
     assert appliance.recorded(event="recording closed")[0]["detail"]["recording"] == row["id"]
@@ -218,14 +228,14 @@ def test_what_a_killed_relay_had_received_is_in_the_recording(
 
 def test_a_killed_recorder_goes_on(appliance: Appliance, ros: RosSession, tmp_path: Path) -> None:
     """The recording that it had begun is finished by the next, under the same name, with every message once."""
-    listener = ros.listener("roscpp", "/chatter", name="ear")
-    ros.talker("roscpp", "/chatter", name="voice")
+    listener = ros.listener("roscpp", "/speech", name="ear")
+    ros.talker("roscpp", "/speech", name="voice")
     heard = [event["data"] for event in listener.wait_for_count(10, event="received")]
     begun = json.loads(appliance.rosrv("record", "now", "--after", "3s", "--json").stdout)
     appliance.kill("recorder")
     [row] = recordings(appliance)
     assert (row["id"], row["complete"], row["why_not"]) == (begun["id"], True, "")
-    chatter = said(ros, fetched(appliance, row["id"], tmp_path), "/chatter")
+    chatter = said(ros, fetched(appliance, row["id"], tmp_path), "/speech")
     assert set(heard) <= set(chatter)
     assert len(chatter) == len(set(chatter))
 
@@ -264,6 +274,7 @@ def test_nodes_call_for_a_recording_if_the_policy_lets_them(appliance: Appliance
     stranger = ros.service_client("roscpp", service, "--trigger", name="stranger")
     stranger.send("now")
     stranger.wait_for(event="failed")
+    appliance.reload(OPEN_POLICY)
     [denied] = appliance.recorded(event="decision", decision="deny", caller_id="/stranger")
     assert (denied["category"], denied["resource"]) == ("call", service)
 
@@ -281,8 +292,8 @@ def test_over_rest_messages_are_for_investigators(
     viewer, operator = admin.with_token(token("viewer")), admin.with_token(token("operator"))
     secret = token("investigator")
     investigator = admin.with_token(secret)
-    listener = ros.listener("roscpp", "/chatter", name="ear")
-    ros.talker("roscpp", "/chatter", name="voice")
+    listener = ros.listener("roscpp", "/talk", name="ear")
+    ros.talker("roscpp", "/talk", name="voice")
     heard = [event["data"] for event in listener.wait_for_count(5, event="received")]
     order = {"after": 0.5, "note": "over REST"}
     for other in (viewer, investigator):
@@ -301,7 +312,7 @@ def test_over_rest_messages_are_for_investigators(
     (tmp_path / "bag").write_bytes(bag.body)
     mcap = investigator.get(f"{path}/bag?format=mcap")
     assert (mcap.status, mcap.body) == (200, b"".join(as_mcap(tmp_path / "bag")))
-    around = f"{path}/messages?at=1970-01-01T00:00:00Z&topic=/chatter"
+    around = f"{path}/messages?at=1970-01-01T00:00:00Z&topic=/talk"
     for other in (viewer, operator, admin):
         assert other.get(around).status == 403
         assert other.get(f"{path}/timeline").status == 200
@@ -325,7 +336,7 @@ def test_over_rest_messages_are_for_investigators(
         over_rest = rosrv(group, *verb, *place, ROSRV_TOKEN=secret)
         assert over_rest.returncode == 0, over_rest.stderr
         done[verb[0]] = over_rest.stdout
-    assert "/chatter" in done["timeline"]
+    assert "/talk" in done["timeline"]
     assert "data: " in done["messages"]
     assert taken.read_bytes() == bag.body
     for other in (viewer, operator, admin):
@@ -336,7 +347,7 @@ def test_over_rest_messages_are_for_investigators(
     assert hashlib.sha256(lent).hexdigest() == memory["sha256"]
     assert memory["id"] not in {one["id"] for one in viewer.get("/v1/recordings").json["recordings"]}
     assert "of 2 recordings" in done["replay"]
-    assert set(heard) <= set(said(ros, taken, "/chatter"))
+    assert set(heard) <= set(said(ros, taken, "/talk"))
     fetches = appliance.recorded(event="recording fetched", count=5)
     assert {record["detail"]["who"] for record in fetches} == {"the-investigator"}
     assert operator.request("DELETE", path).status == 403
