@@ -290,14 +290,14 @@ def test_a_stubborn_process_does_not_hold_up_the_end(start: Any) -> None:
     assert running.children() == []
 
 
-def test_a_second_appliance_on_the_same_state_is_refused(start: Any) -> None:
+def test_a_second_appliance_on_the_same_state_is_refused(common: Running) -> None:
     """The second start says which process has the state directory, and the first one does not notice."""
-    first = start().until_ready()
-    second = start()
+    second = Running(common.state)
     assert second.process.wait() == 1
     reason = second.process.wait_for(event="refused")["reason"]
-    assert f"process {first.process.pid}" in reason
-    assert first.echo()
+    second.process.stop()
+    assert f"process {common.process.pid}" in reason
+    assert common.echo()
 
 
 def test_why_control_cannot_serve_is_what_the_user_reads(start: Any) -> None:
