@@ -9,17 +9,19 @@ the same class serves an asyncio process (`attach`) and the relay's epoll loop. 
 bounded: past `limit` bytes of backlog `send` raises `ChannelFull` (both ends are ours; that is a defect, not load).
 """
 
-import asyncio
 import os
 import socket
 import struct
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from appliance.channel.messages import Message
+
+if TYPE_CHECKING:
+    import asyncio  # who has no loop (a launcher, the relay) does not wait for it
 
 _LENGTH = struct.Struct(">I")
 _RECEIVE_SIZE = 262_144
@@ -170,7 +172,7 @@ class Channel:
 
     def attach(
         self,
-        loop: asyncio.AbstractEventLoop,
+        loop: "asyncio.AbstractEventLoop",
         received: Callable[[Any, tuple[int, ...]], None],
         closed: Callable[[], None],
         refused: Callable[[str], None] | None = None,

@@ -6,7 +6,6 @@ the files of the verbs.
 """
 
 import functools
-import importlib
 import inspect
 import re
 from collections.abc import Callable, Mapping
@@ -16,6 +15,8 @@ from typing import Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
+
+from appliance import late
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,7 @@ class _Deferred(TyperCommand):
 def loaded(verb: Verb, name: str) -> Any:
     """The real command of a verb."""
     module, _colon, attribute = verb.place.partition(":")
-    found = getattr(importlib.import_module(f"appliance.cli.{module}"), attribute)
+    found = getattr(late.load(f"appliance.cli.{module}"), attribute)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command(name, help="\n\n".join(filter(None, (verb.first, inspect.getdoc(found)))))(found)
     return typer.main.get_command(app)

@@ -1,5 +1,8 @@
 """`rosrv up`: start the appliance and stay until it is told to stop."""
 
+from appliance.supervisor.logs import configure_logs  # before whoever imports structlog: see there
+
+# isort: split
 import contextlib
 import json
 import os
@@ -18,7 +21,6 @@ from appliance.config import Settings
 from appliance.config_sources import resolve
 from appliance.control.robot import own_address
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.logs import configure_logs
 from appliance.supervisor.roles import roles_of
 from appliance.supervisor.run import run_appliance
 from appliance.supervisor.supervisor import ControlReady

@@ -41,7 +41,7 @@ from pathlib import Path
 from typing import Literal
 
 from appliance.channel.answers.status import FirewallRule
-from appliance.network import conntrack, links
+from appliance.network import links
 from appliance.network.endings import end_processes
 from appliance.network.endpoint import Endpoint, outward_address
 from appliance.network.firewall import iptables
@@ -216,6 +216,8 @@ class Isolation:
 
     def _forget_tunnels(self) -> None:
         """Let the next packet of each tunnel go where the rules say now."""
+        from appliance.network import conntrack  # noqa: PLC0415  pyroute2: see `links`
+
         conntrack.forget(self._host, [port.first for port in _TUNNELS])
 
     def _build(self) -> None:

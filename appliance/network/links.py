@@ -12,9 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from pyroute2 import IPRoute
-from pyroute2.netlink.exceptions import NetlinkError
-
 from appliance.network.namespaces import Namespace, NetworkError
 
 IFNAMSIZ = 15  # characters
@@ -232,6 +229,9 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
     """Do `work` with a netlink socket of the namespace; errors say what was attempted and where."""
+    # A library of a hundred modules: not where there is no network to change.
+    from pyroute2 import IPRoute  # noqa: PLC0415
+    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415
 
     def inside() -> T:
         with IPRoute() as route:

@@ -7,8 +7,6 @@ in words for the person who started it.
 """
 
 import contextlib
-import gc
-import importlib
 import os
 import signal
 import socket
@@ -19,10 +17,10 @@ import msgspec
 import setproctitle
 
 import appliance
+from appliance import late
 from appliance.channel.channel import Channel
 from appliance.channel.messages import Failed, Lifeline, Walled
 from appliance.supervisor import privileges
-from appliance.supervisor.logs import configure_logs
 from appliance.supervisor.users import Account
 from appliance.supervisor.walls import landlock, seccomp
 from appliance.supervisor.walls.plan import Walls
@@ -63,14 +61,13 @@ def main() -> None:
     role, text = sys.argv[1:3]
     plan = msgspec.json.decode(text, type=Plan)
     setproctitle.setproctitle(f"rosrv: {title_of(role, plan.index)}")
-    configure_logs(role)
     try:
         secret = os.open(plan.secret, os.O_RDONLY | os.O_CLOEXEC) if plan.secret is not None else None
         _prepare(plan)
         if plan.argv:
             _execute(plan)
         else:
-            _call(plan, secret)
+            _call(role, plan, secret)
     except (OSError, ImportError, UnreachableError, seccomp.SeccompError) as error:
         _fail(plan.lifeline, f"{role} cannot be started: {error}")
 
@@ -131,15 +128,12 @@ def _require(account: Account, path: str, mode: int) -> None:
     )
 
 
-def _call(plan: Plan, secret: int | None) -> None:
+def _call(role: str, plan: Plan, secret: int | None) -> None:
     assert plan.entry is not None  # noqa: S101  a plan has either argv or entry
     _require(plan.account, str(Path(appliance.__file__).parent), os.R_OK | os.X_OK)
     module, _, function = plan.entry.partition(":")
-    # What a module makes stays: looking through it for garbage would be a tenth of the start, and of each later look.
-    gc.disable()
-    entry = getattr(importlib.import_module(module), function)
-    gc.freeze()
-    gc.enable()
+    late.load("appliance.supervisor.logs").configure_logs(role)
+    entry = getattr(late.load(module), function)
     arguments: list[int | Path | None] = [plan.lifeline]
     if plan.index is not None:
         arguments.append(plan.index)

@@ -5,8 +5,15 @@ What is logged with the standard library's `logging` looks the same.
 
 import logging
 import sys
+from typing import Any, cast
 
-import structlog
+_rich = sys.modules.pop("rich", None)
+sys.modules["rich"] = cast(Any, None)  # structlog loads it where it is, for tracebacks that we do not want
+import structlog  # noqa: E402  see above
+
+del sys.modules["rich"]
+if _rich is not None:
+    sys.modules["rich"] = _rich
 
 # Never the values of local variables: a token or a key might be among them.
 _transform = structlog.tracebacks.ExceptionDictTransformer(show_locals=False)
