@@ -387,7 +387,6 @@ inline carry_out() {
             awaited = awaited || (flags & AHEAD);
             assert(nfull(compiling));
             compiling!number, flags
-        /* = appliance/relay/monitors/compiler.py Compiler.now */
         :: !has && !blocked && len(compiling) == 0 && !monitored[number] -> swap(number, flags)
         :: !has && !blocked ->
             awaited = true;

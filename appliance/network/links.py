@@ -229,9 +229,8 @@ def source_address_for(namespace: Namespace, peer: str) -> str:
 
 def _netlink(namespace: Namespace, what: str, work: Callable[[Any], T]) -> T:
     """Do `work` with a netlink socket of the namespace; errors say what was attempted and where."""
-    # A library of a hundred modules: not where there is no network to change.
-    from pyroute2 import IPRoute  # noqa: PLC0415
-    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415
+    from pyroute2 import IPRoute  # noqa: PLC0415  a hundred modules: not where no network is changed
+    from pyroute2.netlink.exceptions import NetlinkError  # noqa: PLC0415  likewise
 
     def inside() -> T:
         with IPRoute() as route:

@@ -1,9 +1,13 @@
 """What was done to messages that needed nothing to be told, added up until the second is over."""
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
 
 from appliance.relay.monitors.places import Place
-from appliance.rosmop.walks import Walked, Walker
+
+if TYPE_CHECKING:
+    from appliance.rosmop.walks import Walked, Walker
 
 
 class Count(NamedTuple):

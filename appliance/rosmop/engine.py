@@ -27,24 +27,21 @@ from typing import Any, NamedTuple
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.agenda import Agenda, Patience
 from appliance.rosmop.compile.events import EventCode
-from appliance.rosmop.compile.program import connected
 from appliance.rosmop.compile.specification import Compiled, compile_files, findings_of
 from appliance.rosmop.execution import Asked, Execution, OnFault
 from appliance.rosmop.monitor import Monitor, Step, monitors_of
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.reach import reached, redefined
-from appliance.rosmop.runtime.context import Context
+from appliance.rosmop.runtime.context import TRIAL_BUDGET, Context
 from appliance.rosmop.runtime.wire import Buffer, Message
+from appliance.rosmop.sharing import sharing
 from appliance.rosmop.slices import LIMIT
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.parser import parse
 from appliance.rosmop.walks import Walker, Walks, walks_of
 from appliance.rosmop.why import NOBODY, Sender
-
-TRIAL_BUDGET = 100_000
-"""Instructions that a specification on trial may spend on one message: what waits meanwhile waits some milliseconds."""
 
 
 def _never() -> bool:
@@ -567,14 +564,6 @@ class MonitorSet:
             return False
 
         return tap
-
-
-def sharing(uses: Mapping[str, Collection[str]]) -> list[set[str]]:
-    """Specifications by those that share variables, however indirectly; `uses` says whose each one uses."""
-    names = list(uses)
-    return [
-        {names[number] for number in group} for group in connected([(name, *uses[name]) for name in names])
-    ]
 
 
 def _part(files: Sequence[tree.File], names: Collection[str]) -> list[tree.File]:

@@ -5,19 +5,14 @@ What is checked here is compiled again in the relay; nothing comes into force th
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from appliance import late
 from appliance.ros.definitions import Definitions
-from appliance.ros.errors import DefinitionError
 from appliance.ros.message_view import read_fields
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.certify.properties import certificates_of
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.site_keys import UnsignedError, read_signature, signer
 
 _MOST_FILES = 1000
@@ -146,39 +141,9 @@ def check(sources: Sources, site_keys: Sequence[str]) -> Checked:
     for name, text in sources.files.items():
         if len(text) > _LONGEST_FILE:
             raise SpecificationsRefusedError([f"{name}: longer than {_LONGEST_FILE} characters"])
-    try:
-        definitions = _standard().extended(Definitions.from_files(sources.definitions))
-        monitors = MonitorSet.load(sources.files, definitions)
-    except SpecificationError as error:
-        raise SpecificationsRefusedError([str(finding) for finding in error.findings]) from error
-    except DefinitionError as error:
-        raise SpecificationsRefusedError([f"msg/{error}"]) from error
-    certificates, wrong = certificates_of(monitors.monitors)
-    if wrong:
-        raise SpecificationsRefusedError([str(finding) for finding in wrong])
-    return Checked(
-        {monitor.name: monitor.code.file for monitor in monitors.monitors},
-        {
-            monitor.name: frozenset(
-                e.topic for e in monitor.code.events if e.topic is not None and e.part is None
-            )
-            for monitor in monitors.monitors
-        },
-        {
-            monitor.name: frozenset(
-                e.topic for e in monitor.code.events if e.topic is not None and e.part is not None
-            )
-            for monitor in monitors.monitors
-        },
-        dict(monitors.publications),
-        tuple(str(warning) for warning in monitors.warnings),
-        dict(monitors.topics) | dict(monitors.publications),
-        definitions,
-        {monitor.name: monitor.code.uses for monitor in monitors.monitors},
-        {name: monitors.published_by(name) for name in sources.files},
-        sources.signers(site_keys),
-        certificates,
-    )
+    # The compiler, half a second of a small machine: not where there is nothing to compile.
+    checked: Checked = late.load("appliance.specifications.checking").checked(sources, site_keys)
+    return checked
 
 
 def read_folder(folder: Path) -> Sources:
@@ -224,8 +189,3 @@ def _read(path: Path) -> str:
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
         raise SpecificationsRefusedError([f"{path}: is not UTF-8 text: {error.reason}"]) from error
-
-
-@cache
-def _standard() -> Definitions:
-    return standard_definitions()

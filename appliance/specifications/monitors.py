@@ -37,7 +37,7 @@ from appliance.channel import admin, messages
 from appliance.channel.answers import monitors as answers
 from appliance.channel.answers.monitors import Replaced, Switched
 from appliance.fingerprints import fingerprint_of_all
-from appliance.rosmop.engine import sharing
+from appliance.rosmop.sharing import sharing
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.files import (
     Checked,

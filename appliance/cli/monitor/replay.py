@@ -22,9 +22,10 @@ from appliance.cli.tables import say_table, table_of
 from appliance.cli.target import Appliance, speaks
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import Margin, MonitorSet, sharing
+from appliance.rosmop.engine import Margin, MonitorSet
 from appliance.rosmop.outcomes import Outcome, bound
 from appliance.rosmop.positions import Position, line_of
+from appliance.rosmop.sharing import sharing
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.parser import parse

@@ -1,30 +1,25 @@
 """Specifications become monitors beside the loop, so that messages go on while a large set is compiled.
 
-One statement at a time, in the order they came; `done` is called by the loop. Only what has no specifications is
-"compiled" at once.
+One statement at a time, in the order they came; `done` is called by the loop.
 """
 
 import os
 import sys
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
+from typing import TYPE_CHECKING, Union
 
+from appliance import late
 from appliance.channel.messages import SpecificationsStated
 from appliance.relay.loop import READ, Loop
-from appliance.ros.definitions import Definitions
-from appliance.ros.errors import DefinitionError
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.certify.properties import certificates_of
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.syntax.errors import SpecificationError
+
+if TYPE_CHECKING:
+    from appliance.rosmop.engine import MonitorSet
 
 _SWITCH_SECONDS = 0.0005  # the loop waits so long at most for the compiler
-_TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in one go
-_TRIAL_TICKS_SECONDS = 0.02
 
-Result = MonitorSet | list[str]
+Result = Union["MonitorSet", list[str]]
 """The monitors, or what is wrong with the specifications."""
 
 
@@ -34,15 +29,10 @@ class Compiler:
     def __init__(self, loop: Loop, done: Callable[[SpecificationsStated, Result], None]) -> None:
         self._loop = loop
         self._done = done
-        self._standard: Definitions | None = None
         self._waiting: deque[SpecificationsStated] = deque()
         self._thread: threading.Thread | None = None
         self._result: Result = []
         self._wake = -1
-
-    def now(self, message: SpecificationsStated) -> None:
-        """Compile at once."""
-        self._done(message, self.compile(message))
 
     def later(self, message: SpecificationsStated) -> None:
         """Compile while the loop goes on."""
@@ -86,40 +76,11 @@ class Compiler:
         if self._waiting and self._thread is None:  # `done` may have brought others, and begun
             self._begin()
 
-    def compile(self, message: SpecificationsStated) -> Result:
+    @staticmethod
+    def compile(message: SpecificationsStated) -> Result:
         """The set that these specifications make, or what is wrong with them."""
-        try:
-            if not message.files:
-                return MonitorSet.load({}, Definitions({}), message.on_fault, _patience)
-            if self._standard is None:
-                self._standard = standard_definitions()
-            definitions = self._standard.extended(Definitions.from_files(message.definitions))
-            monitors = MonitorSet.load(
-                dict(message.files),
-                definitions,
-                message.on_fault,
-                _patience,
-                trials=message.trials,
-                trial_patience=lambda: _patience(_TRIAL_TICKS_SECONDS),
-                margins=True,
-                slices=message.slices,
-            )
-            for part in (monitors, *monitors.trials):
-                _, wrong = certificates_of(
-                    part.monitors
-                )  # control has checked its own: these are what will judge
-                if wrong:
-                    return [str(finding) for finding in wrong]
-            monitors.write_module()
-            return monitors
-        except SpecificationError as error:
-            return [str(finding) for finding in error.findings]
-        except DefinitionError as error:
-            return [str(error)]
+        try:  # it is loaded late, for that takes half a second of a small machine
+            result: Result = late.load("appliance.relay.monitors.compilation").compiled(message)
         except Exception as error:  # noqa: BLE001  a defect of the compiler is a reason to refuse, no more
             return [f"a defect of rosrv, please report it: {type(error).__name__}: {error}"]
-
-
-def _patience(seconds: float = _TICKS_SECONDS) -> Callable[[], bool]:
-    ends = time.thread_time() + seconds
-    return lambda: time.thread_time() > ends
+        return result

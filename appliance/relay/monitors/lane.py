@@ -9,9 +9,11 @@ batch has to be asked is prepared once (`_prepare`), and what it adds to the cou
 second is over.
 """
 
+from __future__ import annotations
+
 import struct
 import time
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from appliance.relay.connections.frames import Batch
 from appliance.relay.counts import Counts
@@ -20,10 +22,12 @@ from appliance.relay.monitors.observer import Observer
 from appliance.relay.monitors.passage import Passage
 from appliance.relay.monitors.places import HEAD, Place, Senders, Sighting
 from appliance.relay.monitors.trials import Trials
-from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.context import BUDGET
-from appliance.rosmop.walks import Prepared, Walked, Walker
+
+if TYPE_CHECKING:
+    from appliance.rosmop.engine import MonitorSet
+    from appliance.rosmop.walks import Prepared, Walked, Walker
 
 LONGEST = 2.0
 """Seconds of processor time that monitors may take until the loop comes to its timers again."""

@@ -4,11 +4,16 @@ Every message counts: the modules note it (`rosmop/compile/margins.py`), and onc
 the times are those of the second; of monitors on trial only the messages count that they were given.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from appliance.channel.messages import Approach, MarginRow
-from appliance.rosmop.engine import Margin, MonitorSet
+
+if TYPE_CHECKING:
+    from appliance.rosmop.engine import Margin, MonitorSet
 
 _DAY = 86_400 * 1_000_000_000
 

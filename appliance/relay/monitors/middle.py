@@ -15,9 +15,12 @@ Invariants:
   Ticks that are late and take long are left out.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from appliance.channel.messages import (
     MonitorRow,
@@ -34,10 +37,12 @@ from appliance.relay.monitors.observer import Observer, refusal
 from appliance.relay.monitors.places import NOWHERE, Place, Senders
 from appliance.relay.monitors.trials import Trials
 from appliance.relay.report import Reporter
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.runtime.context import Published
 from appliance.rosmop.why import Sender
+
+if TYPE_CHECKING:
+    from appliance.rosmop.engine import MonitorSet
+    from appliance.rosmop.monitor import Monitor
 
 _AFTER_DEFECT = 1.0
 
@@ -98,7 +103,8 @@ class Middle:
                 self._taken(message, [], frozenset())
                 return
             if not message.files and (self._stated is None or self.blocked):
-                self._compiler.now(message)
+                self._stated, self.blocked = message, ""
+                self._taken(message, [], None)
                 return
         if message.ahead or (self._stated is None and not self.blocked):
             self._awaited = message
@@ -113,9 +119,9 @@ class Middle:
             self._refuse(message, result)
             return
         result.explain_when(self.observer.asks, self._on_trial.asks)
-        before, now, blocked = self.monitors, self.now(), self.blocked
+        before, now, first = self.monitors, self.now(), self._stated is None or bool(self.blocked)
         if before is None:
-            outcome = result.start(now, restarted=message.restarted)
+            outcome = result.start(now, restarted=first and message.restarted)
         else:
             incomplete = self.trials.settle()
             self._margins.take(before, now)
@@ -130,7 +136,7 @@ class Middle:
         self.observer.keep([monitor.name for monitor in result.monitors], began, now)
         self.observer.told(outcome, NOWHERE)
         self.trials.take(result, outcome)
-        anew = None if before is None or blocked else _topics(_replaced(before, result))
+        anew = None if first else _topics(_replaced(before, result))
         self._taken(message, began, anew)
 
     def _taken(self, message: SpecificationsStated, began: list[str], anew: frozenset[str] | None) -> None:
@@ -149,10 +155,10 @@ class Middle:
 
     def _refuse(self, message: SpecificationsStated, findings: list[str]) -> None:
         self.look_again()
-        if self.monitors is None:
+        if self._stated is None:
             reason = f"the specifications of revision {message.revision} could not be taken: {findings[0]}"
             self.blocked = reason
-        self._changed(None if self.monitors is None else frozenset())
+        self._changed(None if self._stated is None else frozenset())
         self._reporter.send(SpecificationsRefused(message.revision, findings[:100], message.statement))
 
     def switch(self, name: str, enabled: bool) -> None:
@@ -338,12 +344,13 @@ def _topics(monitors: Iterable[Monitor]) -> frozenset[str]:
     return frozenset(step.event.topic for monitor in monitors for step in monitor.steps if step.event.topic)
 
 
-def _replaced(before: MonitorSet, after: MonitorSet) -> list[Monitor]:
+def _replaced(before: MonitorSet | None, after: MonitorSet) -> list[Monitor]:
     """The monitors of both sets that do not go on as they were."""
-    kept = {monitor.name for monitor in after.monitors} & {monitor.name for monitor in before.monitors} - set(
+    earlier = before.monitors if before is not None else ()
+    kept = {monitor.name for monitor in after.monitors} & {monitor.name for monitor in earlier} - set(
         after.began
     )
-    return [monitor for part in (before, after) for monitor in part.monitors if monitor.name not in kept]
+    return [monitor for monitor in (*earlier, *after.monitors) if monitor.name not in kept]
 
 
 def _same(one: SpecificationsStated, other: SpecificationsStated) -> bool:

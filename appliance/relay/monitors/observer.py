@@ -5,8 +5,11 @@ change that several made is one record, under the last of them, that names all; 
 once for the topic.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from appliance.channel.messages import MonitorRow
 from appliance.relay.counts import Counts
@@ -14,9 +17,11 @@ from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.places import NOWHERE, Place, Senders, Sighting
 from appliance.rosmop.explanations import of_change, of_drop, of_fault, of_published, of_verdict
-from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.outcomes import Outcome, Verdict, bound, named
 from appliance.rosmop.runtime.context import LogLine, Published
+
+if TYPE_CHECKING:
+    from appliance.rosmop.monitor import Monitor
 
 _EXPLAINED = 10
 

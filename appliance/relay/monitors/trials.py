@@ -9,17 +9,22 @@ Invariants:
 - Ticks and deadlines happen after the messages that came before them.
 """
 
+from __future__ import annotations
+
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from appliance.relay.loop import Loop, Timer
 from appliance.relay.monitors.observer import Observer
 from appliance.relay.monitors.places import NOWHERE, Place, Sighting
-from appliance.rosmop.engine import TRIAL_BUDGET, MonitorSet, Tapped
 from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.runtime.context import TRIAL_BUDGET
 from appliance.rosmop.why import Sender
+
+if TYPE_CHECKING:
+    from appliance.rosmop.engine import MonitorSet, Tapped
 
 SHARE = 0.2
 """Seconds of processor time in a second."""

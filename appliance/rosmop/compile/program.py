@@ -1,11 +1,12 @@
 """What belongs together in a set: specifications that share topics, services or variables, as the form has them."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from appliance.rosmop.compile.specification import SpecificationCode
 from appliance.rosmop.ir import form
 from appliance.rosmop.logics.interface import ClockedProperty, FiniteProperty
+from appliance.rosmop.sharing import connected
 
 
 @dataclass(frozen=True)
@@ -32,25 +33,6 @@ def groups(specifications: Sequence[SpecificationCode]) -> Iterator[Group]:
     ])  # fmt: skip
     for numbers in found:
         yield _group(specifications, numbers)
-
-
-def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
-    """The numbers of what has keys in common, however indirectly, in order."""
-    owners: dict[object, int] = {}
-    chief = list(range(len(keys)))
-
-    def find(number: int) -> int:
-        while chief[number] != number:
-            chief[number] = number = chief[chief[number]]
-        return number
-
-    for number, own in enumerate(keys):
-        for key in own:
-            chief[find(number)] = find(owners.setdefault(key, number))
-    together: dict[int, list[int]] = {}
-    for number in range(len(keys)):
-        together.setdefault(find(number), []).append(number)
-    return together.values()
 
 
 def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) -> Group:

@@ -204,11 +204,11 @@ def test_the_first_specifications_hold_up_nothing_but_what_is_to_be_carried(
     compiled = threading.Event()
     compile_now = Compiler.compile
 
-    def compile_late(compiler: Compiler, message: SpecificationsStated) -> Any:
+    def compile_late(message: SpecificationsStated) -> Any:
         compiled.wait()
-        return compile_now(compiler, message)
+        return compile_now(message)
 
-    monkeypatch.setattr(Compiler, "compile", compile_late)
+    monkeypatch.setattr(Compiler, "compile", staticmethod(compile_late))
     late = GUARD.replace("/chatter", "/late")
     world.state(SpecificationsStated(1, [("0.rv", late)], {}, {}, True, statement=7))
     world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
@@ -253,11 +253,11 @@ def test_what_a_new_control_begins_with_is_in_force_before_it_places_anything(
     compiled = threading.Event()
     compile_now = Compiler.compile
 
-    def compile_late(compiler: Compiler, message: SpecificationsStated) -> Any:
+    def compile_late(message: SpecificationsStated) -> Any:
         compiled.wait()
-        return compile_now(compiler, message)
+        return compile_now(message)
 
-    monkeypatch.setattr(Compiler, "compile", compile_late)
+    monkeypatch.setattr(Compiler, "compile", staticmethod(compile_late))
     world.state(SpecificationsStated(2, [("0.rv", text)], {}, {}, True, ahead=True))
     world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
     assert ("k", "/late") not in world.engine.topics
