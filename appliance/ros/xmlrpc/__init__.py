@@ -1,7 +1,7 @@
 """XML-RPC as ROS 1 speaks it, without I/O: requests and answers from bytes, under limits, and to bytes.
 
-Nothing that was received is sent on as bytes: it is parsed into values (`reader`, and `usual` for what is short and
-plain), decided on, and written afresh (`writer`).
+Nothing that was received is sent on as bytes: it is parsed into values (`reader`, and `usual` for what is plain),
+decided on, and written afresh (`writer`).
 """
 
 from dataclasses import dataclass
@@ -46,17 +46,17 @@ class FaultReceived(PeerError):  # noqa: N818 - named as the event it is: the an
 def parse_call(body: bytes, limits: Limits = DEFAULT_LIMITS) -> MethodCall:
     """Parse a request; raises `ProtocolError` or `LimitExceededError`."""
     usual = usual_call(body, limits)
-    if usual is not None:
-        return MethodCall(usual[0], tuple(usual[1]))
-    document = Document(body, limits, "methodCall")
-    params = document.values
-    if document.method == "system.multicall" and params:
+    if usual is None:
+        document = Document(body, limits, "methodCall")
+        usual = document.method, document.values
+    method, params = usual
+    if method == "system.multicall" and params:
         parts = params[0]
         if isinstance(parts, list) and len(parts) > limits.parts:
             raise LimitExceededError(
                 f"system.multicall of {len(parts)} calls; at most {limits.parts} are allowed"
             )
-    return MethodCall(document.method, tuple(params))
+    return MethodCall(method, tuple(params))
 
 
 def parse_response(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Value:

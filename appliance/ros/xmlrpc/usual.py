@@ -1,40 +1,40 @@
-"""Reading the documents that a ROS network is full of: names, numbers and lists of names, as its clients write them.
+"""Reading the documents that a ROS network is full of: names, numbers and lists of them, as its clients write them.
 
-One pattern has the whole document, where `reader` walks through its elements. It takes nothing that `reader` would not
-take, and as the same values; what it does not know, whatever may be in it, is left to `reader`, which also has all
-errors. Texts are printable ASCII without a character that means something in XML.
+One pattern has the whole document, or each part of a multicall, where `reader` walks through its elements. It takes
+nothing that `reader` would not take, and as the same values; what it does not know, whatever may be in it, is left to
+`reader`, which also has all errors. Texts are printable ASCII without a character that means something in XML.
 """
 
 import re
 
 from appliance.ros.xmlrpc.values import Limits, Value
 
-_LONGEST = 32 << 10  # bytes of a document
+_LONGEST = 32 << 10  # bytes that one pattern has
+_SMALLEST = len("<value></value>")
 # Of two stars that can take the same byte one gives nothing back (`*+`): time is linear in the document.
 _SPACE = rb"[ \t\r\n]*+"
 _TEXT = rb"[ -%'-;=?-~]*+"
 _INTEGER = rb"-?[0-9]{1,9}"
+_DOUBLE = rb"-?[0-9]++(?:\.[0-9]++)?(?:e[-+]?[0-9]++)?"
 
 
-def _scalar(text: bytes, integer: bytes) -> bytes:
-    kinds = b"<string>" + text + b"</string>", b"<int>" + integer + b"</int>", b"<i4>" + integer + b"</i4>"
-    return b"<value>(?:" + b"|".join([*kinds, text]) + b")</value>"
+def _scalar(group: bytes = b"(?:") -> bytes:
+    """A scalar; what begins the group of each kind of content."""
+    kinds = (
+        (b"string", _TEXT), (b"int", _INTEGER), (b"i4", _INTEGER), (b"boolean", b"[01]"), (b"double", _DOUBLE)
+    )  # fmt: skip
+    typed = [b"<%b>%b%b)</%b>" % (kind, group, content, kind) for kind, content in kinds]
+    return b"<value>(?:%b|%b%b))</value>" % (b"|".join(typed), group, _TEXT)
 
 
-_ONE = _scalar(_TEXT, _INTEGER)
+_ONE = _scalar()
 _EACH = b"(?:" + _ONE + _SPACE + b")*"
 _ARRAY, _END = b"<value><array><data>" + _SPACE, b"</data></array></value>" + _SPACE
-_DECLARED = rb"<\?xml version=(?:'1\.0'|\"1\.0\")\?>" + _SPACE
+_DECLARED = rb"<\?xml version=(?:'1\.0'|\"1\.0\")\?>"
 
 
-def _document(*parts: bytes) -> re.Pattern[bytes]:
-    return re.compile(_DECLARED + _SPACE.join(parts) + _SPACE + rb"\Z")
-
-
-_CALL = _document(
-    b"<methodCall>", rb"<methodName>([A-Za-z.]+)</methodName>", b"<params>",
-    b"((?:<param>" + _SPACE + _ONE + _SPACE + b"</param>" + _SPACE + b")*)</params>", b"</methodCall>",
-)  # fmt: skip
+def _spaced(*parts: bytes) -> re.Pattern[bytes]:
+    return re.compile(_SPACE.join([*parts, b""]))
 
 
 def _list_in(group: bytes) -> bytes:
@@ -43,46 +43,89 @@ def _list_in(group: bytes) -> bytes:
     return _ARRAY + each + b"(?:" + _ARRAY + each + _END + b")?" + _END
 
 
-def _answer(value: bytes) -> re.Pattern[bytes]:
-    return _document(
-        b"<methodResponse>", b"<params>", b"<param>", value, b"</param>", b"</params>", b"</methodResponse>"
-    )
-
-
-_ANSWER = _answer(_list_in(b"("))
-_PART = re.compile(_ARRAY + _list_in(b"(") + _END)  # of the answer to a multicall
-_ANSWERS = _answer(_ARRAY + b"((?:" + _ARRAY + _list_in(b"(?:") + _END + b")+)" + _END)
-_VALUE = re.compile(_scalar(b"(" + _TEXT + b")", b"(" + _INTEGER + b")"))
+_LIST = _list_in(b"(")
+_CALL = _spaced(
+    _DECLARED, b"<methodCall>", rb"<methodName>([A-Za-z.]+)</methodName>", b"<params>",
+    b"((?:<param>" + _SPACE + _ONE + _SPACE + b"</param>" + _SPACE + b")*)</params>", b"</methodCall>", rb"\Z",
+)  # fmt: skip
+_CALLS = _spaced(
+    _DECLARED,
+    b"<methodCall>",
+    rb"<methodName>system\.multicall</methodName>",
+    b"<params>",
+    b"<param>",
+    _ARRAY,
+)
+_NAME = _SPACE.join([b"<member>", b"<name>methodName</name>", b"<value><string>([A-Za-z]+)</string></value>"])
+_CALL_IN = _spaced(
+    b"<value><struct>", _NAME, b"</member>", b"<member>", b"<name>params</name>", _LIST, b"</member>",
+    b"</struct></value>",
+)  # fmt: skip
+_CALLS_END = _spaced(_END, b"</param>", b"</params>", b"</methodCall>", rb"\Z")
+_ANSWER_HEAD = _DECLARED, b"<methodResponse>", b"<params>", b"<param>"
+_ANSWER_END = b"</param>", b"</params>", b"</methodResponse>", rb"\Z"
+_ANSWER = _spaced(*_ANSWER_HEAD, _LIST, *_ANSWER_END)
+_ANSWERS, _ANSWERS_END = _spaced(*_ANSWER_HEAD, _ARRAY), _spaced(_END, *_ANSWER_END)
+_ANSWER_IN = _spaced(_ARRAY + _LIST + _END)
+_VALUE = re.compile(_scalar(b"("))
 
 
 def usual_call(body: bytes, limits: Limits) -> tuple[str, list[Value]] | None:
-    """The method and the parameters of a call, if they are names and numbers; else None."""
-    found = _CALL.match(body) if _fits(body, limits) else None
-    return None if found is None else (found[1].decode(), _values(found[2]))
+    """The method and the parameters of a call, if they are scalars, or those of all parts of a multicall; else None."""
+    if not _fits(body, limits):
+        return None
+    found = _CALL.match(body) if len(body) <= _LONGEST else None
+    if found is not None:
+        return found[1].decode(), _values(found[2])
+    parts = _several(body, _CALLS, _CALL_IN, _CALLS_END)
+    if parts is None:
+        return None
+    calls: list[Value] = [
+        {"methodName": part[1].decode(), "params": _list(part[2], part[3])} for part in parts
+    ]
+    return "system.multicall", [calls]
 
 
 def usual_answer(body: bytes, limits: Limits) -> list[Value] | None:
-    """The answer, if it is a list of names and numbers whose last may be such a list, or several of a multicall's."""
+    """The answer, if it is a list of scalars whose last may be such a list, or several of a multicall's."""
     if not _fits(body, limits):
         return None
-    found = _ANSWER.match(body)
+    found = _ANSWER.match(body) if len(body) <= _LONGEST else None
     if found is not None:
-        return _list(found)
-    several = _ANSWERS.match(body)
-    return None if several is None else [[_list(part)] for part in _PART.finditer(several[1])]
+        return _list(*found.groups())
+    parts = _several(body, _ANSWERS, _ANSWER_IN, _ANSWERS_END)
+    return None if parts is None else [[_list(*part.groups())] for part in parts]
+
+
+def _several(
+    body: bytes, head: re.Pattern[bytes], part: re.Pattern[bytes], end: re.Pattern[bytes]
+) -> list[re.Match[bytes]] | None:
+    """The parts of a document, if there is one at least and nothing else between its head and its end."""
+    found = head.match(body)
+    parts: list[re.Match[bytes]] = []
+    while found is not None:
+        parts.append(found)
+        found = part.match(body, found.end(), found.end() + _LONGEST)
+    return parts[1:] if len(parts) > 1 and end.match(body, parts[-1].end()) else None
 
 
 def _fits(body: bytes, limits: Limits) -> bool:
     """Whether a document is so short that nothing in it is beyond the limits."""
-    return len(body) <= min(_LONGEST, limits.body, limits.string, limits.elements) and limits.depth > 3
+    return len(body) <= min(limits.body, limits.string, _SMALLEST * limits.elements) and limits.depth > 3
 
 
-def _list(found: re.Match[bytes]) -> list[Value]:
-    return _values(found[1]) if found[2] is None else [*_values(found[1]), _values(found[2])]
+def _list(most: bytes, last: bytes | None) -> list[Value]:
+    return _values(most) if last is None else [*_values(most), _values(last)]
 
 
 def _values(text: bytes) -> list[Value]:
     return [
-        int(whole or four) if whole or four else (string or untyped).decode()
-        for string, whole, four, untyped in _VALUE.findall(text)
+        (string or untyped).decode()
+        if string or not (whole or four or boolean or double)
+        else int(whole or four)
+        if whole or four
+        else float(double)
+        if double
+        else boolean == b"1"
+        for string, whole, four, boolean, double, untyped in _VALUE.findall(text)
     ]

@@ -1,4 +1,4 @@
-"""Short, plain documents are read by a pattern: as the walk through their elements reads them, or not at all."""
+"""Plain documents are read by a pattern: as the walk through their elements reads them, or not at all."""
 
 import time
 import xmlrpc.client
@@ -16,7 +16,9 @@ from tests.support.examples import examples
 NAMES = st.one_of(
     st.text("/abc_09 :.~;\"'", max_size=12), st.text(max_size=5), st.sampled_from(["&", "]]>", "a\rb"])
 )
-SCALARS: st.SearchStrategy[Value] = st.one_of(NAMES, st.integers(-(2**31), 2**31 - 1), st.booleans())
+SCALARS: st.SearchStrategy[Value] = st.one_of(
+    NAMES, st.integers(-(2**31), 2**31 - 1), st.booleans(), st.floats(allow_nan=False)
+)
 ROSCPP = (
     b'<?xml version="1.0"?>\r\n<methodCall><methodName>registerPublisher</methodName>\r\n<params>'
     b"<param><value>/talker</value></param><param><value><i4>-7</i4></value></param></params></methodCall>\r\n"
@@ -39,6 +41,11 @@ def dumped(values: list[Value], method: str | None) -> bytes:
     return xmlrpc.client.dumps((values,), methodresponse=True).encode("utf-8", "surrogatepass")
 
 
+def parts(*params: list[Value]) -> list[Value]:
+    """The parameter of a multicall that sets parameters, as roslaunch writes it."""
+    return [[{"methodName": "setParam", "params": one} for one in params]]
+
+
 LIST = b"<value><array><data></data></array></value>"
 LISTS: st.SearchStrategy[Value] = st.lists(SCALARS, max_size=3)
 
@@ -47,10 +54,9 @@ LISTS: st.SearchStrategy[Value] = st.lists(SCALARS, max_size=3)
 @settings(max_examples=examples(1000))
 def test_what_the_pattern_reads_the_walk_reads_alike(values: list[Value], data: st.DataObject) -> None:
     """Whole or damaged, a call or an answer has the same values both ways, or the pattern leaves it to the walk."""
-    asked = data.draw(st.booleans())
-    body = bytearray(
-        data.draw(st.sampled_from([dumped(values, "registerService" if asked else None), ROSCPP]))
-    )
+    whole = [dumped(values, "registerService"), dumped(values, None), ROSCPP]
+    whole.append(dumped(parts(values, ["/a", "/b", 1]), "system.multicall"))
+    body = bytearray(data.draw(st.sampled_from(whole)))
     for _ in range(data.draw(st.integers(0, 3))):
         at = data.draw(st.integers(0, len(body) - 1))
         piece = data.draw(
@@ -84,6 +90,27 @@ def test_calls_of_ros_clients_and_answers_of_rosmaster_are_usual(quote: bytes) -
     assert usual_answer(dumped(several, None), Limits()) == several
 
 
+@pytest.mark.parametrize("value", [7, True, False, -0.5, 1e-05, "", "a b", [1.5, 2.0], []])
+def test_a_multicall_of_roslaunch_is_usual_however_long(value: Value) -> None:
+    """What sets scalars, or lists of them, is read part by part; limits hold for it as for the walk."""
+    params: list[Value] = ["/roslaunch", "/start/part/value", value]
+    several = parts(*[params] * 2000)
+    body = dumped(several, "system.multicall")
+    assert usual_call(body, Limits()) == ("system.multicall", several)
+    for limits in (Limits(parts=1999), Limits(elements=2000), Limits(body=1000), Limits(depth=1)):
+        with pytest.raises(PeerError):
+            parse_call(body, limits)
+
+
+def test_a_part_that_is_not_plain_leaves_the_multicall_to_the_walk() -> None:
+    """A struct is none of the pattern's, nor is a value that is longer than one pattern may take at once."""
+    for value in ({"a": 1}, "x" * 40_000, [[[1]]]):
+        several = parts(["/a", "/b", 1], ["/a", "/c", value])
+        body = dumped(several, "system.multicall")
+        assert usual_call(body, Limits()) is None
+        assert parse_call(body).params == tuple(several)
+
+
 @pytest.mark.parametrize("piece", [b" ", b"\n", b"<value>a</value>", b"<value>a</value> \n", b"1"])
 @pytest.mark.parametrize("before", [b"", b"<value>", b"<value><int>", LIST, LIST[:20]])
 def test_a_document_that_is_none_costs_no_more_than_its_length(piece: bytes, before: bytes) -> None:
@@ -93,6 +120,14 @@ def test_a_document_that_is_none_costs_no_more_than_its_length(piece: bytes, bef
     assert usual_answer(whole, Limits()) is None
     call = whole.replace(b"<methodResponse>", b"<methodCall><methodName>m</methodName>")
     assert usual_call(call, Limits()) is None
+    part = b"<value><struct><member><name>methodName</name><value><string>a</string></value></member>"
+    part += b"<member><name>params</name>" + LIST + b"</member></struct></value>"
+    for within in (part, part[: part.index(b"<data>") + 6] + piece * (31_000 // len(piece))):
+        several = whole.partition(b"<value>")[0] + LIST[:20] + within * (1_000_000 // len(within)) + b"<"
+        several = several.replace(
+            b"<methodResponse>", b"<methodCall><methodName>system.multicall</methodName>"
+        )
+        assert usual_call(several[:1_000_000], Limits()) is None
     assert time.process_time() - begun < 0.2  # a quadratic pattern takes four times as long
 
 
