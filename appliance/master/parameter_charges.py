@@ -90,10 +90,10 @@ class ParameterCharges:
         """What is at this key weighed `before` in all, and now `after` (0: it is gone), which is this owner's."""
         path = self._path(parts)
         region = _region(path, parts)
-        if (
-            parts and len(path) <= len(parts) and region.owner == owner
-        ):  # as nearly always: no place begins or ends
-            region.weight += after - before
+        begun = len(path) > len(parts)  # whether it is a place, or on the way to one
+        place = path[-1] if begun else region
+        if parts and place.owner == owner and not (begun and (place.below or not after)):
+            place.weight += after - before  # as nearly always: no place begins or ends
             self.pool.charge(owner, after - before)
             return
         self._release(parts, before)

@@ -6,6 +6,7 @@ loses nothing: what is queued stands in a file of its own until the database has
 
 import asyncio
 import contextlib
+import itertools
 import queue
 import sqlite3
 import threading
@@ -19,6 +20,8 @@ from appliance.store.ahead import Parameter, Parameters, WriteAhead
 
 _GROUP = 2_000
 _GATHER_SECONDS = 0.02  # a statement that nobody awaits waits this long for company: it is safe in `ahead`
+
+_ROWS = 64  # of one statement
 
 _CATCH_UP_SECONDS = 1.0
 
@@ -84,7 +87,10 @@ class Database:
             raise StoreError(f"{self._path}: {error}") from error
 
     def submit(self, sql: str, parameters: Parameters = (), *, ahead: bool = True) -> None:
-        """Queue one statement; when this returns it outlasts the process (unless not `ahead`: for large values)."""
+        """Queue one statement; when this returns it outlasts the process (unless not `ahead`: for large values).
+
+        Of an INSERT the row stands at the end.
+        """
         statement = _Queued(sql, parameters, ahead)
         gathered = self._gathered
         if gathered is not None and gathered.thread == threading.get_ident():
@@ -107,6 +113,7 @@ class Database:
                 self._keep(gathered.statements)
 
     def _keep(self, statements: list[_Queued]) -> None:
+        statements = list(_joined(statements))
         ahead = [(statement.sql, statement.parameters) for statement in statements if statement.ahead]
         if ahead:
             try:
@@ -195,6 +202,19 @@ class Database:
                 self._connection.execute(sql, parameters)
             self._connection.execute("COMMIT")
         self._ahead.clear()
+
+
+def _joined(statements: list[_Queued]) -> Iterator[_Queued]:
+    """The same, rows of one table that follow each other as one statement: each costs the loop a turn of its thread."""
+    for (sql, ahead), same in itertools.groupby(
+        statements, lambda statement: (statement.sql, statement.ahead)
+    ):
+        rows = [statement.parameters for statement in same]
+        most = _ROWS if sql.startswith("INSERT") else 1
+        for start in range(0, len(rows), most):
+            together = rows[start : start + most]
+            more = f", {sql[sql.rindex('(') :]}" * (len(together) - 1) if most > 1 else ""
+            yield _Queued(sql + more, [value for row in together for value in row], ahead)
 
 
 def _advice(error: sqlite3.Error) -> str:

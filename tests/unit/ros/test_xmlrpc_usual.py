@@ -104,7 +104,8 @@ def test_a_multicall_of_roslaunch_is_usual_however_long(value: Value) -> None:
 
 def test_a_part_that_is_not_plain_leaves_the_multicall_to_the_walk() -> None:
     """A struct is none of the pattern's, nor is a value that is longer than one pattern may take at once."""
-    for value in ({"a": 1}, "x" * 40_000, [[[1]]]):
+    values: list[Value] = [{"a": 1}, "x" * 40_000, [[[1]]]]
+    for value in values:
         several = parts(["/a", "/b", 1], ["/a", "/c", value])
         body = dumped(several, "system.multicall")
         assert usual_call(body, Limits()) is None

@@ -117,6 +117,32 @@ def test_what_a_killed_process_had_queued_is_there_after_the_next_start(tmp_path
     again.close()
 
 
+def test_rows_of_one_table_are_one_statement(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many follow each other; what stands between them is carried out between them."""
+    numbers: list[int] = []
+    append = WriteAhead.append
+
+    def observed(ahead: WriteAhead, statements: Sequence[Statement]) -> None:
+        numbers.append(len(statements))
+        append(ahead, statements)
+
+    monkeypatch.setattr(WriteAhead, "append", observed)
+    with database.together():
+        for size in range(100):
+            database.put("thing", f"row {size % 70}", size)
+        database.delete("thing", name="row 1")
+        database.put("thing", "row 2", 1)
+    assert numbers == [4]  # rows of one statement are limited: SQLite takes so many values
+    asyncio.run(database.settled())
+    with sqlite3.connect(tmp_path / "state.db") as other:
+        rows = dict(other.execute("SELECT name, size FROM thing"))
+    expected = {f"row {size % 70}": size for size in range(100)} | {"row 2": 1}
+    del expected["row 1"]
+    assert rows == expected
+
+
 def test_what_is_submitted_together_is_kept_by_one_write_and_holds_up_no_other_thread(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -125,7 +151,7 @@ def test_what_is_submitted_together_is_kept_by_one_write_and_holds_up_no_other_t
     append = WriteAhead.append
 
     def observed(ahead: WriteAhead, statements: Sequence[Statement]) -> None:
-        kept.append([str(parameters[0]) for _sql, parameters in statements])
+        kept.append([str(one) for _sql, parameters in statements for one in parameters])
         append(ahead, statements)
 
     def submit(name: str) -> None:
