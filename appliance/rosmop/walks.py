@@ -39,6 +39,8 @@ costs a quarter of a call. Where it ends the message at hand is left, and there 
 BEGINNING = 8192
 """Bytes that are looked at of a frame that was not received into the module's memory."""
 
+_FIRST = 512  # that are shown if they suffice: caches are cold when a large frame has gone through them
+
 _ADDRESS = 0xFFFFFFFF
 _LENGTH = struct.Struct("<I")
 _POSITION = struct.Struct("<II")
@@ -203,6 +205,7 @@ class Walker:
         self._owner = self._memory.obj
         self._feed = feed
         self._frames = module.frames
+        self._shown = _FIRST
         self._effects = module.effects + _EFFECT.size
         self._home = home
         self.verdicts = tuple(
@@ -319,8 +322,6 @@ class Walker:
     def _walk_elsewhere(  # noqa: PLR0917  as `walk`
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
     ) -> Walked:
-        area = self._memory[self._frames : self._frames + BEGINNING]
-        each = prepared._replace(changed={})
         dropped: Sequence[int] = ()
         told: Sequence[int] = ()
         lines: list[tuple[int, LogLine]] = []
@@ -328,14 +329,12 @@ class Walker:
         sooner = False
         while position < len(view) and not sooner:
             following = position + 4 + _LENGTH.unpack_from(view, position)[0]
-            size = min(following - position, BEGINNING)
-            area[:size] = view[position : position + size]
-            _LENGTH.pack_into(area, 0, size - 4)
-            walked = self.walk(area[:size], 0, 0, [], time_ns, each)
-            for who in each.changed:
-                view[position + 4 : position + size] = area[4:size]
-                prepared.changed[who] = prepared.changed.get(who, 0) + 1
-            each.changed.clear()
+            frame = view[position:following]
+            walked = self._walk_beginning(frame, self._shown, time_ns, prepared)
+            if walked is not None and not walked.position and self._shown < min(len(frame), BEGINNING):
+                walked = self._walk_beginning(frame, BEGINNING, time_ns, prepared)
+                if walked is None or walked.position:
+                    self._shown = BEGINNING
             if walked is not None:
                 if not walked.position:
                     break
@@ -350,6 +349,19 @@ class Walker:
                     dropped = _sums(dropped, walked.dropped)
             position = following
         return Walked(position, run, dropped, told, sooner, lines, seconds)
+
+    def _walk_beginning(
+        self, frame: memoryview, shown: int, time_ns: int, prepared: Prepared
+    ) -> Walked | None:
+        """The walk over one frame of which so many bytes are shown."""
+        size, before = min(len(frame), shown), prepared.changed.copy()
+        area = self._memory[self._frames : self._frames + size]
+        area[4:] = frame[4:size]
+        _LENGTH.pack_into(area, 0, size - 4)
+        walked = self.walk(area, 0, 0, [], time_ns, prepared)
+        if prepared.changed != before:
+            frame[4:size] = area[4:]
+        return walked
 
     def _put_out(self, lines: list[tuple[int, LogLine]], clock: Callable[[], float]) -> float:
         """Append what is put out, each line with where its frame begins; the seconds that it took."""

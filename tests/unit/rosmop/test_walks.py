@@ -519,12 +519,16 @@ def test_fuel_lasts_for_many_calls_and_where_it_ends_one_message_is_left(
 def test_a_long_message_is_looked_at_where_it_begins() -> None:
     """Changed and dropped there; a field that is further behind is left, and so is the bytes' number.
 
-    But not where all of it stands in the module's memory.
+    Not where all of it stands in the module's memory.
     """
     picture = bytes(range(256)) * (BEGINNING // 128)
     fed = Fed(event("if (count == 3) { return; } count = count + 1; n++;"))
     fed.check([plain(1, rest=picture), plain(2), plain(3, rest=picture), plain(4, rest=picture), plain(5)])
     assert fed.came["together"] == 1
+    further = Fed(event("n += r; count = n;", "int r, int count", "rest[600]:r, count:count"))
+    for together in (1, 2):
+        further.check([plain(1, rest=picture[:1000]), plain(3, rest=picture[:1000])] * 2)
+        assert further.came["together"] == together
     behind = Fed("s() { int n = 0; event e(int r) /plain own/Plain '{rest[9000]:r}' { n += r; } }")
     assert behind.monitors.area is not None
     for together in (1, 1, 2):
