@@ -74,9 +74,16 @@ def back_up(state: Path, file: Path) -> list[str]:
     except BaseException as error:  # Ctrl-C, too
         file.unlink()
         if isinstance(error, (OSError, sqlite3.Error)):
-            raise BackupError(f"the backup was not made: {error}; {_ADVICE}") from error
+            advice = "make room there, or name a file elsewhere" if _is_full(error) else _ADVICE
+            raise BackupError(f"the backup was not made: {error}; {advice}") from error
         raise
     return names
+
+
+def _is_full(error: OSError | sqlite3.Error) -> bool:
+    if isinstance(error, OSError):
+        return error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+    return getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_FULL
 
 
 def _write(state: Path, archive: tarfile.TarFile, beside: Path) -> list[str]:

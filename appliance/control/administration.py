@@ -31,6 +31,7 @@ from appliance.hosts.table import (
 from appliance.master.reach.topic_looks import TooManyLooksError
 from appliance.specifications.files import SpecificationsRefusedError
 from appliance.specifications.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
+from appliance.store.database import StoreError
 
 # The first that an error is.
 _TROUBLES: dict[type[Exception], admin.Trouble] = {
@@ -46,6 +47,7 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     TokenRefusedError: "refused",
     RecorderAwayError: "failed",
     NotSealedError: "failed",
+    StoreError: "failed",
 }
 Orders = (
     Policies | Monitors | Tokens | RecordingOrders | EvidenceOrders

@@ -389,6 +389,8 @@ class _Control:
                 _log.error(
                     "the policy was refused, the last good one stays in force", findings=error.findings
                 )
+            except StoreError as error:
+                _log.error("the policy is in force and not kept", reason=str(error))
             await self._reload_hosts()
 
     async def _reload_hosts(self) -> None:
@@ -396,6 +398,8 @@ class _Control:
             await self._hosts.reload(HostsReload(), "disk")
         except HostRefusedError as error:
             _log.error("hosts.yaml was refused", reason=str(error))
+        except StoreError as error:
+            _log.error("hosts.yaml is in force and not kept", reason=str(error))
 
     def _relay_link(self, index: int, channel: Channel) -> None:
         relay = self._parts.relay

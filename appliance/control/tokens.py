@@ -13,6 +13,7 @@ from appliance.audit_trail import AuditTrail
 from appliance.channel import admin
 from appliance.channel.answers import tokens as answers
 from appliance.channel.messages import TokenKept
+from appliance.store.database import StoreError
 from appliance.store.state import StateStore
 from appliance.store.tokens import BadTokenNameError, TokenRow, make_token
 
@@ -80,7 +81,7 @@ class Tokens:
             self._store.save_setting(_UNTOLD, "")
 
     async def add(self, request: admin.TokenAdd) -> answers.NewToken:
-        """Make a token; its text is given here and never again. Raises `TokenRefusedError`."""
+        """Make a token; its text is given here and never again. Raises `TokenRefusedError`, `StoreError`."""
         name, seconds, now = request.name, request.seconds, time.time()
         if not 0 < seconds <= LONGEST_SECONDS:
             raise TokenRefusedError(f"a token ends after at most {LONGEST_SECONDS / 86_400:.0f} days")
@@ -103,7 +104,11 @@ class Tokens:
             role=row.role,
             expires=row.expires,
         )
-        await self._store.settled()
+        try:
+            await self._store.settled()
+        except StoreError:  # nobody is told its text: it is not to stand in the way of the next of its name
+            self._end(row)
+            raise
         return answers.NewToken(*_fields(row), token=text)
 
     async def revoke(self, request: admin.TokenRevoke) -> answers.Token:
@@ -115,7 +120,12 @@ class Tokens:
                 ", ".join(sorted(token.name for token in self._rows.values() if token.usable(now))) or "none"
             )
             raise TokenRefusedError(f"there is no token {name[:80]!r} that can be used; there are: {known}")
-        revoked = row._replace(revoked=now)
+        revoked = self._end(row)
+        await self._store.settled()
+        return answers.Token(*_fields(revoked))
+
+    def _end(self, row: TokenRow) -> TokenRow:
+        revoked = row._replace(revoked=time.time())
         self._keep(revoked)
         self._trail.happened(
             "token revoked",
@@ -124,8 +134,7 @@ class Tokens:
             token=row.name,
             id=row.id,
         )
-        await self._store.settled()
-        return answers.Token(*_fields(revoked))
+        return revoked
 
     def _named(self, name: str, now: float) -> TokenRow | None:
         return next((row for row in self._rows.values() if row.name == name and row.usable(now)), None)

@@ -9,7 +9,7 @@ is held up for half as long by a registration (20 µs, not 45), and never by SQL
 parameters of 16 MiB for a third of a second. Beside any tree one registration in a hundred would wait 3 to 17 ms, where
 both cores are busy; ahead of it, 0.06 ms.
 
-What this outlasts is the death of the process, not of the machine's power: as the database's own WAL without fsync.
+What this outlasts is the death of the process, and after `sync` that of the machine's power, as the database's own WAL.
 """
 
 import errno
@@ -75,6 +75,10 @@ class WriteAhead:
     def clear(self) -> None:
         """The database has everything."""
         os.ftruncate(self._descriptor, 0)
+
+    def sync(self) -> None:
+        """Have the disk hold the file as it is now. Raises `OSError`."""
+        os.fsync(self._descriptor)
 
     def close(self) -> None:
         """Close the file."""

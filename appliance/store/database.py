@@ -1,12 +1,14 @@
 """One SQLite file with one writer thread: statements are queued, written in groups, and can be awaited.
 
 What was queued together is committed together with whatever else is waiting (group commit). A process that is killed
-loses nothing: what is queued stands in a file of its own until the database has it (`ahead`).
+loses nothing: what is queued stands in a file of its own until the database has it (`ahead`). A machine that loses its
+power loses nothing that was awaited (`settled`): what an operator was told is done.
 """
 
 import asyncio
 import contextlib
 import itertools
+import os
 import queue
 import sqlite3
 import threading
@@ -24,6 +26,7 @@ _GATHER_SECONDS = 0.02  # a statement that nobody awaits waits this long for com
 _ROWS = 64  # of one statement
 
 _CATCH_UP_SECONDS = 1.0
+_SETTLE_SECONDS = 5.0
 
 
 class _Queued(NamedTuple):
@@ -51,7 +54,7 @@ class Database:
     def __init__(self, path: Path, schema: str, *, failed: Callable[[str], None]) -> None:
         self._path = path
         self._failed = failed
-        self._failing = False
+        self._failing = ""
         try:
             self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
             self._connection.execute("PRAGMA journal_mode=WAL")
@@ -134,7 +137,7 @@ class Database:
         self.submit(f"DELETE FROM {table} WHERE {wanted}", tuple(where.values()))  # noqa: S608  fixed names
 
     async def settled(self) -> None:
-        """Wait until everything queued so far is in the file."""
+        """Wait until everything queued so far is on the disk. Raises `StoreError` when it cannot be written."""
         loop = asyncio.get_running_loop()
         done = loop.create_future()
 
@@ -143,12 +146,15 @@ class Database:
                 done.set_result(None)
 
         def call_back() -> None:
+            self._sync()
             with contextlib.suppress(RuntimeError):  # the loop has ended: nobody waits any more
                 loop.call_soon_threadsafe(tell)
 
         self._queue.put(call_back)
         self._hurry.set()
-        await done
+        while not (await asyncio.wait([done], timeout=_SETTLE_SECONDS))[0]:
+            if self._failing:
+                raise StoreError(f"{self._failing}; make room: until then a restart undoes what was ordered")
 
     def close(self) -> None:
         """Write what is queued and close the file."""
@@ -184,14 +190,22 @@ class Database:
             except sqlite3.Error as error:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
-                self._failing = True
-                self._failed(f"{self._path}: {error}")
+                self._failing = f"{self._path}: {error}"
+                self._failed(self._failing)
                 if self._closing.wait(0.5):
                     return
             else:
-                self._failing = False
+                self._failing = ""
                 self._ahead.taken(sum(statement.ahead for statement in statements))
                 return
+
+    def _sync(self) -> None:
+        try:
+            with self._path.with_name(f"{self._path.name}-wal").open("rb") as log:
+                os.fsync(log.fileno())
+            self._ahead.sync()  # else it could come back with what the database has had long since
+        except OSError as error:
+            self._failed(f"{self._path}: {error}")
 
     def _catch_up(self) -> None:
         """Carry out what a killed process left, before anything is read."""

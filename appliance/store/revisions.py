@@ -7,6 +7,7 @@ from typing import Protocol, TypeVar
 
 import structlog
 
+from appliance.store.database import StoreError
 from appliance.store.state import StateStore
 
 _log = structlog.get_logger()
@@ -109,5 +110,8 @@ class Trial:
             except self._refusals as error:
                 _log.error("an unconfirmed change cannot go back yet", revision=back_to, error=str(error))
                 await asyncio.sleep(_AGAIN_SECONDS)
+            except StoreError as error:
+                _log.error("an unconfirmed change went back, and this is not kept", reason=str(error))
+                return
             else:
                 return

@@ -127,7 +127,7 @@ class StateStore:
         self._parameter_changes = 0  # the number of the last one
 
     async def settled(self) -> None:
-        """Wait until everything saved so far is in the file."""
+        """Wait until everything saved so far is on the disk. Raises `StoreError` when it cannot be written."""
         await self.database.settled()
 
     def together(self) -> AbstractContextManager[None]:

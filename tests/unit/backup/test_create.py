@@ -123,6 +123,23 @@ def test_nothing_is_written_over(state: Path, tmp_path: Path) -> None:
         restore(file, state)
 
 
+@pytest.mark.parametrize("size", ["8k", "64k"])
+def test_a_full_disk_is_called_so(state: Path, tmp_path: Path, size: str) -> None:
+    """What is to be done is to make room; rights that are there would not help."""
+    need_root()
+    place = tmp_path / "disk"
+    place.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "rosrv-backup-test", place], check=True)
+    try:
+        (state / "api" / "key.pem").write_bytes(os.urandom(200_000))
+        with pytest.raises(BackupError, match=r"(No space left|disk is full).*make room") as caught:
+            back_up(state, place / "backup.tar.gz")
+        assert "root" not in str(caught.value)
+        assert list(place.iterdir()) == []
+    finally:
+        subprocess.run(["umount", "--lazy", place], check=True)
+
+
 def test_what_cannot_be_read(tmp_path: Path) -> None:
     """No state directory: an error that names it."""
     with pytest.raises(BackupError, match="no state directory of an appliance"):

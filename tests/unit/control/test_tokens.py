@@ -9,6 +9,7 @@ from appliance.audit.log import AuditLog
 from appliance.audit_trail import AuditTrail
 from appliance.channel.admin import TokenAdd
 from appliance.control.tokens import Tokens
+from appliance.store.database import StoreError
 from appliance.store.state import StateStore
 from appliance.store.tokens import is_secret, parse_token
 
@@ -87,3 +88,19 @@ async def test_a_state_from_before_has_no_first_token_made(lives: Lives) -> None
     tokens = lives.next()
     await tokens.add(TokenAdd("alice", "admin", 60))
     assert await lives.next().first() is None
+
+
+async def test_a_token_that_cannot_be_kept_is_none(lives: Lives, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its text is told to nobody then; it does not stand in the way of the next one of its name."""
+    tokens = lives.next()
+    assert lives.store is not None
+
+    async def full() -> None:
+        raise StoreError("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(lives.store, "settled", full)
+        with pytest.raises(StoreError, match="full"):
+            await tokens.add(TokenAdd("alice", "admin", 60))
+    assert tokens.usable() == []
+    assert (await tokens.add(TokenAdd("alice", "admin", 60))).token

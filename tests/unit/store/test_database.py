@@ -1,6 +1,8 @@
 """One SQLite file with one writer thread."""
 
 import asyncio
+import contextlib
+import os
 import signal
 import sqlite3
 import subprocess
@@ -13,6 +15,7 @@ import pytest
 
 from appliance.store.ahead import Statement, WriteAhead
 from appliance.store.database import Database, StoreError
+from tests.support.requirements import need_root
 
 KILLED = """
 import os, signal, sys
@@ -89,6 +92,58 @@ def test_a_write_that_fails_is_tried_again_until_it_succeeds(
     blocker.close()
     assert "locked" in failures[0]
     assert database.query("SELECT name FROM thing") == [("late",)]
+
+
+def test_who_waits_is_told_that_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An operator is not kept waiting without a word; with room again all that was queued is written."""
+    need_root()
+    monkeypatch.setattr("appliance.store.database._SETTLE_SECONDS", 0.05)
+    place = tmp_path / "disk"
+    place.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "rosrv-store-test", place], check=True)
+    try:
+        failures: list[str] = []
+        database = Database(place / "state.db", SCHEMA, failed=failures.append)
+        filler = place / "filler"
+        with contextlib.suppress(OSError), filler.open("wb", buffering=0) as file:
+            while file.write(bytes(4096)):
+                pass
+
+        async def scene() -> None:
+            database.submit("INSERT INTO thing VALUES ('late', 1)")
+            with pytest.raises(StoreError, match=r"state\.db: .*full; make room"):
+                await database.settled()
+            filler.unlink()
+            monkeypatch.setattr("appliance.store.database._SETTLE_SECONDS", 30)
+            await database.settled()
+
+        asyncio.run(scene())
+        assert database.query("SELECT name FROM thing") == [("late",)]
+        database.close()
+    finally:
+        subprocess.run(["umount", "--lazy", place], check=True)
+
+
+def test_what_was_awaited_outlasts_the_machines_power(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before `settled` returns the disk has the database's log, and the file of what is on its way as it is then."""
+    synced: list[tuple[str, int]] = []
+    fsync = os.fsync
+
+    def noted(descriptor: int) -> None:
+        fsync(descriptor)
+        synced.append((str(Path(f"/proc/self/fd/{descriptor}").readlink()), os.fstat(descriptor).st_size))
+
+    monkeypatch.setattr(os, "fsync", noted)
+
+    async def scene() -> None:
+        database.submit("INSERT INTO thing VALUES ('revoked', 1)")
+        await database.settled()
+
+    asyncio.run(scene())
+    log, ahead = tmp_path / "state.db-wal", tmp_path / "state.ahead"
+    assert synced == [(str(log), log.stat().st_size), (str(ahead), 0)]
 
 
 def test_a_file_that_is_no_database_is_named_with_what_to_do(tmp_path: Path) -> None:
