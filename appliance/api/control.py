@@ -8,7 +8,6 @@ Invariants:
    next one; what is lost is counted and logged.
 """
 
-import asyncio
 import contextlib
 from collections import deque
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from appliance.api.access import Bearer
 from appliance.channel import messages
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, decode
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
+from appliance.channel.link import Link
 from appliance.channel.operations import CHANGES
 
 _log = structlog.get_logger()
@@ -49,9 +49,7 @@ class ControlLink:
     ) -> None:
         self._tokens_stated = tokens_stated
         self._lost = lost
-        self._channel: Channel | None = None
-        self._open: dict[int, asyncio.Future[bytes]] = {}
-        self._number = 0
+        self._link = Link(self._received, self._ended)
         self._kept: deque[messages.RestCalled] = deque()
         self._dropped = 0
         self._pin = ""
@@ -60,20 +58,12 @@ class ControlLink:
     @property
     def connected(self) -> bool:
         """Whether control is there and has said what the tokens are."""
-        return self._channel is not None and self.known
+        return self._link.channel is not None and self.known
 
     def attach(self, channel: Channel) -> None:
         """A control is there."""
-        if self._channel is not None:
-            self._channel.close()
-            self._end("control was started again")
-        self._channel, self.known = channel, False
-        channel.attach(
-            asyncio.get_running_loop(),
-            lambda message, _descriptors: self._received(message),
-            lambda: self._closed(channel, "control ended"),
-            lambda reason: self._closed(channel, reason),
-        )
+        self.known = False
+        self._link.attach(channel)
         self._tell_pin()
 
     def state_pin(self, pin: str) -> None:
@@ -82,34 +72,29 @@ class ControlLink:
         self._tell_pin()
 
     def _tell_pin(self) -> None:
-        if self._pin and self._channel is not None:
-            with contextlib.suppress(
-                ChannelFullError, ChannelClosedError
-            ):  # the link ends, and the next is told
-                self._channel.send(messages.RestServed(self._pin))
+        if self._pin:
+            with contextlib.suppress(ChannelFullError):  # the link ends, and the next is told
+                self._link.send(messages.RestServed(self._pin))
 
     async def ask(
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float = ANSWER_SECONDS
     ) -> AdminAnswer[A]:
         """Control's answer to a request of whoever showed a token, if any. Raises `ControlAwayError`."""
-        if self._channel is None:
+        if self._link.channel is None:
             raise ControlAwayError("the appliance is being restarted: try again in a second")
-        if len(self._open) >= _MOST_OPEN:
+        if self._link.unanswered >= _MOST_OPEN:
             raise ControlAwayError("too many requests wait for the appliance: try again")
-        self._number += 1
-        number = self._number
-        answer: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
-        self._open[number] = answer
         try:
-            self._channel.send(_made(number, request, bearer))
-            async with asyncio.timeout(seconds):
-                return decode(await answer, request)
+            answer = await self._link.ask(lambda number: _made(number, request, bearer), seconds)
         except TimeoutError:
             raise ControlAwayError(f"the appliance did not answer within {seconds:g} s") from None
-        except (ChannelFullError, ChannelClosedError):
+        except ChannelFullError:
             raise ControlAwayError("the appliance does not take requests now: try again") from None
-        finally:
-            self._open.pop(number, None)
+        except ChannelClosedError:
+            raise ControlAwayError(
+                "the appliance is being restarted: whether the request was carried out is not known"
+            ) from None
+        return decode(answer, request)
 
     def tell(self, call: messages.RestCalled) -> None:
         """Have a call recorded."""
@@ -119,16 +104,16 @@ class ControlLink:
         self._tell_kept()
 
     def _tell_kept(self) -> None:
-        while self._kept and self._channel is not None:
+        while self._kept and self._link.channel is not None:
             try:
-                self._channel.send(self._kept[0])
-            except (ChannelFullError, ChannelClosedError):
+                self._link.send(self._kept[0])
+            except ChannelFullError:
                 return
             except UnicodeEncodeError as error:  # one that can never be told keeps the others from nothing
                 _log.error("a REST call cannot be recorded", reason=str(error))
                 self._dropped += self._kept[0].count
             self._kept.popleft()
-        if self._dropped and self._channel is not None:
+        if self._dropped and self._link.channel is not None:
             _log.warning(
                 "REST calls were not recorded: control was away, or could not be told", calls=self._dropped
             )
@@ -136,16 +121,12 @@ class ControlLink:
 
     def close(self) -> None:
         """End the link."""
-        if self._channel is not None:
-            self._channel.close()
-            self._channel = None
+        self._link.close()
 
     def _received(self, message: Any) -> None:
         match message:
             case messages.RequestAnswered(number, answer):
-                waiting = self._open.get(number)
-                if waiting is not None and not waiting.done():
-                    waiting.set_result(answer)
+                self._link.answered(number, answer)
             case messages.TokensStated(tokens):
                 self.known = True
                 self._tokens_stated(tokens)
@@ -153,14 +134,7 @@ class ControlLink:
             case _:
                 _log.error("control said something that is not for the api", message=type(message).__name__)
 
-    def _closed(self, channel: Channel, reason: str) -> None:
-        if self._channel is channel:
-            self._channel, self.known = None, False
-            _log.warning("no control", reason=reason)
-            self._end("the appliance is being restarted: whether the request was carried out is not known")
-            self._lost()
-
-    def _end(self, reason: str) -> None:
-        for waiting in self._open.values():
-            if not waiting.done():
-                waiting.set_exception(ControlAwayError(reason))
+    def _ended(self, reason: str) -> None:
+        self.known = False
+        _log.warning("no control", reason=reason or "control ended")
+        self._lost()

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
+from appliance.channel.link import Link
 from appliance.channel.messages import LinkOpened, Message, Ping, Pong, Ready, RingGiven, Stop
 
 
@@ -29,10 +30,9 @@ class Child:
         """`link` is the union of the messages of the link to control; `ring_given` takes over the descriptor."""
         self._lifeline = lifeline
         self._link = link
-        self._said = said
         self._linked = linked
         self._ring_given = ring_given
-        self._control: Channel | None = None
+        self._control = Link(said)
         self.ended = asyncio.Event()
 
     def attach(self, ready: Ready) -> None:
@@ -42,20 +42,15 @@ class Child:
 
     def tell(self, message: Message) -> bool:
         """Tell control something; False while there is none, or it reads nothing: it asks again over its next link."""
-        if self._control is None:
-            return False
         try:
-            self._control.send(message)
-        except (ChannelClosedError, ChannelFullError):
-            self._control = None
+            return self._control.send(message)
+        except ChannelFullError:
+            self._control.close()
             return False
-        return True
 
     def close(self) -> None:
         """Close the link to control."""
-        if self._control is not None:
-            self._control.close()
-            self._control = None
+        self._control.close()
 
     def _supervisor_said(self, message: Any, descriptors: tuple[int, ...]) -> None:
         match message:
@@ -64,7 +59,8 @@ class Child:
             case Stop():
                 self.ended.set()
             case LinkOpened(role="control"):
-                self._open(descriptors[0])
+                self._control.attach(Channel(socket.socket(fileno=descriptors[0]), self._link))
+                self._linked()
             case RingGiven():
                 self._ring_given(message, descriptors[0])
             case _:
@@ -76,17 +72,3 @@ class Child:
             self._lifeline.send(message)
         except ChannelClosedError:
             self.ended.set()  # the supervisor is gone
-
-    def _open(self, descriptor: int) -> None:
-        self.close()
-        link = self._control = Channel(socket.socket(fileno=descriptor), self._link)
-        link.attach(
-            asyncio.get_running_loop(),
-            lambda message, _descriptors: self._said(message),
-            lambda: self._closed(link),
-        )
-        self._linked()
-
-    def _closed(self, link: Channel) -> None:
-        if self._control is link:
-            self._control = None

@@ -165,6 +165,7 @@ class Parts:
             self._carried,
             allocation=self._allocation,
             policy=self._policy,
+            monitors=lambda: self.monitors,
             broken=self._watchlist.look_at,
             own_header=rosout.header(standard_definitions()) if settings.monitors_on_rosout else None,
             own_call=self.recordings.called,

@@ -9,7 +9,7 @@ from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.answers.status import ForwardingState
-from appliance.channel.channel import Channel
+from appliance.channel.link import Link
 from appliance.config import Syslog
 
 _log = structlog.get_logger()
@@ -22,26 +22,10 @@ class Forwarded:
     def __init__(self, wanted: Syslog, trail: AuditTrail) -> None:
         self._wanted = wanted
         self._trail = trail
-        self._channel: Channel | None = None
+        self.link = Link(self._heard)
         self._report: messages.ForwardingReported | None = None
         self._failing: asyncio.TimerHandle | None = None
         self._failure_recorded = False
-
-    def attach(self, channel: Channel) -> None:
-        """A forwarder is there."""
-        if self._channel is not None:
-            self._channel.close()
-        self._channel = channel
-
-        def received(message: object, _descriptors: tuple[int, ...]) -> None:
-            if isinstance(message, messages.ForwardingReported) and self._channel is channel:
-                self._reported(message)
-
-        def lost(_reason: str = "") -> None:
-            if self._channel is channel:
-                self._channel = None
-
-        channel.attach(asyncio.get_running_loop(), received, lost, lost)
 
     def status(self) -> ForwardingState | None:
         """For `rosrv status` and the metrics; None when nothing is to be forwarded."""
@@ -49,12 +33,12 @@ class Forwarded:
             return None
         report = self._report or messages.ForwardingReported()
         trouble = report.trouble
-        if self._channel is None or self._report is None:
+        if self.link.channel is None or self._report is None:
             trouble = trouble or "the forwarder does not run yet"
         fields = msgspec.structs.asdict(report) | {"trouble": trouble}
         return ForwardingState(**fields, to=self._wanted.to, send=self._wanted.send)
 
-    def _reported(self, report: messages.ForwardingReported) -> None:
+    def _heard(self, report: messages.ForwardingReported) -> None:
         before = self._report
         self._report = report
         if before is not None and report.missed > before.missed:

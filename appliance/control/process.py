@@ -127,8 +127,8 @@ class _Control:
         self._say_ready(restarted, token)
 
     async def _lay_foundation(self, restarted: bool) -> Foundation:
-        self._authority = Authority()
-        self._signing = Signing(self._authority)
+        self._signing = Signing(lambda: self._audit)
+        self._authority = Authority(self._signing.link)
         self._standing: HostStanding | None = None
         self._audit = _open_audit(self._settings, self._signing, self._log_held(), self._standing_of)
         audit = self._settings.audit
@@ -363,15 +363,15 @@ class _Control:
             case "relay":
                 self._relay_link(index, Channel(sock, messages.RelayLink))
             case "signer":
-                self._signing.attach(Channel(sock, messages.SignerLink), self._audit)
+                self._signing.attach(Channel(sock, messages.SignerLink))
             case "api":
                 self._rest.attach(Channel(sock, messages.ApiLink, limit=16 << 20, longest=8 << 20))
             case "charon":
                 self._tunnels.attach(Channel(sock, messages.TunnelLink))
             case "syslog":
-                self._forwarded.attach(Channel(sock, messages.ForwardingLink))
+                self._forwarded.link.attach(Channel(sock, messages.ForwardingLink))
             case "recorder":
-                self._parts.recordings.attach(Channel(sock, messages.RecorderLink))
+                self._parts.recordings.link.attach(Channel(sock, messages.RecorderLink))
             case _:
                 _log.error("a link leads to a process that control does not know", role=role)
                 sock.close()
@@ -403,7 +403,7 @@ class _Control:
 
     def _relay_link(self, index: int, channel: Channel) -> None:
         relay = self._parts.relay
-        relay.attach(index, channel, self._parts.monitors)
+        relay.attach(index, channel)
         told = self._parts.graph.tell_everybody(lambda topic: relay.carries(index, TOPIC, topic))
         self._parts.enactor.carry_out(told)
         self._parts.reminders.begin()

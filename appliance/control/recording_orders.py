@@ -1,7 +1,6 @@
 """Control's end of the link to the flight recorder: what operators ask of it, and what the audit log has of it."""
 
 import asyncio
-import itertools
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -12,7 +11,8 @@ from appliance.audit_trail import AuditTrail
 from appliance.channel import admin, messages
 from appliance.channel.answers.recordings import Recording, RecordingBegun, Recordings, Trigger
 from appliance.channel.answers.status import RecorderState
-from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
+from appliance.channel.channel import ChannelClosedError, ChannelFullError
+from appliance.channel.link import Link
 from appliance.config import RecorderRules
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.recorder.shelf import MOST_LENT
@@ -42,41 +42,18 @@ class RecordingOrders:
         self._rules = rules
         self._trail = trail
         self._in_force = in_force
-        self._channel: Channel | None = None
+        self.link = Link(self._heard)
         self._kept: dict[str, Recording] = {}
         self._lent: dict[str, Recording] = {}  # the last ones of the memory
         self._begun: str | None = None  # the id of the one that is being made, if somebody was told it
-        self._numbers = itertools.count(1)
-        self._asked: dict[int, asyncio.Future[_Answer]] = {}
         self._notes: set[asyncio.Future[None]] = set()
-
-    def attach(self, channel: Channel) -> None:
-        """A recorder is there."""
-        if self._channel is not None:
-            self._channel.close()
-        self._channel = channel
-
-        def received(message: object, _descriptors: tuple[int, ...]) -> None:
-            if self._channel is channel:
-                self._received(channel, message)
-
-        def lost(_reason: str = "") -> None:
-            if self._channel is channel:
-                self._channel = None
-                for waiting in self._asked.values():
-                    if not waiting.done():
-                        waiting.set_exception(
-                            RecorderAwayError("the flight recorder ended before it answered")
-                        )
-
-        channel.attach(asyncio.get_running_loop(), received, lost, lost)
 
     def state(self) -> RecorderState | None:
         """For `rosrv status` and the metrics; None when nothing is recorded."""
         if not self._rules.enabled:
             return None
         sizes = [recording.size for recording in self._kept.values()]
-        return RecorderState(self._channel is not None, len(sizes), sum(sizes))
+        return RecorderState(self.link.channel is not None, len(sizes), sum(sizes))
 
     # --- what operators ask -------------------------------------------------------------------------------
 
@@ -204,7 +181,7 @@ class RecordingOrders:
             raise UnknownThingError(
                 "the flight recorder is off: `recorder: {enabled: true}` in appliance.yaml turns it on"
             )
-        if self._channel is None:
+        if self.link.channel is None:
             raise RecorderAwayError("the flight recorder does not run at the moment")
 
     def _find(self, recording_id: str) -> Recording:
@@ -219,33 +196,28 @@ class RecordingOrders:
 
     async def _ask(self, order: Callable[[int], messages.Message]) -> _Answer:
         """The recorder's answer to an order, which is given a number."""
-        number = next(self._numbers)
-        future: asyncio.Future[_Answer] = asyncio.get_running_loop().create_future()
-        self._asked[number] = future
         try:
-            if self._channel is not None:
-                self._channel.send(order(number))
-            answer = await asyncio.wait_for(future, _PATIENCE_SECONDS)
+            answer: _Answer = await self.link.ask(order, _PATIENCE_SECONDS)
+        except ChannelClosedError:
+            raise RecorderAwayError("the flight recorder ended before it answered") from None
         except TimeoutError:
             raise RecorderAwayError("the flight recorder did not answer") from None
-        finally:
-            del self._asked[number]
         if isinstance(answer, messages.RecordingRefused):
             raise (UnknownThingError if answer.unknown else RecorderAwayError)(answer.reason)
         return answer
 
     # --- what the recorder says ---------------------------------------------------------------------------
 
-    def _received(self, channel: Channel, message: object) -> None:
+    def _heard(self, message: object) -> None:
         match message:
             case messages.RecordingsStated(recordings):
                 self._kept = {recording.id: recording for recording in recordings}
             case messages.RevisionsWanted():
-                channel.send(self._in_force())
+                self.link.send(self._in_force())
             case messages.RecordingClosed(recording):
                 self._begun = None
                 self._closed(recording)
-                self._note(channel, recording.id)
+                self._note(recording.id)
             case messages.RecordingMissed(trigger, reason):
                 self._begun = None
                 self._trail.happened(
@@ -265,30 +237,25 @@ class RecordingOrders:
                     sha256=recording.sha256,
                     who=who or "recorder",
                 )
-                self._note(channel, recording.id)
-                self._answered(message)
+                self._note(recording.id)
+                self.link.answered(message.number, message)
             case messages.RecordingBegun(_number, recording_id):
                 self._begun = recording_id
-                self._answered(message)
-            case messages.MemoryLent() | messages.RecordingRefused():
-                self._answered(message)
+                self.link.answered(message.number, message)
+            case messages.MemoryLent(number) | messages.RecordingRefused(number):
+                self.link.answered(number, message)
 
-    def _note(self, channel: Channel, recording_id: str) -> None:
+    def _note(self, recording_id: str) -> None:
         """Have the recorder know, once it is on disk, that the audit log has what it told of a recording."""
 
         async def note() -> None:
             if await self._trail.durable() is None:
-                with suppress(ChannelClosedError, ChannelFullError):
-                    channel.send(messages.RecordingNoted(recording_id))
+                with suppress(ChannelFullError):
+                    self.link.send(messages.RecordingNoted(recording_id))
 
         task = asyncio.ensure_future(note())
         self._notes.add(task)
         task.add_done_callback(self._notes.discard)
-
-    def _answered(self, message: _Answer) -> None:
-        future = self._asked.get(message.number)
-        if future is not None and not future.done():
-            future.set_result(message)
 
     def _closed(self, recording: Recording) -> None:
         self._kept[recording.id] = recording

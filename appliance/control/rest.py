@@ -31,6 +31,7 @@ from appliance.channel.admin import (
     verb_of,
 )
 from appliance.channel.channel import Channel, ChannelFullError
+from appliance.channel.link import Link
 from appliance.channel.operations import CHANGES
 from appliance.control.administration import Administration
 from appliance.control.rest_proof import Askers, UnprovenError
@@ -65,7 +66,7 @@ class RestLink:
         self._tokens = tokens
         self._askers = Askers(tokens, require_proof=require_proof)
         self._trail = trail
-        self._channel: Channel | None = None
+        self._link = Link(self._received, self._lost)
         self._waiting: deque[messages.RequestMade] = deque()
         self._worker: asyncio.Task[None] | None = None  # of the present link
         self._slow: set[asyncio.Task[None]] = set()
@@ -74,21 +75,12 @@ class RestLink:
 
     def attach(self, channel: Channel) -> None:
         """An api is there: serve it, and tell it the tokens."""
-        if self._channel is not None:
-            self._channel.close()
-        self._channel, self._worker = channel, None
+        self._link.attach(channel)
+        self._worker = None
         self._waiting.clear()
-        channel.attach(
-            asyncio.get_running_loop(),
-            lambda message, _descriptors: self._received(channel, message),
-            lambda: self._lost(channel, None),
-            lambda reason: self._lost(channel, reason),
-        )
         self.state_tokens()
 
-    def _received(self, channel: Channel, message: object) -> None:
-        if channel is not self._channel:
-            return
+    def _received(self, message: object) -> None:
         match message:
             case messages.RequestMade(number):
                 if len(self._waiting) >= _MOST_WAITING:
@@ -97,7 +89,7 @@ class RestLink:
                     return
                 self._waiting.append(message)
                 if self._worker is None or self._worker.done():
-                    self._worker = asyncio.get_running_loop().create_task(self._work(channel))
+                    self._worker = asyncio.get_running_loop().create_task(self._work(self._link.channel))
                     self._workers.add(self._worker)
                     self._worker.add_done_callback(self._workers.discard)
             case messages.RestCalled():
@@ -105,11 +97,11 @@ class RestLink:
             case messages.RestServed(pin):
                 self._served(pin)
             case _:
-                channel.close()
-                self._lost(channel, f"it sent {type(message).__name__}")
+                self._link.close()
+                self._lost(f"it sent {type(message).__name__}")
 
-    async def _work(self, channel: Channel) -> None:
-        while self._waiting and channel is self._channel:
+    async def _work(self, channel: Channel | None) -> None:
+        while self._waiting and channel is self._link.channel:
             made = self._waiting.popleft()
             if isinstance(made.request, WaitingRequest):
                 self._begin(channel, made)
@@ -117,7 +109,7 @@ class RestLink:
                 await self._serve(channel, made)
             await asyncio.sleep(0)
 
-    def _begin(self, channel: Channel, made: messages.RequestMade) -> None:
+    def _begin(self, channel: Channel | None, made: messages.RequestMade) -> None:
         """Serve beside the others what waits for charon, the signer, the recorder or a topic's messages."""
         if len(self._slow) >= _MOST_SLOW:
             text = "too many requests that take a while are under way: try again"
@@ -127,9 +119,9 @@ class RestLink:
         self._slow.add(task)
         task.add_done_callback(self._slow.discard)
 
-    async def _serve(self, channel: Channel, made: messages.RequestMade) -> None:
+    async def _serve(self, channel: Channel | None, made: messages.RequestMade) -> None:
         answer = await self._answer(made)
-        if channel is self._channel:
+        if channel is self._link.channel:
             self._send_answer(made.number, answer)
 
     async def _answer(self, made: messages.RequestMade) -> AdminAnswer[Any]:
@@ -187,19 +179,14 @@ class RestLink:
         self._send(messages.RequestAnswered(number, encode(answer)))
 
     def _send(self, message: messages.Message) -> None:
-        if self._channel is None:
-            return
         try:
-            self._channel.send(message)
+            self._link.send(message)
         except ChannelFullError:
-            channel, self._channel = self._channel, None
-            channel.close()
+            self._link.close()
             _log.error("the api does not read its answers: its link is closed")
 
-    def _lost(self, channel: Channel, wrong: str | None) -> None:
-        """The link is gone; `wrong` is what the api did to lose it, None when it ended: the supervisor says why."""
-        if self._channel is channel:
-            self._channel = None
-            self._waiting.clear()
-            if wrong is not None:
-                _log.error("the api's link is closed; another one is started", reason=wrong)
+    def _lost(self, wrong: str) -> None:
+        """The link is gone; `wrong` is what the api did to lose it, empty when it ended: the supervisor says why."""
+        self._waiting.clear()
+        if wrong:
+            _log.error("the api's link is closed; another one is started", reason=wrong)

@@ -4,20 +4,21 @@ Unsigned checkpoints are asked for again whenever a signer appears.
 """
 
 import asyncio
+from collections.abc import Callable
 
 from appliance.audit.log import AuditLog
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.hosts.authority import Authority
+from appliance.channel.link import Link
 
 
 class Signing:
     """The link to the signer; `want` and `want_removal` may be called on any thread."""
 
-    def __init__(self, authority: Authority) -> None:
-        self._authority = authority
+    def __init__(self, audit: Callable[[], AuditLog]) -> None:
+        self.link = Link(self._heard)
+        self._audit = audit
         self._loop = asyncio.get_running_loop()
-        self._channel: Channel | None = None
 
     def want(self, number: int, text: bytes) -> None:
         """Have a checkpoint signed. Called on the log's thread."""
@@ -28,33 +29,27 @@ class Signing:
         self._ask(messages.RemovalWanted(number, checkpoint, newest))
 
     def _ask(self, message: messages.Message) -> None:
-        def ask() -> None:
-            if self._channel is not None:
-                self._channel.send(message)
+        self._loop.call_soon_threadsafe(self.link.send, message)
 
-        self._loop.call_soon_threadsafe(ask)
-
-    def attach(self, channel: Channel, audit: AuditLog) -> None:
+    def attach(self, channel: Channel) -> None:
         """A signer is there."""
-        self._channel = channel
-        self._authority.attach(channel)
+        self.link.attach(channel)
+        self._audit().request_signatures()
 
-        def received(message: object, _descriptors: tuple[int, ...]) -> None:
-            if self._authority.received(message):
-                return
-            if isinstance(message, messages.SignatureMade):
-                audit.signed(message.number, message.signature, message.public_key)
-            elif isinstance(message, messages.SignatureRefused):
-                audit.refused(message.number, message.reason)
-            elif isinstance(message, messages.RemovalApproved):
-                audit.removal_approved(message.number, message.text, message.signature, message.public_key)
-            elif isinstance(message, messages.RemovalRefused):
-                audit.removal_refused(message.number, message.reason)
-
-        def closed() -> None:
-            if self._channel is channel:
-                self._channel = None
-                self._authority.attach(None)
-
-        channel.attach(self._loop, received, closed)
-        audit.request_signatures()
+    def _heard(self, message: object) -> None:
+        match message:
+            case messages.SignatureMade(number, signature, public_key):
+                self._audit().signed(number, signature, public_key)
+            case messages.SignatureRefused(number, reason):
+                self._audit().refused(number, reason)
+            case messages.RemovalApproved(number, text, signature, public_key):
+                self._audit().removal_approved(number, text, signature, public_key)
+            case messages.RemovalRefused(number, reason):
+                self._audit().removal_refused(number, reason)
+            case (
+                messages.AuthorityStated(number)
+                | messages.CertificateMade(number)
+                | messages.CertificateRefused(number)
+                | messages.RevocationsMade(number)
+            ):
+                self.link.answered(number, message)

@@ -20,7 +20,8 @@ import structlog
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
-from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.channel import Channel
+from appliance.channel.link import Link
 from appliance.hosts.authority import Authority, AuthorityError
 from appliance.hosts.revocation_list import RevocationList
 from appliance.hosts.table import HostRefusedError, HostTable
@@ -59,7 +60,7 @@ class Tunnels:
         self._enclosed: messages.TunnelsEnclosed | None = None
         self._answered = asyncio.Event()
         self._opening = asyncio.Lock()
-        self._link: Channel | None = None
+        self._link = Link(self._received, self._lost)
         self._certificate: bytes | None = None
         self._dirty = asyncio.Event()
         # Of the last statement: no number of an earlier life, which charon's process may still report, comes again.
@@ -132,14 +133,8 @@ class Tunnels:
 
     def attach(self, link: Channel) -> None:
         """A new life of that process; it asks for its certificate first."""
-        if self._link is not None:
-            self._link.close()
-        self._link, self._certificate, self.charon = link, None, None
-        link.attach(
-            asyncio.get_running_loop(),
-            lambda message, _descriptors: self._received(message),
-            lambda: self._lost(link),
-        )
+        self._certificate = self.charon = None
+        self._link.attach(link)
 
     def state_anew(self) -> None:
         """Tell charon what it is to have, soon."""
@@ -181,7 +176,7 @@ class Tunnels:
         return True
 
     async def _state(self) -> None:
-        link, certificate, esp = self._link, self._certificate, self.esp
+        link, certificate, esp = self._link.channel, self._certificate, self.esp
         if link is None or certificate is None or esp is None:
             return
         authority = await self._authority.certificate()
@@ -197,10 +192,7 @@ class Tunnels:
         message = messages.TunnelsStated(
             self._number, esp, self._table.own_address, authority, certificate, revocations, hosts
         )
-        try:
-            link.send(message)
-        except ChannelClosedError:
-            self._lost(link)
+        link.send(message)
 
     def _received(self, message: object) -> None:
         match message:
@@ -238,8 +230,8 @@ class Tunnels:
         task.add_done_callback(self._tasks.discard)
 
     async def _certify(self, request: bytes) -> None:
-        link = self._link
-        while link is self._link:
+        link = self._link.channel
+        while link is self._link.channel:
             try:
                 made = await self._authority.issue(request, messages.APPLIANCE_NAME, _APPLIANCE_DAYS)
             except AuthorityError as error:
@@ -250,10 +242,8 @@ class Tunnels:
             self._dirty.set()
             return
 
-    def _lost(self, link: Channel) -> None:
-        if self._link is not link:
-            return
-        self._link = self._certificate = self.charon = None
+    def _lost(self, _reason: str) -> None:
+        self._certificate = self.charon = None
         for name in list(self.seen):
             self._went_down(name, "the process that runs charon ended")
 

@@ -148,11 +148,12 @@ class Conversation:
             idle(Carried),
             allocation=Allocation(1),
             policy=lambda: parts.current,
+            monitors=cast(Any, _Monitors),
             broken=lambda _node: None,
             own_header=None,
             own_call=cast(Any, None),
         )
-        relay.attach(0, cast(Any, link), cast(Any, _Monitors()))
+        relay.attach(0, cast(Any, link))
         parts.enactor.carry_out(parts.graph.tell_everybody(lambda _topic: True))
         return [self._stated(message) for message in link.told]
 

@@ -321,7 +321,8 @@ class Control(ControlParts):
             Any,
             RelayControl(
                 self.registry, self.grants, cast(Any, _Ports()), self.nodes, idle(Carried), allocation=Allocation(1),
-                policy=lambda: self.current, broken=self.watchlist.look_at, own_header=None, own_call=cast(Any, None),
+                policy=lambda: self.current,
+                monitors=cast(Any, _Monitors), broken=self.watchlist.look_at, own_header=None, own_call=cast(Any, None),
             ),
         )  # fmt: skip
         self.grants.used = world.used
@@ -344,7 +345,7 @@ class Control(ControlParts):
 
     def attach(self) -> None:
         """The relay is there, as it is now."""
-        cast(Any, self.relay).attach(0, self.world.relay, _Monitors())
+        cast(Any, self.relay).attach(0, self.world.relay)
         self.enactor.carry_out(self.graph.tell_everybody())
         self.reminders.begin()
 

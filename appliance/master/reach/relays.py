@@ -9,11 +9,13 @@ import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from appliance.channel import messages
 from appliance.channel.answers.graph import Flow
-from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.channel import Channel
+from appliance.channel.link import Link
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.node_api import NodeApi
@@ -30,73 +32,38 @@ from appliance.specifications.monitors import Monitors
 from appliance.store.state import PermissionRow
 
 
-class RelayPost:
-    """The place of relay `index`. What is sent while nobody is there is stated afresh when somebody is."""
+class RelayPost(Link):
+    """The link to relay `index`. What is sent while nobody is there is stated afresh when somebody is.
 
-    def __init__(self, index: int) -> None:
+    What it is sent `soon` goes with the rest of that turn of the loop, or before the next thing that is not: nobody
+    connects to what a relay carries without a grant, which is told at once.
+    """
+
+    def __init__(self, index: int, heard: Callable[[Any], None], lost: Callable[[str], None]) -> None:
+        super().__init__(heard, lost)
         self.index = index
         self.placed: set[str] = set()  # incarnations whose port this relay has
-        self._channel: Channel | None = None
         self._epoch = 0
-        self._asked: deque[asyncio.Future[None]] = deque()
+        self._orders: deque[asyncio.Future[None]] = deque()
 
-    @property
-    def there(self) -> bool:
-        """Whether a relay is there."""
-        return self._channel is not None
-
-    def attach(
-        self,
-        channel: Channel,
-        received: Callable[[Any, tuple[int, ...]], None],
-        lost: Callable[[], None],
-    ) -> None:
-        """Serve this link from now on; `lost()` is called when it ends before another takes its place."""
-        before, self._channel = self._channel, channel
-        if before is not None:
-            before.close()
+    def close(self) -> None:
+        """As `Link`; nobody waits for its orders any more."""
+        super().close()
         self.placed.clear()
-        self._forget_orders()
-
-        def closed() -> None:
-            if self._channel is channel:
-                self._channel = None
-                self._forget_orders()
-                lost()
-
-        channel.attach(asyncio.get_running_loop(), received, closed)
-
-    def send(
-        self, message: messages.Message, descriptors: tuple[int, ...] = (), *, soon: bool = False
-    ) -> bool:
-        """Tell the relay; False when it is not there.
-
-        `soon`: with what it is told in the same turn of the loop, or before the next thing that is not. Nobody connects
-        to what a relay carries without a grant, which is told at once.
-        """
-        if self._channel is None:
-            return False
-        try:
-            self._channel.send(message, descriptors, soon=soon)
-        except ChannelClosedError:
-            return False  # its end is reported by the loop
-        return True
+        while self._orders:
+            self.carried_out()
 
     def orders(self) -> list[asyncio.Future[None]]:
         """What is done when the relay has carried out all that it was told, or ends; nothing when nobody is there."""
         if not self.send(messages.OrdersAsked()):
             return []
-        self._asked.append(asyncio.get_running_loop().create_future())
-        return [self._asked[-1]]
+        self._orders.append(asyncio.get_running_loop().create_future())
+        return [self._orders[-1]]
 
     def carried_out(self) -> None:
         """The relay has carried out what it was told before it was asked first."""
-        if not (done := self._asked.popleft()).done():
+        if not (done := self._orders.popleft()).done():
             done.set_result(None)
-
-    def _forget_orders(self) -> None:
-        while self._asked:
-            self.carried_out()
 
     @contextmanager
     def restating(self) -> Iterator[None]:
@@ -116,7 +83,7 @@ class RelayControl:
     """What control knows and wants of the relays.
 
     `broken(incarnation)` hears of lost upstreams, `own_header` is of what control publishes itself, `own_call`
-    answers calls of the service that the appliance itself offers.
+    answers calls of the service that the appliance itself offers; `monitors()` are what relays are told and tell of.
     """
 
     def __init__(
@@ -129,6 +96,7 @@ class RelayControl:
         *,
         allocation: Allocation,
         policy: Callable[[], Policy],
+        monitors: Callable[[], Monitors],
         broken: Callable[[Incarnation], None],
         own_header: messages.OwnHeaderStated | None,
         own_call: Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]],
@@ -141,7 +109,11 @@ class RelayControl:
         self._broken = broken
         self._allocation = allocation
         self._policy = policy
-        self._posts = tuple(RelayPost(index) for index in range(allocation.relays))
+        self._monitors = monitors
+        self._posts = tuple(
+            RelayPost(index, partial(self._received, index), partial(self._lost, index))
+            for index in range(allocation.relays)
+        )
         self._asking: set[asyncio.Task[None]] = set()
         self._own_header = own_header
         self._own_call = own_call
@@ -150,7 +122,7 @@ class RelayControl:
     @property
     def presence(self) -> str:
         """`connected` when every relay is there, `away` when none is, else how many are away."""
-        away = sum(not post.there for post in self._posts)
+        away = sum(post.channel is None for post in self._posts)
         if not away:
             return "connected"
         return "away" if away == len(self._posts) else f"{away} of {len(self._posts)} are away"
@@ -175,25 +147,23 @@ class RelayControl:
 
     # --- the links ---
 
-    def attach(self, index: int, channel: Channel, monitors: Monitors) -> None:
+    def attach(self, index: int, channel: Channel) -> None:
         """A relay is there: serve its link and state everything that it is to carry."""
         post = self._posts[index]
         self.carried.lost(index)
-        post.attach(
-            channel,
-            lambda message, _descriptors: self._received(post, message, monitors),
-            lambda: self._lost(index, monitors),
-        )
-        post.send(monitors.statement(index))  # before anything is placed: nothing goes past the monitors
+        post.attach(channel)
+        post.send(
+            self._monitors().statement(index)
+        )  # before anything is placed: nothing goes past the monitors
         if self._own_header is not None:
             post.send(self._own_header)
         with post.restating():
             for incarnation in self._registry.live():
                 self._place(post, incarnation)
 
-    def _lost(self, index: int, monitors: Monitors) -> None:
+    def _lost(self, index: int, _reason: str) -> None:
         self.carried.lost(index)
-        monitors.relay_lost(index)
+        self._monitors().relay_lost(index)
 
     def send(self, message: messages.Message, relay: int) -> bool:
         """Tell a relay; False when it is not there."""
@@ -333,7 +303,8 @@ class RelayControl:
 
     # --- what the relays say ---
 
-    def _received(self, post: RelayPost, message: messages.Message, monitors: Monitors) -> None:
+    def _received(self, index: int, message: messages.Message) -> None:
+        post = self._posts[index]
         match message:
             case messages.UpstreamWanted() | messages.OwnServiceCalled():
                 task = asyncio.get_running_loop().create_task(self._answer(post, message))
@@ -363,7 +334,7 @@ class RelayControl:
             case messages.PublicationRefused():
                 self.carried.publication_refused(message)
             case _:
-                monitors.received(message, post.index)
+                self._monitors().received(message, post.index)
 
     async def _answer(
         self, post: RelayPost, asked: messages.UpstreamWanted | messages.OwnServiceCalled

@@ -53,7 +53,7 @@ class Scene:
     def attach(self, answer: Callable[[Any], list[messages.Message]]) -> Channel:
         """A recorder that answers so."""
         ours, theirs = socket.socketpair()
-        self.orders.attach(Channel(ours, messages.RecorderLink))
+        self.orders.link.attach(Channel(ours, messages.RecorderLink))
         recorder = Channel(theirs, messages.RecorderLink)
 
         def received(message: Any, _descriptors: tuple[int, ...]) -> None:

@@ -61,7 +61,7 @@ def reports(controls: list[Control]) -> Reports:
 def begin(controls: list[Control], reports: Reports, progress: messages.ForwardingReported) -> Control:
     """A control that is there from now on."""
     control = Control()
-    control.forwarded.attach(cast(Channel, control))
+    control.forwarded.link.attach(cast(Channel, control))
     controls.append(control)
     reports.anew(progress)
     return control

@@ -32,6 +32,7 @@ from appliance.channel.admin import (
 )
 from appliance.channel.answers.hosts import Endpoint, EnrolmentToken, KitParts, PortsSeen
 from appliance.channel.channel import Channel
+from appliance.channel.link import Link
 from appliance.channel.messages import (
     CertificateMade,
     CertificateNeeded,
@@ -66,7 +67,7 @@ class NearAuthority(Authority):
     """The real authority, asked without a link."""
 
     def __init__(self, directory: Path) -> None:
-        super().__init__()
+        super().__init__(Link(lambda _message: None))
         self._near = ipsec.Authority(directory)
         self.meanwhile: Callable[[], object] = lambda: None
         self.lists = 0

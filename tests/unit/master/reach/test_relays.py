@@ -71,7 +71,7 @@ class Link:
         self.told: list[tuple[messages.Message, tuple[int, ...]]] = []
         self.end: Callable[[], None] = lambda: None
 
-    def attach(self, _loop: Any, received: Any, closed: Callable[[], None]) -> None:
+    def attach(self, _loop: Any, received: Any, closed: Callable[[], None], _refused: object) -> None:
         """As `Channel`."""
         self.say, self.end = received, closed
 
@@ -114,6 +114,7 @@ class World:
             carried,
             allocation=self.allocation,
             policy=lambda: self.policy,
+            monitors=lambda: cast(Any, self),
             broken=lambda _incarnation: None,
             own_header=None,
             own_call=cast(Any, None),
@@ -138,7 +139,7 @@ class World:
         self.registry.add(self.node)
         self.links = [Link(), Link()]
         for index, link in enumerate(self.links):
-            self.relay.attach(index, cast(Channel, link), cast(Any, self))
+            self.relay.attach(index, cast(Channel, link))
         for kind, name, detail in (
             (Kind.PUBLICATION, "/left", "std_msgs/String"),
             (Kind.PUBLICATION, "/right", "std_msgs/String"),
@@ -195,10 +196,10 @@ async def test_orders_are_carried_out_when_every_relay_says_so() -> None:
     second.say(messages.OrdersCarriedOut(), ())
     await one
     assert not other.done()
-    relay.attach(0, cast(Channel, Link()), cast(Any, world))
+    relay.attach(0, cast(Channel, Link()))
     second.end()
     await other
-    relay.attach(0, cast(Channel, again := Link()), cast(Any, world))
+    relay.attach(0, cast(Channel, again := Link()))
     again.end()
     await relay.carried_out()
     world.close()
@@ -219,7 +220,7 @@ async def test_each_relay_is_told_what_it_carries() -> None:
     grant = messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear")
     assert (first.heard(), second.heard()) == ([], [grant])
     again = Link()
-    relay.attach(1, cast(Channel, again), cast(Any, world))
+    relay.attach(1, cast(Channel, again))
     assert again.heard() == [
         world.statement(1), messages.StateBegan(2), placed,
         messages.PublicationPlaced("key", "/right", "std_msgs/String"), grant,
@@ -337,7 +338,7 @@ async def test_limits_of_the_policy_are_stated_and_stated_again_when_they_change
     assert (first.heard(), second.heard()) == ([], [placed, grant])
     world.limits_changed(world.policy, policy(line))
     assert second.heard() == []
-    relay.attach(1, cast(Channel, second), cast(Any, world))
+    relay.attach(1, cast(Channel, second))
     told = second.heard()
     assert placed in told
     assert grant in told
