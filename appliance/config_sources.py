@@ -162,7 +162,7 @@ class _Gathered:
             table = table[key]
         table[path[-1]] = value
         # Where the file stands no longer matters for what is under this key.
-        for older in [place for place in self._places if place[: len(path)] == path]:
+        for older in [known for known in self._places if known[: len(path)] == path]:
             del self._places[older]
         self._places[path] = place
 

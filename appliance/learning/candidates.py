@@ -265,7 +265,7 @@ class _Proposer:
         for path, series in content.numbers.items():
             row = content.elements.get(path)
             if row:
-                yield from ((path, place, len(row), series) for place, series in enumerate(row))
+                yield from ((path, place, len(row), element) for place, element in enumerate(row))
             elif (
                 content.types[path].endswith("]")
                 or content.types[path].startswith("float")

@@ -185,7 +185,7 @@ def default_route(namespace: Namespace, version: int) -> DefaultRoute | None:
             for entry in route.get_routes(family=family, table=_MAIN_TABLE)
             if not entry["dst_len"] and entry["type"] == _UNICAST
         ]
-        for entry in sorted(found, key=lambda route: route.get_attr("RTA_PRIORITY") or 0):
+        for entry in sorted(found, key=lambda entry: entry.get_attr("RTA_PRIORITY") or 0):
             hops = entry.get_attr("RTA_MULTIPATH") or []
             hop = hops[0] if hops else entry
             index = hop["oif"] if hops else entry.get_attr("RTA_OIF")

@@ -89,7 +89,7 @@ class Meaning:
             seen.append(place)
             if event == ptcaret.END:
                 open_calls = [
-                    number for number, event in enumerate(seen) if self._events[event] == ptcaret.BEGIN
+                    number for number, earlier in enumerate(seen) if self._events[earlier] == ptcaret.BEGIN
                 ]
                 seen = seen[: open_calls[-1]] if open_calls else []
         return [*seen, at]

@@ -16,7 +16,7 @@ class Queue(Generic[Holder, Member]):
 
     def __init__(self, standing: Callable[[Holder], Standing]) -> None:
         self._standing = standing
-        self._lines = {standing: OrderedDict[Member, tuple[Holder, float]]() for standing in Standing}
+        self._lines = {level: OrderedDict[Member, tuple[Holder, float]]() for level in Standing}
         self._line_of: dict[Member, OrderedDict[Member, tuple[Holder, float]]] = {}
 
     def put(self, member: Member, host: Holder, since: float) -> None:

@@ -248,9 +248,8 @@ class Registry:
         """The keys of parameters below `key` that live incarnations subscribed to, sorted."""
         keys, above = self._subscribed_keys, key.rstrip("/")
         # Those that begin with `above/` stand together, before `above0`: '0' follows '/'.
-        return [
-            key for key in keys[bisect_left(keys, f"{above}/") : bisect_left(keys, f"{above}0")] if key != "/"
-        ]
+        below = keys[bisect_left(keys, f"{above}/") : bisect_left(keys, f"{above}0")]
+        return [found for found in below if found != "/"]
 
     def nodes_of(self, host: Address) -> int:
         """How many incarnations of a host are known (for the limit per host)."""

@@ -27,9 +27,7 @@ class NodeApi:
         """Call a node. Raises `CallFailedError`; `RefusedError` also for what would shut down another in its place."""
         if method == "shutdown" and incarnation.life is not Life.LIVE:
             uri = incarnation.call_uri
-            there = next(
-                (incarnation for incarnation in self._registry.live() if incarnation.call_uri == uri), None
-            )
+            there = next((other for other in self._registry.live() if other.call_uri == uri), None)
             if there is not None:
                 where = node_uri(uri.host, uri.port, uri.path)
                 raise RefusedError(f"{where} was not called: {there.name} has that address now")

@@ -140,7 +140,7 @@ def check_overlaps(bound: list[Bound], written: list[Bound]) -> None:
         for other in bound:
             if other is not field and _overlap(field.binding, other.binding):
                 raise SpecificationError.at(
-                    max(field, other, key=lambda field: field.binding.position).binding.position,
+                    max(field.binding.position, other.binding.position),
                     "two bindings hold this field, and one of them is assigned; bind it once",
                 )
 

@@ -243,7 +243,7 @@ class Scope:
         wrong = (self.misdeclared, *(other.misdeclared for other in self.shared.specifications))
         if self.shared.partial or any(name in names for names in wrong):
             return SpecificationError(())
-        known = [name for block in self._blocks for name in block]
+        known = [local for block in self._blocks for local in block]
         known += [*self.names.variables, *self.names.functions]
         return SpecificationError.at(position, f"there is no {what} {shown(name)}{nearest(name, known)}")
 

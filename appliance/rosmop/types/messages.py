@@ -95,7 +95,7 @@ class Messages:
 
     def constant(self, name: str, constant: str) -> Constant:
         """A constant of a message type; raises `UnknownNameError`."""
-        constants = {constant.name: constant for constant in self.definition(name).constants}
+        constants = {known.name: known for known in self.definition(name).constants}
         if constant not in constants:
             raise UnknownNameError(f"{name} has no constant {shown(constant)}{nearest(constant, constants)}")
         return constants[constant]
