@@ -17,10 +17,9 @@ import structlog
 
 from appliance.api.access import Bearer
 from appliance.channel import messages
-from appliance.channel.admin import A, AdminAnswer, AdminRequest, decode
+from appliance.channel.admin import CHANGES, A, AdminAnswer, AdminRequest, decode
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
-from appliance.channel.operations import CHANGES
 
 _log = structlog.get_logger()
 _MOST_OPEN = 48
@@ -35,7 +34,7 @@ class ControlAwayError(Exception):
 def _made(number: int, request: AdminRequest[Any], bearer: Bearer | None) -> messages.RequestMade:
     shown = bearer.shown if bearer is not None else ""
     asked = bearer.asked if bearer is not None and type(request) in CHANGES else None
-    return messages.RequestMade(number, request, shown, asked)  # type: ignore[arg-type]  # mypy does not narrow a struct to its union
+    return messages.RequestMade(number, request, shown, asked)
 
 
 class ControlLink:

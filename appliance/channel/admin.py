@@ -1,15 +1,17 @@
 """What operators' tools ask of the running appliance; the base of each request names the struct that answers it.
 
 Over the admin socket: one JSON document per line in each direction, one request per connection at a time. The
-socket is in the state directory, for its owner and root only, and takes `AnyRequest`. Over REST the api process
-passes on `RestRequest`, which cannot make tokens, and gets the same document back; which HTTP request asks what is in
-`operations.py`.
+socket is in the state directory, for its owner and root only, and takes `AnyRequest`: all but `ChallengeWanted`. Over
+REST the api process passes on `RestRequest`, all that has `@rest`, and gets the same document back. `@rest` says which
+HTTP request asks it, and the least role that may: the command line makes its calls from that, control derives from it
+once more what a client has signed and who may ask it, and a test holds the api's routes against it.
 
 `expected` is the revision that the asker has seen: a change is refused when another one is in force by now.
 """
 
 import functools
-from typing import Annotated, Any, Generic, Literal, TypeVar, cast, get_args
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, NamedTuple, TypeVar, Union, cast, get_args
 
 import msgspec
 
@@ -28,6 +30,10 @@ from appliance.channel.answers import (
 from appliance.channel.answers.tokens import TokenRole
 
 A = TypeVar("A")
+PARAMETERS = {"names": "name", "topics": "topic"}
+"""What a field is called in a query, where it may stand there several times."""
+
+_WITHIN = ("confirm_within",)
 
 
 class AdminRequest(msgspec.Struct, Generic[A], frozen=True, tag_field="verb", forbid_unknown_fields=True):
@@ -38,19 +44,72 @@ class WaitingRequest(AdminRequest[A], Generic[A], frozen=True):
     """One whose answer waits for charon, the signer, the recorder or a topic's messages: others go past it."""
 
 
+R = TypeVar("R", bound=AdminRequest[Any])
+
+
+class Operation(NamedTuple):
+    """How one thing is asked over REST; `role` None: without a token. Without a path the api asks it to answer others.
+
+    A field of the request stands in the path (of a list: the only element), in the query, in `If-Match` (`expected`),
+    or else in the body, under its name. `says` is what the body has besides; `fixed` are fields that the operation
+    stands for. Both tell the operations of one path apart: the first that fits is meant.
+    """
+
+    request: type[AdminRequest[Any]]
+    role: TokenRole | None
+    method: str
+    path: str
+    query: tuple[str, ...]
+    says: Mapping[str, Any]
+    fixed: Mapping[str, Any]
+
+    def body(self) -> list[msgspec.structs.FieldInfo]:
+        """The fields that the body has."""
+        elsewhere = {"expected", *self.query, *self.fixed}
+        fields = msgspec.structs.fields(self.request)
+        return [
+            field for field in fields if field.name not in elsewhere and f"{{{field.name}}}" not in self.path
+        ]
+
+
+_OPERATIONS: dict[type, tuple[Operation, ...]] = {}
+
+
+def rest(
+    role: TokenRole | None,
+    method: str = "",
+    path: str = "",
+    query: tuple[str, ...] = (),
+    *,
+    says: Mapping[str, Any] = {},
+    fixed: Mapping[str, Any] = {},
+) -> Callable[[type[R]], type[R]]:
+    """The request is asked over REST in this way, besides those that stand below this one."""
+
+    def add(request: type[R]) -> type[R]:
+        operation = Operation(request, role, method, path, query, says, fixed)
+        _OPERATIONS[request] = (operation, *_OPERATIONS.get(request, ()))
+        return request
+
+    return add
+
+
 def verb_of(request: AdminRequest[Any]) -> str:
     """The name of a request, as it stands in `verb`."""
     return str(type(request).__struct_config__.tag)
 
 
+@rest("viewer", "GET", "/v1/status")
 class StatusWanted(AdminRequest[status.Status], frozen=True, tag="status"):
     """Processes, policy, registry, relay, firewall: what `rosrv status` shows."""
 
 
+@rest("viewer", "GET", "/v1/inventory")
 class InventoryWanted(AdminRequest[inventory.Inventory], frozen=True, tag="inventory"):
     """What runs: version, build, parts with their licences, what is used of the kernel."""
 
 
+@rest("operator", "POST", "/v1/policy/reload", _WITHIN)
 class PolicyReload(AdminRequest[policy.Loaded], frozen=True, tag="policy reload"):
     """Read the policy file again; back by itself after `confirm_within` seconds unless confirmed."""
 
@@ -58,6 +117,7 @@ class PolicyReload(AdminRequest[policy.Loaded], frozen=True, tag="policy reload"
     expected: int | None = None
 
 
+@rest("operator", "POST", "/v1/policy/rollback")
 class PolicyRollback(AdminRequest[policy.Loaded], frozen=True, tag="policy rollback"):
     """Back to a kept revision; None: the one before the present."""
 
@@ -65,12 +125,14 @@ class PolicyRollback(AdminRequest[policy.Loaded], frozen=True, tag="policy rollb
     expected: int | None = None
 
 
+@rest("operator", "POST", "/v1/policy/confirm")
 class PolicyConfirm(AdminRequest[policy.PolicyConfirmed], frozen=True, tag="policy confirm"):
     """Keep a change that would go back by itself."""
 
     expected: int | None = None
 
 
+@rest("admin", "POST", "/v1/policy", _WITHIN)
 class PolicyLoad(AdminRequest[policy.Loaded], frozen=True, tag="policy load"):
     """Bring a text into force that is not the file's: check, test, swap, decide again what is live."""
 
@@ -81,24 +143,29 @@ class PolicyLoad(AdminRequest[policy.Loaded], frozen=True, tag="policy load"):
     signature: str = ""
 
 
+@rest("viewer")
 class PolicyWanted(AdminRequest[policy.PolicyKnown], frozen=True, tag="policy"):
     """The text of a revision (None: the one in force), and with what it is judged: its tests, the robot."""
 
     revision: int | None = None
 
 
+@rest("viewer", "GET", "/v1/policy/revisions")
 class PolicyRevisions(AdminRequest[policy.PolicyRevisionList], frozen=True, tag="policy revisions"):
     """The kept revisions."""
 
 
+@rest("viewer")
 class RegistrationsWanted(AdminRequest[graph.Registrations], frozen=True, tag="registrations"):
     """What is live now and a change of the policy may end."""
 
 
+@rest("viewer", "GET", "/v1/graph")
 class GraphWanted(AdminRequest[graph.Graph], frozen=True, tag="graph"):
     """Nodes, topics and services with who is connected to whom and how much flows."""
 
 
+@rest("operator", "GET", "/v1/messages", ("topic", "messages", "seconds", "latched"))
 class TopicLook(WaitingRequest[graph.TopicMessages], frozen=True, tag="topic look"):
     """The next messages of a topic, read as fields; it is recorded who looked. At most 20, and for ten seconds.
 
@@ -111,16 +178,19 @@ class TopicLook(WaitingRequest[graph.TopicMessages], frozen=True, tag="topic loo
     latched: bool = True
 
 
+@rest(None)
 class MetricsWanted(AdminRequest[measures.Measures], frozen=True, tag="metrics"):
     """The status, and everything that control counts."""
 
 
+@rest("viewer", "GET", "/v1/monitors", ("texts",))
 class MonitorsWanted(AdminRequest[monitors.Monitors], frozen=True, tag="monitors"):
     """The monitors with their state and counters; with `texts`, also the specifications themselves."""
 
     texts: bool = False
 
 
+@rest("admin", "POST", "/v1/monitors", _WITHIN)
 class MonitorLoad(AdminRequest[monitors.Replaced], frozen=True, tag="monitor load"):
     """Add or replace files of specifications, and the message definitions they need (`package/Type.msg`).
 
@@ -137,6 +207,7 @@ class MonitorLoad(AdminRequest[monitors.Replaced], frozen=True, tag="monitor loa
     signatures: dict[str, str] = {}
 
 
+@rest("admin", "PUT", "/v1/monitors/{name}", _WITHIN)
 class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor replace"):
     """Put a text in the place of the file that the monitor `name` stands in, or of the file of this name.
 
@@ -153,6 +224,7 @@ class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor 
     signatures: dict[str, str] = {}
 
 
+@rest("operator", "POST", "/v1/monitors/reload", ("prune", "confirm_within"))
 class MonitorReload(AdminRequest[monitors.Replaced], frozen=True, tag="monitor reload"):
     """Take what the folder of specifications has now; what it does not have stays, unless `prune`."""
 
@@ -161,6 +233,8 @@ class MonitorReload(AdminRequest[monitors.Replaced], frozen=True, tag="monitor r
     confirm_within: float | None = None
 
 
+@rest("admin", "DELETE", "/v1/monitors", ("names", "confirm_within"))
+@rest("admin", "DELETE", "/v1/monitors/{names}", _WITHIN)
 class MonitorRemove(AdminRequest[monitors.Replaced], frozen=True, tag="monitor remove"):
     """Remove specifications, by the names of their files or monitors."""
 
@@ -169,6 +243,7 @@ class MonitorRemove(AdminRequest[monitors.Replaced], frozen=True, tag="monitor r
     confirm_within: float | None = None
 
 
+@rest("admin", "POST", "/v1/monitors/rollback")
 class MonitorRollback(AdminRequest[monitors.Replaced], frozen=True, tag="monitor rollback"):
     """Back to a kept revision; None: the one before the present."""
 
@@ -176,22 +251,27 @@ class MonitorRollback(AdminRequest[monitors.Replaced], frozen=True, tag="monitor
     expected: str | None = None
 
 
+@rest("operator", "POST", "/v1/monitors/confirm")
 class MonitorConfirm(AdminRequest[monitors.MonitorsConfirmed], frozen=True, tag="monitor confirm"):
     """Keep specifications that would go back by themselves."""
 
     expected: str | None = None
 
 
+@rest("viewer", "GET", "/v1/monitors/revisions")
 class MonitorRevisions(AdminRequest[monitors.MonitorRevisionList], frozen=True, tag="monitor revisions"):
     """The kept revisions of the specifications."""
 
 
+@rest("viewer", "GET", "/v1/monitors/revisions/{revision}")
 class MonitorRevisionWanted(AdminRequest[monitors.RevisionTexts], frozen=True, tag="monitor revision"):
     """The texts of a kept revision."""
 
     revision: int
 
 
+@rest("operator", "PATCH", "/v1/monitors")
+@rest("operator", "PATCH", "/v1/monitors/{names}")
 class MonitorSwitch(AdminRequest[monitors.Switched], frozen=True, tag="monitor switch"):
     """Let the events of these monitors happen, or not."""
 
@@ -200,6 +280,8 @@ class MonitorSwitch(AdminRequest[monitors.Switched], frozen=True, tag="monitor s
     expected: str | None = None
 
 
+@rest("operator", "PATCH", "/v1/monitors")
+@rest("operator", "PATCH", "/v1/monitors/{names}")
 class MonitorTrial(AdminRequest[monitors.Switched], frozen=True, tag="monitor trial"):
     """Put these monitors on trial, or (false) bring those that are on trial into force."""
 
@@ -208,6 +290,8 @@ class MonitorTrial(AdminRequest[monitors.Switched], frozen=True, tag="monitor tr
     expected: str | None = None
 
 
+@rest("operator", "PATCH", "/v1/monitors", says={"held": False})
+@rest("operator", "PATCH", "/v1/monitors/{names}", says={"held": False})
 class MonitorResume(AdminRequest[monitors.Switched], frozen=True, tag="monitor resume"):
     """Let the topics that these monitors hold go on."""
 
@@ -215,22 +299,19 @@ class MonitorResume(AdminRequest[monitors.Switched], frozen=True, tag="monitor r
     expected: str | None = None
 
 
-MonitorChange = (
-    MonitorLoad | MonitorReplace | MonitorReload | MonitorRemove | MonitorRollback | MonitorConfirm | MonitorSwitch
-    | MonitorTrial | MonitorResume
-)  # fmt: skip
-
-
+@rest("viewer", "GET", "/v1/recordings")
 class RecordingsWanted(WaitingRequest[recordings.Recordings], frozen=True, tag="recordings"):
     """The recordings that are kept."""
 
 
+@rest("viewer", "GET", "/v1/recordings/{id}")
 class RecordingWanted(WaitingRequest[recordings.Recording], frozen=True, tag="recording"):
     """One of them."""
 
     id: str
 
 
+@rest("operator", "POST", "/v1/recordings")
 class RecordNow(WaitingRequest[recordings.RecordingBegun], frozen=True, tag="record now"):
     """Record from `before` seconds before now to `after` seconds after; None: as configured."""
 
@@ -239,12 +320,14 @@ class RecordNow(WaitingRequest[recordings.RecordingBegun], frozen=True, tag="rec
     note: str = ""
 
 
+@rest("investigator", "GET", "/v1/recordings/{id}/bag")
 class RecordingFetch(WaitingRequest[recordings.Recording], frozen=True, tag="recording fetch"):
     """Somebody takes the messages of a recording: it is recorded who."""
 
     id: str
 
 
+@rest("investigator", "GET", "/v1/recordings/{id}/messages", ("topics",))
 class RecordingRead(WaitingRequest[recordings.Recording], frozen=True, tag="recording read"):
     """Somebody reads messages of a recording, of these topics (none: of all): it is recorded who."""
 
@@ -252,6 +335,7 @@ class RecordingRead(WaitingRequest[recordings.Recording], frozen=True, tag="reco
     topics: list[str] = []
 
 
+@rest("investigator", "POST", "/v1/recordings/memory")
 class RecordingOfMemory(WaitingRequest[recordings.Recording], frozen=True, tag="recording memory"):
     """What is in memory, to be read: from `since` to `until`, nanoseconds since the epoch (None: all, now).
 
@@ -262,16 +346,11 @@ class RecordingOfMemory(WaitingRequest[recordings.Recording], frozen=True, tag="
     until: int | None = None
 
 
+@rest("admin", "DELETE", "/v1/recordings/{id}")
 class RecordingRemove(WaitingRequest[recordings.Recording], frozen=True, tag="recording remove"):
     """Remove a recording."""
 
     id: str
-
-
-RecorderRequest = (
-    RecordingsWanted | RecordingWanted | RecordNow | RecordingFetch | RecordingRead | RecordingOfMemory
-    | RecordingRemove
-)  # fmt: skip
 
 
 class TokenAdd(AdminRequest[tokens.NewToken], frozen=True, tag="token add"):
@@ -282,29 +361,20 @@ class TokenAdd(AdminRequest[tokens.NewToken], frozen=True, tag="token add"):
     seconds: float
 
 
+@rest("admin", "GET", "/v1/tokens")
 class TokenList(AdminRequest[tokens.Tokens], frozen=True, tag="token list"):
     """All tokens that were made, without their secrets."""
 
 
+@rest("admin", "DELETE", "/v1/tokens/{name}")
 class TokenRevoke(AdminRequest[tokens.Token], frozen=True, tag="token revoke"):
     """End a token now."""
 
     name: str
 
 
-class HostAdd(WaitingRequest[hosts.KitParts], frozen=True, tag="host add"):
-    """Enrol a host by a signing request (PKCS #10, PEM) for the key that it has, for `days`.
-
-    `address`: the virtual address it shall have; None: the next free one.
-    """
-
-    name: str
-    request: str
-    days: float = 90
-    address: str | None = None
-    expected: int | None = None
-
-
+@rest("admin", "POST", "/v1/hosts", says={"how": "token"}, fixed={"new": True})
+@rest("admin", "POST", "/v1/hosts/{name}/token", fixed={"new": False})
 class HostToken(WaitingRequest[hosts.EnrolmentToken], frozen=True, tag="host token"):
     """Make a token by which a host enrols itself once within `token_seconds`; an earlier one of the name ends.
 
@@ -324,6 +394,21 @@ class HostToken(WaitingRequest[hosts.EnrolmentToken], frozen=True, tag="host tok
     new: bool = False
 
 
+@rest("admin", "POST", "/v1/hosts", says={"how": "kit"})
+class HostAdd(WaitingRequest[hosts.KitParts], frozen=True, tag="host add"):
+    """Enrol a host by a signing request (PKCS #10, PEM) for the key that it has, for `days`.
+
+    `address`: the virtual address it shall have; None: the next free one.
+    """
+
+    name: str
+    request: str
+    days: float = 90
+    address: str | None = None
+    expected: int | None = None
+
+
+@rest(None)
 class HostEnrol(WaitingRequest[hosts.KitParts], frozen=True, tag="host enrol"):
     """The host itself, at the real address `peer`, brings its token and a signing request (PEM)."""
 
@@ -332,6 +417,7 @@ class HostEnrol(WaitingRequest[hosts.KitParts], frozen=True, tag="host enrol"):
     peer: str
 
 
+@rest("admin", "POST", "/v1/hosts/{name}/kit")
 class HostRenew(WaitingRequest[hosts.KitParts], frozen=True, tag="host renew"):
     """A new certificate for an enrolled host; the one before is revoked."""
 
@@ -341,6 +427,7 @@ class HostRenew(WaitingRequest[hosts.KitParts], frozen=True, tag="host renew"):
     expected: int | None = None
 
 
+@rest(None)
 class HostRenewItself(WaitingRequest[hosts.NewCertificate], frozen=True, tag="host renew itself"):
     """A host asks through its tunnel, at its virtual address `peer`, for a certificate for a new key.
 
@@ -354,6 +441,7 @@ class HostRenewItself(WaitingRequest[hosts.NewCertificate], frozen=True, tag="ho
     peer: str
 
 
+@rest(None)
 class HostRenewed(AdminRequest[hosts.Renewed], frozen=True, tag="host renewed"):
     """A host at its virtual address `peer` has put its new certificate in place: the one before ends now."""
 
@@ -361,20 +449,24 @@ class HostRenewed(AdminRequest[hosts.Renewed], frozen=True, tag="host renewed"):
     peer: str
 
 
+@rest("viewer", "GET", "/v1/hosts")
 class HostList(AdminRequest[hosts.Hosts], frozen=True, tag="host list"):
     """All hosts that were enrolled or declared, with their tunnels."""
 
 
+@rest("viewer")
 class HostEndpoint(AdminRequest[hosts.Endpoint], frozen=True, tag="host endpoint"):
     """At which address hosts reach the appliance, where nobody says it: `endpoint`, and `reason`: why that one."""
 
 
+@rest("operator")
 class HostKit(AdminRequest[hosts.KitParts], frozen=True, tag="host kit"):
     """What an enrolled host's kit is made of, without its private key."""
 
     name: str
 
 
+@rest("admin", "DELETE", "/v1/hosts/{name}")
 class HostRevoke(AdminRequest[hosts.Revoked], frozen=True, tag="host revoke"):
     """Let a host in no more, and cut what it has, now."""
 
@@ -382,6 +474,7 @@ class HostRevoke(AdminRequest[hosts.Revoked], frozen=True, tag="host revoke"):
     expected: int | None = None
 
 
+@rest("operator", "PUT", "/v1/hosts/{name}/ports")
 class HostPorts(AdminRequest[hosts.PortsTold], frozen=True, tag="host ports"):
     """Somebody tried the ROS ports of a host from outside, at `checked` (seconds since the epoch; None: now).
 
@@ -395,24 +488,29 @@ class HostPorts(AdminRequest[hosts.PortsTold], frozen=True, tag="host ports"):
     expected: int | None = None
 
 
+@rest("operator", "POST", "/v1/hosts/reload")
 class HostsReload(AdminRequest[hosts.Reloaded], frozen=True, tag="hosts reload"):
     """Read `ipsec/hosts.yaml` again."""
 
     expected: int | None = None
 
 
+@rest(None)
 class RevocationsWanted(AdminRequest[hosts.RevocationList], frozen=True, tag="host revocations"):
     """The authority's signed list of revoked certificates, in PEM."""
 
 
+@rest(None)
 class AuthorityWanted(AdminRequest[hosts.AuthorityCertificate], frozen=True, tag="host authority"):
     """The authority's certificate, in PEM."""
 
 
+@rest("viewer")
 class LogSealed(WaitingRequest[evidence.Sealed], frozen=True, tag="audit seal"):
     """Have all that was recorded sealed by a signed checkpoint, now."""
 
 
+@rest("viewer")
 class EvidenceExported(WaitingRequest[evidence.Sealed], frozen=True, tag="evidence exported"):
     """Record that a bundle was made whose manifest has this hash, and have that sealed.
 
@@ -427,23 +525,31 @@ class EvidenceExported(WaitingRequest[evidence.Sealed], frozen=True, tag="eviden
     recording: str = ""
 
 
+@rest("viewer", "GET", "/v1/challenge")
 class ChallengeWanted(AdminRequest[tokens.Challenge], frozen=True, tag="challenge"):
     """A challenge, under which the next order over REST is signed."""
 
 
-HostRequest = (
-    HostAdd | HostToken | HostEnrol | HostRenew | HostRenewItself | HostRenewed | HostList | HostKit | HostRevoke
-    | HostPorts | HostsReload | RevocationsWanted | AuthorityWanted | HostEndpoint
-)  # fmt: skip
-_Common = (
-    StatusWanted | InventoryWanted | PolicyReload | PolicyRollback | PolicyConfirm | PolicyLoad | PolicyWanted
-    | PolicyRevisions
-    | RegistrationsWanted | GraphWanted | TopicLook | MetricsWanted | MonitorsWanted | MonitorRevisions
-    | MonitorRevisionWanted | MonitorChange | TokenList | TokenRevoke | LogSealed | EvidenceExported
-    | RecorderRequest | HostRequest
-)  # fmt: skip
-RestRequest = _Common | ChallengeWanted
-AnyRequest = _Common | TokenAdd
+OPERATIONS = tuple(operation for operations in _OPERATIONS.values() for operation in operations)
+CHANGES = frozenset(
+    operation.request for operation in OPERATIONS if operation.path and operation.method != "GET"
+)
+"""What changes something in the name of a token: control makes it only with the request that asked for it."""
+
+if TYPE_CHECKING:
+    RestRequest = AdminRequest[Any]
+    AnyRequest = AdminRequest[Any]
+else:
+    RestRequest = Union[tuple(_OPERATIONS)]  # noqa: UP007  there are as many as there are
+    AnyRequest = Union[(TokenAdd, *(request for request in _OPERATIONS if request is not ChallengeWanted))]
+
+
+def operation_of(request: AdminRequest[Any]) -> Operation | None:
+    """How a request is asked; None: not over REST."""
+    for operation in _OPERATIONS.get(type(request), ()):
+        if all(getattr(request, name) == operation.fixed[name] for name in operation.fixed):
+            return operation
+    return None
 
 
 Trouble = Literal["", "request", "refused", "conflict", "unknown", "forbidden", "busy", "failed"]

@@ -21,6 +21,7 @@ from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.admin import (
+    CHANGES,
     AdminAnswer,
     ChallengeWanted,
     HostEnrol,
@@ -32,7 +33,6 @@ from appliance.channel.admin import (
 )
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
-from appliance.channel.operations import CHANGES
 from appliance.control.administration import Administration
 from appliance.control.rest_proof import Askers, UnprovenError
 from appliance.control.tokens import Tokens

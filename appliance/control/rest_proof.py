@@ -20,7 +20,6 @@ from appliance.audit.record import Severity
 from appliance.channel import admin
 from appliance.channel.answers.tokens import Challenge, TokenRole, may
 from appliance.channel.messages import Asked, RequestMade
-from appliance.channel.operations import CHANGES, operation_of
 from appliance.control.challenges import SECONDS, ChallengeRefusedError, Challenges
 from appliance.control.rest_meaning import NoOrderError, meant
 from appliance.control.tokens import Tokens
@@ -67,13 +66,13 @@ class Askers:
         """The name of the token in whose name this is asked. Raises `UnprovenError`."""
         role = _role_for(made.request)
         if role is None:
-            return _ITSELF if isinstance(made.request, admin.HostRequest) else ""
+            return "" if isinstance(made.request, admin.MetricsWanted) else _ITSELF
         row = await self._holder(made.shown)
         if not may(row.role, role):
             raise UnprovenError(
                 f"this is for {role}s; the token {row.name} has the role {row.role}", row.name
             )
-        if type(made.request) in CHANGES:
+        if type(made.request) in admin.CHANGES:
             self._require_order(made, row)
         return row.name
 
@@ -146,5 +145,5 @@ def _role_for(request: admin.RestRequest) -> TokenRole | None:
     """The least role of a token that may ask this; None where no token is needed."""
     if isinstance(request, admin.MonitorReload) and request.prune:
         return "admin"  # removes what an admin loaded
-    operation = operation_of(request)
+    operation = admin.operation_of(request)
     return operation.role if operation is not None else "admin"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.channel.operations import OPERATIONS
+from appliance.channel.admin import OPERATIONS
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted((ROOT / "docs").glob("*.md"))

@@ -7,9 +7,8 @@ from urllib.parse import quote
 import msgspec
 
 from appliance.channel import admin
-from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble
+from appliance.channel.admin import PARAMETERS, A, AdminAnswer, AdminRequest, Operation, Trouble, operation_of
 from appliance.channel.answers.graph import Graph, Registration, Registrations
-from appliance.channel.operations import PARAMETERS, Operation, operation_of
 from appliance.cli.admin_socket import NotRunningError, encoded
 from appliance.cli.rest.session import ProblemError, RestClient
 

@@ -21,13 +21,12 @@ from appliance.api.history import History
 from appliance.api.journal import Journal
 from appliance.api.services import Services
 from appliance.channel import admin, messages
-from appliance.channel.admin import A, AdminAnswer, AdminRequest
+from appliance.channel.admin import CHANGES, OPERATIONS, A, AdminAnswer, AdminRequest
 from appliance.channel.answers.graph import Registrations
 from appliance.channel.answers.hosts import Endpoint
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.policy import PolicyKnown
 from appliance.channel.messages import Asked
-from appliance.channel.operations import CHANGES, OPERATIONS
 from appliance.config import Settings
 from appliance.control.rest_meaning import NoOrderError, meant
 from appliance.store.tokens import make_token

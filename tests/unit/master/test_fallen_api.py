@@ -77,7 +77,7 @@ class Api:
     ) -> AdminAnswer[A]:
         """Control's answer."""
         self._answers += 1
-        self.channel.send(messages.RequestMade(self._answers, request, shown, asked))  # type: ignore[arg-type]  # one of the union
+        self.channel.send(messages.RequestMade(self._answers, request, shown, asked))
         while True:
             for one in await self._ear.until(len(self._ear.messages)):
                 if isinstance(one, messages.RequestAnswered) and one.number == self._answers:

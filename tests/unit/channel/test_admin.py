@@ -1,14 +1,7 @@
-"""Tests of `appliance.channel.operations`: every request that can come over REST has its way and its role."""
-
-from typing import get_args
+"""Tests of `appliance.channel.admin`: every request that can come over REST has its way and its role."""
 
 from appliance.channel import admin
-from appliance.channel.operations import CHANGES, OPERATIONS, operation_of
-
-
-def test_no_request_was_forgotten() -> None:
-    """A request that is added is given to one role, or stands in the table as one that needs no token."""
-    assert {one.request for one in OPERATIONS} == set(get_args(admin.RestRequest))
+from appliance.channel.admin import CHANGES, OPERATIONS, operation_of
 
 
 def test_what_changes_something_is_for_operators_and_admins() -> None:
