@@ -4,11 +4,11 @@ from typing import Annotated
 
 from fastapi import Query
 
-from appliance.api.roles import Operator, Viewer, ask
+from appliance.api.roles import Operator, add_look, ask
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.channel.admin import GraphWanted, TopicLook
-from appliance.channel.answers.graph import Graph, TopicMessages
+from appliance.channel.answers.graph import TopicMessages
 
 _UNKNOWN: Responses = {404: {"description": "No node publishes or subscribes to it."}}
 
@@ -17,10 +17,7 @@ def routes(services: Services) -> Routes:
     """The route."""
     router = Routes(prefix="/v1", tags=["graph"])
 
-    @router.get("/graph")
-    async def graph(bearer: Viewer) -> Graph:
-        """Nodes, topics and services, who is mediated, and rates."""
-        return await ask(services.control, GraphWanted(), bearer)
+    add_look(router, services.control, GraphWanted)
 
     @router.get("/messages", operation_id="topic_messages", responses=_UNKNOWN)
     async def messages(

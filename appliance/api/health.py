@@ -9,12 +9,10 @@ from typing import Literal
 import msgspec
 
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Viewer, ask
+from appliance.api.roles import add_look
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.channel.admin import InventoryWanted, StatusWanted
-from appliance.channel.answers.inventory import Inventory
-from appliance.channel.answers.status import Status
 from appliance.channel.health import unserved
 
 _PATIENCE_SECONDS = 1.0
@@ -50,14 +48,6 @@ def routes(services: Services) -> Routes:
         router.add_api_route(f"{prefix}/healthz", live, operation_id=f"live{name}")
         router.add_api_route(f"{prefix}/readyz", ready, operation_id=f"ready{name}", responses=unready)
 
-    @router.get("/v1/status")
-    async def status(bearer: Viewer) -> Status:
-        """The running appliance: processes, isolation, policy, graph, audit log."""
-        return await ask(services.control, StatusWanted(), bearer)
-
-    @router.get("/v1/inventory")
-    async def inventory(bearer: Viewer) -> Inventory:
-        """What runs: version, build, parts with their licences, what is used of the kernel."""
-        return await ask(services.control, InventoryWanted(), bearer)
-
+    add_look(router, services.control, StatusWanted)
+    add_look(router, services.control, InventoryWanted)
     return router

@@ -17,12 +17,12 @@ from appliance.api.policy_models import (
     RuleText,
     Text,
 )
-from appliance.api.roles import Viewer, ask
+from appliance.api.roles import Viewer, add_look, ask
 from appliance.api.routing import Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services
 from appliance.channel.admin import PolicyRevisions, PolicyWanted
 from appliance.channel.answers.field_docs import told
-from appliance.channel.answers.policy import PolicyInForce, PolicyRevisionList, RevisionText
+from appliance.channel.answers.policy import PolicyInForce, RevisionText
 from appliance.policy.cases import CaseResult
 from appliance.policy.explain import Explanation
 from appliance.policy.model import Category, Rule
@@ -74,10 +74,7 @@ def routes(services: Services) -> Routes:
         known = await ask(control, PolicyWanted(), bearer)
         return tagged(msgspec.convert(known, PolicyInForce, from_attributes=True))
 
-    @router.get("/revisions", operation_id="policy_revisions")
-    async def revisions(bearer: Viewer) -> PolicyRevisionList:
-        """The kept revisions, the newest first."""
-        return await ask(control, PolicyRevisions(), bearer)
+    add_look(router, control, PolicyRevisions)
 
     @router.get("/revisions/{revision}", operation_id="policy_revision", responses=_UNKNOWN)
     async def revision_text(revision: OneRevision, bearer: Viewer) -> RevisionText:

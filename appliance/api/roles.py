@@ -9,7 +9,8 @@ from appliance.api.access import Bearer, Role
 from appliance.api.control import ControlLink
 from appliance.api.gate import BEARER
 from appliance.api.problems import ProblemError
-from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble
+from appliance.api.routing import Routes
+from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble, answer_to, operation_of
 from appliance.channel.answers.tokens import TokenRole, may
 
 _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token add`")
@@ -71,6 +72,29 @@ _PROBLEMS = {
 async def ask(control: ControlLink, request: AdminRequest[A], bearer: Bearer) -> A:
     """Control's answer. Raises `ProblemError` for a refusal, `ControlAwayError` when there is no control."""
     return answered(await control.ask(request, bearer))
+
+
+_LEAST: dict[str, Any] = {
+    "viewer": Viewer,
+    "investigator": Investigator,
+    "operator": Operator,
+    "admin": Admin,
+}
+
+
+def add_look(routes: Routes, control: ControlLink, question: type[AdminRequest[Any]]) -> None:
+    """Add the route of a question that has no fields: its path, role, answer and words are those of the request."""
+    operation = operation_of(question())
+    assert operation is not None  # noqa: S101  it has `@rest`
+    path = operation.path.removeprefix(routes.prefix)
+
+    async def look(bearer: Bearer) -> Any:
+        return await ask(control, question(), bearer)
+
+    look.__doc__ = question.__doc__
+    look.__name__ = operation.path.rpartition("/")[2]
+    look.__annotations__ = {"bearer": _LEAST[operation.role or ""], "return": answer_to(question)}
+    routes.add_api_route(path, look, operation_id=operation.path.removeprefix("/v1/").replace("/", "_"))
 
 
 def answered(answer: AdminAnswer[A]) -> A:

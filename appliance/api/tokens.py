@@ -8,11 +8,11 @@ from typing import Annotated
 
 from fastapi import Path
 
-from appliance.api.roles import Admin, ask
+from appliance.api.roles import Admin, add_look, ask
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.channel.admin import TokenList, TokenRevoke
-from appliance.channel.answers.tokens import Token, Tokens
+from appliance.channel.answers.tokens import Token
 
 _UNKNOWN: Responses = {422: {"description": "There is no token of this name that can be used."}}
 
@@ -20,11 +20,7 @@ _UNKNOWN: Responses = {422: {"description": "There is no token of this name that
 def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1/tokens", tags=["tokens"])
-
-    @router.get("")
-    async def tokens(bearer: Admin) -> Tokens:
-        """All access tokens that were made, without their secrets; for admins."""
-        return await ask(services.control, TokenList(), bearer)
+    add_look(router, services.control, TokenList)
 
     @router.delete("/{name}", responses=_UNKNOWN)
     async def revoke_token(

@@ -4,12 +4,12 @@ from typing import Annotated, cast
 
 import msgspec
 
-from appliance.api.roles import Viewer, ask
+from appliance.api.roles import Viewer, add_look
 from appliance.api.routing import Routes
 from appliance.api.services import Services
 from appliance.channel.admin import ChallengeWanted
 from appliance.channel.answers.field_docs import Moment, told
-from appliance.channel.answers.tokens import Challenge, TokenRole
+from appliance.channel.answers.tokens import TokenRole
 
 
 class Holder(msgspec.Struct, frozen=True):
@@ -29,9 +29,5 @@ def routes(services: Services) -> Routes:
         """The name and role of the token that asks, and when it ends."""
         return Holder(bearer.name, cast(TokenRole, bearer.role.name.lower()), bearer.expires)
 
-    @router.get("/challenge")
-    async def challenge(bearer: Viewer) -> Challenge:
-        """A challenge: an order that changes something is signed under one, and each is good once."""
-        return await ask(services.control, ChallengeWanted(), bearer)
-
+    add_look(router, services.control, ChallengeWanted)
     return router

@@ -101,7 +101,7 @@ def verb_of(request: AdminRequest[Any]) -> str:
 
 @rest("viewer", "GET", "/v1/status")
 class StatusWanted(AdminRequest[status.Status], frozen=True, tag="status"):
-    """Processes, policy, registry, relay, firewall: what `rosrv status` shows."""
+    """The running appliance: processes, isolation, policy, graph, audit log."""
 
 
 @rest("viewer", "GET", "/v1/inventory")
@@ -152,7 +152,7 @@ class PolicyWanted(AdminRequest[policy.PolicyKnown], frozen=True, tag="policy"):
 
 @rest("viewer", "GET", "/v1/policy/revisions")
 class PolicyRevisions(AdminRequest[policy.PolicyRevisionList], frozen=True, tag="policy revisions"):
-    """The kept revisions."""
+    """The kept revisions, the newest first."""
 
 
 @rest("viewer")
@@ -162,7 +162,7 @@ class RegistrationsWanted(AdminRequest[graph.Registrations], frozen=True, tag="r
 
 @rest("viewer", "GET", "/v1/graph")
 class GraphWanted(AdminRequest[graph.Graph], frozen=True, tag="graph"):
-    """Nodes, topics and services with who is connected to whom and how much flows."""
+    """Nodes, topics and services, who is mediated, and rates."""
 
 
 @rest("operator", "GET", "/v1/messages", ("topic", "messages", "seconds", "latched"))
@@ -363,7 +363,7 @@ class TokenAdd(AdminRequest[tokens.NewToken], frozen=True, tag="token add"):
 
 @rest("admin", "GET", "/v1/tokens")
 class TokenList(AdminRequest[tokens.Tokens], frozen=True, tag="token list"):
-    """All tokens that were made, without their secrets."""
+    """All access tokens that were made, without their secrets; for admins."""
 
 
 @rest("admin", "DELETE", "/v1/tokens/{name}")
@@ -527,7 +527,7 @@ class EvidenceExported(WaitingRequest[evidence.Sealed], frozen=True, tag="eviden
 
 @rest("viewer", "GET", "/v1/challenge")
 class ChallengeWanted(AdminRequest[tokens.Challenge], frozen=True, tag="challenge"):
-    """A challenge, under which the next order over REST is signed."""
+    """A challenge: an order that changes something is signed under one, and each is good once."""
 
 
 OPERATIONS = tuple(operation for operations in _OPERATIONS.values() for operation in operations)
