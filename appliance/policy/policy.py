@@ -18,7 +18,7 @@ from appliance.policy.hosts import Atom, HostTable, Network, canonical_address
 from appliance.policy.keys import Key, is_parameter_key
 from appliance.policy.limits import NO_LIMIT, LimitRule, LimitTable, Part, Rate
 from appliance.policy.model import Address, Category, Decision, Request, Rule
-from appliance.policy.sections import BY_CATEGORY, PARAMETERS, PHRASES
+from appliance.policy.sections import BY_CATEGORY, PARAMETERS
 from appliance.policy.tree import KeyTree
 from appliance.ros.names import is_global_name
 
@@ -265,7 +265,7 @@ class Policy:
     def _without_section(self, request: Request, table: RuleTable) -> Decision:
         decider = BY_CATEGORY[request.category]
         if decider.extension:
-            deed = f"{PHRASES[request.category]} {_shortened(request.resource)}"
+            deed = f"{decider.phrases[request.category]} {_shortened(request.resource)}"
             return Decision(True, None, f"no [{decider.name}] section: every host may {deed}")
         reason = f"{_what(request, 'may not')}: the policy has no [{decider.name}] section, so nobody may"
         return _decided(False, None, reason, table.audit_only)
@@ -285,7 +285,7 @@ def _decided(allowed: bool, rule: Rule | None, reason: str, audit_only: bool) ->
 
 
 def _what(request: Request, may: str) -> str:
-    phrase = PHRASES[request.category]
+    phrase = BY_CATEGORY[request.category].phrases[request.category]
     return f"{canonical_address(request.host)} {may} {phrase} {_shortened(request.resource)}"
 
 

@@ -1,5 +1,6 @@
 """The sections of a policy file, one row each; to add one, add its row."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from appliance.policy.model import Category
@@ -7,25 +8,34 @@ from appliance.policy.model import Category
 
 @dataclass(frozen=True, slots=True)
 class Decider:
-    """A section that decides requests of one or more categories.
+    """A section that decides requests of the categories in `phrases`: what each does, before the name of the resource.
 
     `extension` sections grant everything to everybody when they are missing (the thesis knows nothing of
     them); all others then grant nothing.
     """
 
     name: str
-    categories: tuple[Category, ...]
+    phrases: Mapping[Category, str]
     extension: bool = False
+
+    @property
+    def categories(self) -> tuple[Category, ...]:
+        """What it decides."""
+        return tuple(self.phrases)
 
 
 DECIDERS = (
-    Decider("Nodes", (Category.NODE,)),
-    Decider("Publishers", (Category.PUBLISH,)),
-    Decider("Subscribers", (Category.SUBSCRIBE,)),
-    Decider("Commands", (Category.COMMAND,)),
-    Decider("Services", (Category.OFFER,), extension=True),
-    Decider("Clients", (Category.CALL,), extension=True),
-    Decider("Parameters", (Category.READ, Category.WRITE), extension=True),
+    Decider("Nodes", {Category.NODE: "use the node name"}),
+    Decider("Publishers", {Category.PUBLISH: "publish"}),
+    Decider("Subscribers", {Category.SUBSCRIBE: "subscribe to"}),
+    Decider("Commands", {Category.COMMAND: "call"}),
+    Decider("Services", {Category.OFFER: "offer the service"}, extension=True),
+    Decider("Clients", {Category.CALL: "call the service"}, extension=True),
+    Decider(
+        "Parameters",
+        {Category.READ: "read the parameter", Category.WRITE: "write the parameter"},
+        extension=True,
+    ),
 )
 
 BY_CATEGORY = {category: decider for decider in DECIDERS for category in decider.categories}
@@ -39,15 +49,3 @@ DEFAULT = "default"
 GROUPS, PORTS, MONITOR, LIMITS, OPTIONS = "Groups", "Ports", "Monitor", "Limits", "Options"
 
 NAMES = (GROUPS, PORTS, MONITOR, *(decider.name for decider in DECIDERS), LIMITS, OPTIONS)
-
-PHRASES = {
-    Category.NODE: "use the node name",
-    Category.PUBLISH: "publish",
-    Category.SUBSCRIBE: "subscribe to",
-    Category.COMMAND: "call",
-    Category.OFFER: "offer the service",
-    Category.CALL: "call the service",
-    Category.READ: "read the parameter",
-    Category.WRITE: "write the parameter",
-}
-"""What a request does, for the sentence of a decision; the resource follows."""

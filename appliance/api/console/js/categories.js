@@ -1,9 +1,13 @@
-/** What a host asks the policy for: the category of a decision, and what whoever asks wants to do. */
+/** What a host asks the policy for: the category of a decision, what whoever asks wants to do, the letter of the graph. */
 
-export const CATEGORIES = /** @type {[string, string][]} */ ([
-  ["publish", "publish a topic"], ["subscribe", "subscribe to a topic"], ["offer", "offer a service"], ["call", "call a service"],
-  ["command", "make a call"], ["node", "use a node name"], ["read", "read a parameter"], ["write", "write a parameter"],
+export const CATEGORIES = /** @type {[string, string, string][]} */ ([
+  ["publish", "publish a topic", "t"], ["subscribe", "subscribe to a topic", "t"], ["offer", "offer a service", "s"],
+  ["call", "call a service", "s"], ["command", "make a call", "t"], ["node", "use a node name", "n"],
+  ["read", "read a parameter", "t"], ["write", "write a parameter", "t"],
 ]);
+
+/** @param {string | null | undefined} category */
+export const letterOf = (category) => CATEGORIES.find(([word]) => word === category)?.[2] ?? "t";
 
 /** @param {string} category */
 export const isDecided = (category) => CATEGORIES.some(([word]) => word === category);

@@ -13,6 +13,8 @@
  * @typedef {{items: Map<string, Item>, lines: Map<string, Line>}} Model
  */
 
+import { letterOf } from "../categories.js";
+
 export const MASTER = "m/";
 const QUIET = new Set(["/rosout", "/rosout_agg", "/clock", "/statistics", "/diagnostics"]);
 const ATTEMPTS = 60;
@@ -75,7 +77,7 @@ function attemptOf(/** @type {Model} */ model, /** @type {{key: string, command:
   const { host, caller_id: caller, category, event, resource } = attempt.records[0];
   const known = model.items.get(`n${caller}`);
   const from = known && known.sub === host ? known.key : `x${caller ?? ""}@${host}`;
-  const to = attempt.command ? MASTER : `${category === "offer" || category === "call" ? "s" : category === "node" ? "n" : "t"}${resource}`;
+  const to = attempt.command ? MASTER : `${letterOf(category)}${resource}`;
   // What the party does have now was refused only for a moment (a call that came late): it is no attempt.
   if (model.lines.has(`${from}>${to}`) || model.lines.has(`${to}>${from}`)) return;
   if (!model.items.has(from)) put(model, { key: from, kind: "party", name: caller || "no name", sub: host ?? "" });

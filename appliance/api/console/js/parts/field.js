@@ -2,7 +2,7 @@
 
 import { html, useId } from "../html.js";
 
-/** @param {{label: string, hint?: any, type?: string, value: any, set: (value: string) => void, options?: [string, string][], rows?: number, mono?: boolean, [more: string]: any}} given */
+/** @param {{label: string, hint?: any, type?: string, value: any, set: (value: string) => void, options?: [string, string, ...string[]][], rows?: number, mono?: boolean, [more: string]: any}} given */
 export function Field({ label, hint, type = "text", value, set, options, rows, mono = false, ...more }) {
   const id = useId();
   const common = {
