@@ -9,9 +9,13 @@ def write_whole(path: Path, data: bytes, mode: int) -> None:
     making = path.with_name(path.name + ".new")
     making.unlink(missing_ok=True)
     descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        os.fchmod(descriptor, mode)  # whatever the mask is: the folder says who comes by
-        file.write(data)
-        file.flush()
-        os.fsync(descriptor)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            os.fchmod(descriptor, mode)  # whatever the mask is: the folder says who comes by
+            file.write(data)
+            file.flush()
+            os.fsync(descriptor)
+    except OSError as error:  # a full disk: the system does not say of which file
+        error.filename = str(path)
+        raise
     making.rename(path)

@@ -2,11 +2,13 @@
 
 import os
 import stat
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from appliance.whole_files import write_whole
+from tests.support.requirements import need_root
 
 
 def test_a_file_is_replaced_with_the_mode_that_is_said(tmp_path: Path) -> None:
@@ -31,3 +33,14 @@ def test_what_cannot_be_written_leaves_the_file_before(tmp_path: Path) -> None:
     with pytest.raises(OSError, match=r"position\.new"):
         write_whole(path, b"after", 0o600)
     assert path.read_text() == "before"
+
+
+def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:
+    """The system says only that there is no space: who reads it learns where to make room."""
+    need_root()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4k", "rosrv-files-test", tmp_path], check=True)
+    try:
+        with pytest.raises(OSError, match=r"No space left.*audit\.pub"):
+            write_whole(tmp_path / "audit.pub", bytes(8192), 0o644)
+    finally:
+        subprocess.run(["umount", "--lazy", tmp_path], check=True)
