@@ -98,6 +98,7 @@ EVENTS: dict[str, str] = {
     "disk has room": "There is more than the reserve on the log's disk again.",
     "clock not synchronised": "No time service keeps the machine's clock: the times of records may be wrong.",
     "clock synchronised": "A time service keeps the machine's clock again.",
+    "clock set forward": "The machine's clock went further than time has passed; `detail` has by how many seconds.",
     "clock set back": "The machine's clock stands before the last record; `detail` has by how many seconds.",
     "log failed": "The log could not be written for a time, and can be again; `reason` says why.",
 }

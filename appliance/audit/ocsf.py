@@ -155,6 +155,7 @@ KINDS: dict[str, Kind] = {
     "disk has room": Kind(FINDING, _CLOSED, about="the audit log's disk is nearly full"),
     "clock not synchronised": Kind(FINDING, _FOUND, _DETECTED, "the clock is not synchronised"),
     "clock synchronised": Kind(FINDING, _CLOSED, about="the clock is not synchronised"),
+    "clock set forward": Kind(FINDING, _FOUND, _DETECTED),
     "clock set back": Kind(FINDING, _FOUND, _DETECTED),
     "log failed": Kind(LOG, _LOG_RESTART),
 }

@@ -1,10 +1,12 @@
 """Whether the times of the records can be believed: for status, metrics, and the log itself. It blocks nothing.
 
-Two things are looked at: whether a time service keeps the machine's clock (the supervisor tells), and whether the clock
-stands before the last record of the log, which it does after it was set back, also while the appliance was off.
+Three things are looked at: whether a time service keeps the machine's clock (the supervisor tells), whether the clock
+stands before the last record of the log, which it does after it was set back, also while the appliance was off, and
+whether it went further than time has passed.
 """
 
 import asyncio
+import time
 from collections.abc import Callable
 
 from appliance.audit.record import Severity
@@ -18,11 +20,19 @@ _STEP_SECONDS = 2.0  # less is what a time service mends
 class Clock:
     """Records each change once. `behind()` is how many seconds the clock stands before the last record; else 0."""
 
-    def __init__(self, trail: AuditTrail, behind: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        trail: AuditTrail,
+        behind: Callable[[], float],
+        started: Callable[[], float] = lambda: time.time() - time.clock_gettime(time.CLOCK_BOOTTIME),
+    ) -> None:
+        """`started()` is when the machine was started, by its clock as it is now (seconds since the epoch)."""
         self._trail = trail
         self._behind = behind
         self._synchronised: bool | None = None
         self._set_back = False
+        self._started = started
+        self._seen = started()
 
     def told(self, synchronised: bool | None) -> None:
         """What the supervisor sees now; None: it cannot."""
@@ -43,13 +53,22 @@ class Clock:
         return ClockState(self._synchronised, behind if behind > _STEP_SECONDS else 0.0)
 
     async def watch(self) -> None:
-        """Look every ten seconds whether it was set back."""
+        """Look every ten seconds whether it was set."""
         while True:
             self.look()
             await asyncio.sleep(_LOOK_SECONDS)
 
     def look(self) -> None:
-        """Record it, once, when the clock was set back; it may be again when it has caught up."""
+        """Record each step forward, and once that it was set back; it may be again when it has caught up."""
+        before, self._seen = self._seen, self._started()
+        ahead = self._seen - before
+        if ahead > _STEP_SECONDS:
+            self._trail.happened(
+                "clock set forward",
+                f"the machine's clock went {ahead:.0f} s further than time has passed",
+                severity=Severity.WARNING,
+                seconds=round(ahead, 3),
+            )
         behind = self.state().behind_seconds
         if behind and not self._set_back:
             self._trail.happened(

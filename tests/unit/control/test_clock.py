@@ -53,3 +53,12 @@ def test_a_clock_that_was_set_back_is_recorded_once(trail: Trail) -> None:
         clock.look()
     assert trail.events == ["clock set back"] * 2
     assert clock.state().behind_seconds == 90.0
+
+
+def test_each_step_forward_is_recorded(trail: Trail) -> None:
+    """Between two records more time seems to have passed than has: who reads them is told; a second is no step."""
+    started = [1000.0]
+    clock = Clock(cast(AuditTrail, trail), lambda: 0.0, lambda: started[0])
+    for started[0] in (1000.0, 1001.0, 4600.0, 4600.0, 1000.0, 1003.0):
+        clock.look()
+    assert trail.events == ["clock set forward"] * 2
