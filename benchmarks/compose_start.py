@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 from examples.landshark.lab import Lab
-from tests.support.docker import APPLIANCE, BASE, DEMO, Compose, Engine, images, project
+from tests.support.docker import APPLIANCE, BASE, DEMO, Compose, Engine, build_images, project
 
 RUNS = 5
 READY = "Nodes may connect"
@@ -40,7 +40,8 @@ def stop(compose: Compose) -> float:
 def main() -> None:
     """Measure and print."""
     runs = int(sys.argv[1]) if len(sys.argv) > 1 else RUNS
-    with images(), Lab("rosrv-bench") as lab, Engine(lab.host("machine", "10.79.0.1/24")) as engine:
+    build_images()
+    with Lab("rosrv-bench") as lab, Engine(lab.host("machine", "10.79.0.1/24")) as engine:
         sizes = {name: int(engine.inspect(name)["Size"]) / 1e6 for name in (BASE, APPLIANCE, DEMO)}
         with tempfile.TemporaryDirectory() as directory:
             compose = engine.compose(project(Path(directory)), "bench")

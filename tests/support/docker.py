@@ -1,10 +1,10 @@
 """A Docker engine of the tests' own: started, used and ended here, beside whatever else the machine runs.
 
-    with Lab("rosrv-engine") as lab, images():
-        with Engine(lab.host("machine", "10.79.0.1/24")) as engine:
-            engine.docker("ps")
-            compose = engine.compose(project_directory, "rosrv")
-            compose("up", "--detach")
+    build_images()
+    with Lab("rosrv-engine") as lab, Engine(lab.host("machine", "10.79.0.1/24")) as engine:
+        engine.docker("ps")
+        compose = engine.compose(project_directory, "rosrv")
+        compose("up", "--detach")
 
 The engine lives on a host of the lab: that is the machine that the product's containers run on, and the engine's
 bridges and rules are in the namespace of that host, not in this machine's. Images are built before, by an engine in
@@ -324,14 +324,12 @@ class Compose:
         return self("--profile", "demo", "logs", "--no-color", "--tail", "40", check=False).stdout
 
 
-@contextlib.contextmanager
-def images() -> Iterator[None]:
+def build_images() -> None:
     """Have the images of the appliance and of the demonstration, built from this checkout as it is."""
     with builder() as engine:
         engine.build("appliance", APPLIANCE)
         engine.build("demo", DEMO)
         engine.docker("image", "prune", "--force", "--filter", "until=24h")
-    yield
 
 
 @contextlib.contextmanager

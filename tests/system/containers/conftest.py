@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from examples.landshark.lab import Host, Lab
-from tests.support.docker import Compose, Engine, images, project
+from tests.support.docker import Compose, Engine, build_images, project
 from tests.support.requirements import need_root
 
 
@@ -25,11 +25,17 @@ class Site:
         return self.engine.story()
 
 
-@pytest.fixture(scope="module")
-def site() -> Iterator[Site]:
-    """The engine, with the images built from this checkout; its data is for one, so it ends with the module."""
+@pytest.fixture(scope="session")
+def images() -> None:
+    """The images, built from this checkout."""
     need_root()
-    with images(), Lab("rosrv-engine") as lab:
+    build_images()
+
+
+@pytest.fixture(scope="module")
+def site(images: None) -> Iterator[Site]:
+    """The engine, with the images; its data is for one, so it ends with the module."""
+    with Lab("rosrv-engine") as lab:
         machine, laptop = lab.host("machine", "10.79.0.1/24"), lab.host("laptop", "10.79.0.50/24")
         with Engine(machine) as engine:
             yield Site(engine, machine, laptop)
