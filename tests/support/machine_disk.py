@@ -24,7 +24,7 @@ GIGABYTES = 4  # the file is sparse
 # A machine that is booted needs these beside what the project names in packages.txt; without a network it has what a
 # kit would install (curl), too.
 _MACHINES_OWN = ("systemd-sysv", "udev", "kmod", "procps", "openssl", "tcpdump", "curl")
-_COMPILERS = ("g++", "pkg-config")  # and every -dev package: what the tests compile comes with the checkout
+_COMPILERS = ("g++", "pkg-config")  # and every -dev package: nodes in the machine are rospy's
 # Of the environment: large, and for other tests.
 _NOT_IN_THE_MACHINE = ("playwright", "mypy", "numpy", "numpy.libs", "networkx", "jsonschema_rs")
 _UNIT = """\
@@ -116,7 +116,7 @@ def _disk(name: str, kernel: Kernel, packages: tuple[str, ...], *, environment: 
 
 
 def checkout_archive(path: Path) -> None:
-    """Write the checkout as it stands, with what its tests have compiled, as a tar archive to `path`."""
+    """Write the checkout as it stands, with its Python files compiled, as a tar archive to `path`."""
     for folder in ("appliance", "tests"):
         _compile(ROOT / folder, as_if_in=ROOT / folder)
     listed = subprocess.run(
@@ -139,7 +139,6 @@ def checkout_archive(path: Path) -> None:
     names |= {
         str(code.relative_to(ROOT)) for one in ("appliance", "tests") for code in (ROOT / one).rglob("*.pyc")
     }
-    names |= {str(program.relative_to(ROOT)) for program in (ROOT / "build" / "tests").glob("*")}
     with tarfile.open(path, "w") as tar:
         for name in sorted(names):
             if (ROOT / name).is_file():
