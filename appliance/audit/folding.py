@@ -96,11 +96,14 @@ class Folder:
         if not self._settings.seconds:
             yield record
             return
-        plain = keepable(record)
         denial = record.decision == "deny" or record.event in self._settings.events
+        if not (denial or record.folds or (record.decision == "allow" and self._by_subject)):
+            yield record
+            return
+        plain = keepable(record)
         if denial or record.decision == "allow":
             yield from self._end_contradicted(plain)
-        if not (self._counted(plain, denial=denial, now=now) if denial or record.folds else False):
+        if not (denial or record.folds) or not self._counted(plain, denial=denial, now=now):
             yield record
 
     def _counted(self, record: Record, *, denial: bool, now: float) -> bool:

@@ -190,6 +190,8 @@ def measure(value: Value) -> tuple[int, int]:
     Level by level, because values may be large: those of a level that are numbers or texts cost next to nothing.
     Raises `ProtocolError` for `<nil/>`.
     """
+    if type(value) in _NUMBERS:
+        return _VALUE, 0
     weight, depth = 0, 0
     level: list[Value] = [value]
     while True:

@@ -127,7 +127,7 @@ class ParameterMirror:
         self.weight = measure(self.tree)[0]
         self.charges.recount(self.tree, final=final)
 
-    def _place_of(self, key: str) -> tuple[list[str], int]:
+    def _place_of(self, key: str) -> tuple[tuple[str, ...], int]:
         """The topmost key that is new, or another, when `key` is set; and what is there now, in bytes."""
         parts = parts_of(key)
         node: Value = self.tree
@@ -138,7 +138,7 @@ class ParameterMirror:
             if depth == len(parts) or not isinstance(node[part], dict):
                 return parts[:depth], member_weight(part, node[part])
             node = node[part]
-        return [], self.weight
+        return (), self.weight
 
     def _put_in(self, key: str, value: Value) -> None:
         parts = parts_of(key)
@@ -183,4 +183,5 @@ def _with_namespaces(key: str, first: int, weight: int) -> int:
     if not first:
         return weight
     *namespaces, name = parts_of(key)[first - 1 :]
-    return NAME_WEIGHT + len(name) + weight + sum(member_weight(part, {}) for part in namespaces)
+    whole = NAME_WEIGHT + len(name) + weight
+    return whole + sum(member_weight(part, {}) for part in namespaces) if namespaces else whole

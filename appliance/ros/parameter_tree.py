@@ -1,15 +1,17 @@
 """The tree of parameters as ROSMaster has it: what stands at a key, and in the way of one."""
 
 from collections.abc import Iterator
+from functools import lru_cache
 
 from appliance.ros.xmlrpc import Value
 
 Tree = dict[str, Value]
 
 
-def parts_of(key: str) -> list[str]:
-    """The segments of a key."""
-    return [part for part in key.split("/") if part]
+@lru_cache(256)
+def parts_of(key: str) -> tuple[str, ...]:
+    """The segments of a key; whoever sets it asks for them again and again."""
+    return tuple([part for part in key.split("/") if part])
 
 
 def holds_others(value: Value) -> bool:

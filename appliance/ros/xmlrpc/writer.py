@@ -108,7 +108,10 @@ def _write_base64(value: bytes, out: list[str], _depth: int) -> None:
 def _write_array(value: Sequence[Value], out: list[str], depth: int) -> None:
     out.append("<value><array><data>\n")
     for item in value:
-        _write(item, out, depth + 1)
+        if type(item) is str:  # as most are
+            out.append(f"<value><string>{_text(item)}</string></value>\n")
+        else:
+            _write(item, out, depth + 1)
     out.append("</data></array></value>\n")
 
 
