@@ -79,9 +79,8 @@ def test_a_policy_that_changed_while_the_appliance_was_down_holds_for_nodes_that
     listener.wait_for(event="received", publisher="/voice", since=after)
 
 
-@pytest.mark.parametrize("client", ["rospy", "roscpp"])
 def test_a_node_that_stood_still_over_a_reload_has_lost_what_the_policy_took(
-    lab: Lab, robot: Host, tmp_path: Path, client: Client
+    lab: Lab, robot: Host, tmp_path: Path
 ) -> None:
     """It is lost, the policy changes, it goes on: nothing of the topic goes through it until a rollback."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
@@ -94,18 +93,26 @@ def test_a_node_that_stood_still_over_a_reload_has_lost_what_the_policy_took(
         RosSession(appliance.master_uri, tmp_path, robot) as ros,
     ):
         listener = ros.listener("rospy", "/chatter")
-        voice = ros.talker(client, "/chatter", name="voice")
-        listener.wait_for(event="received")
-        voice.popen.send_signal(signal.SIGSTOP)
-        eventually(lambda: appliance.audit("--event", "node lost", caller_id="/voice"), "it is lost")
+        clients: list[Client] = ["rospy", "roscpp"]
+        voices = {
+            f"/{client}_voice": ros.talker(client, "/chatter", name=f"{client}_voice") for client in clients
+        }
+        for name, voice in voices.items():
+            listener.wait_for(event="received", publisher=name)
+            voice.popen.send_signal(signal.SIGSTOP)
+        for name in voices:
+            appliance.recorded("--event", "node lost", caller_id=name)
         appliance.reload(NO_CHATTER)
-        assert appliance.recorded("--event", "revoked", caller_id="/voice", resource="/chatter")
-        voice.popen.send_signal(signal.SIGCONT)
-        eventually(lambda: appliance.audit("--event", "node returned", caller_id="/voice"), "it is back")
-        assert "/voice" not in ros.run("rostopic", "info", "/chatter").stdout.partition("Subscribers")[0]
+        for name, voice in voices.items():
+            appliance.recorded("--event", "revoked", caller_id=name, resource="/chatter")
+            voice.popen.send_signal(signal.SIGCONT)
+        for name in voices:
+            appliance.recorded("--event", "node returned", caller_id=name)
+        assert "_voice" not in ros.run("rostopic", "info", "/chatter").stdout.partition("Subscribers")[0]
         appliance.rosrv("policy", "rollback")
         after = listener.mark()
-        listener.wait_for(event="received", publisher="/voice", since=after)
+        for name in voices:
+            listener.wait_for(event="received", publisher=name, since=after)
 
 
 def test_sighup_reads_the_policy_again(appliance: Appliance) -> None:

@@ -5,7 +5,7 @@ import os
 import signal
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
@@ -36,8 +36,8 @@ def specification(name: str, topic: str) -> str:
     return SPECIFICATION.replace("NAME", name).replace("TOPIC", topic)
 
 
-@contextmanager
-def two_relays() -> Iterator[Appliance]:
+@pytest.fixture(scope="module")
+def common_appliance() -> Iterator[Appliance]:
     """Two relays, and a monitor for each: `left` on /left, `right` on /right."""
     needs(has_ros(), "ROS 1 and g++ (run `make setup`)")
     with tempfile.TemporaryDirectory(prefix="rosrv-relays-") as name:
@@ -51,17 +51,13 @@ def two_relays() -> Iterator[Appliance]:
 
 
 @pytest.fixture
-def appliance() -> Iterator[Appliance]:
-    """One of its own for a test that loads, or ends a process."""
-    with two_relays() as appliance:
-        yield appliance
-
-
-@pytest.fixture(scope="module")
-def common_appliance() -> Iterator[Appliance]:
-    """One for the tests in which only nodes come and go."""
-    with two_relays() as appliance:
-        yield appliance
+def appliance(common_appliance: Appliance) -> Iterator[Appliance]:
+    """The same for a test that loads, or ends a process: both monitors begin anew after it, and the log is its own."""
+    common_appliance.leave_out_what_was()
+    yield common_appliance
+    for name in rows(common_appliance):
+        common_appliance.rosrv("monitor", "remove", name)
+    common_appliance.rosrv("monitor", "reload")
 
 
 @pytest.fixture
