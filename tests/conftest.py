@@ -123,10 +123,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """`-n auto`: more than there are cores, at least two, for all wait much; unit tests most of the time."""
-    cores = len(os.sched_getaffinity(0))
-    units_only = all("tests/unit" in argument for argument in config.args)
-    return 2 * cores if units_only else max(2, 3 * cores // 2)
+    """`-n auto`: twice as many as there are cores, for all wait much."""
+    return 2 * len(os.sched_getaffinity(0))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -34,6 +34,7 @@ from appliance.evidence.bundle import VERIFIER, BundleError, Span, export
 from tests.support.answers import example
 from tests.support.audit import decision, settle
 from tests.support.control_parts import OPEN
+from tests.support.examples import examples
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import await_removal, make_old
 from tests.unit.evidence.conftest import LENGTHS, NUMBERS, Control
@@ -151,7 +152,7 @@ def test_every_change_of_a_member_is_named(bundle: Path, tmp_path: Path, reviewe
     """Every byte of small members and a sample of the others, made another one: each time the member is named."""
     members, chance = members_of(bundle), random.Random(5)  # noqa: S311  the same each time
     for name, data in members.items():
-        places = range(len(data)) if len(data) <= 40 else chance.sample(range(len(data)), 12)
+        places = range(len(data)) if len(data) <= 40 else chance.sample(range(len(data)), examples(12))
         for place in places:
             other = bytes([data[place] ^ (1 << chance.randrange(8))])
             changed = data[:place] + other + data[place + 1 :]
@@ -261,7 +262,7 @@ def test_a_file_that_is_cut_or_damaged_is_never_right(
     with zipfile.ZipFile(bundle) as archive:
         frame = [*range(archive.start_dir - 24, len(whole))]
         frame += [one.header_offset + byte for one in archive.infolist() for byte in range(50)]
-    for position in chance.sample(range(len(whole)), 30) + chance.sample(frame, 120):
+    for position in chance.sample(range(len(whole)), examples(30)) + chance.sample(frame, examples(120)):
         place.write_bytes(whole[:position] + bytes([whole[position] ^ 0x20]) + whole[position + 1 :])
         if not reviewer.status(place):
             assert members_of(place) == members
