@@ -116,3 +116,10 @@ def test_name_of_another_machines_node(appliance: Appliance, ros: RosSession, se
     assert answer[0] == 0
     after = listener.wait_for(event="received", since=listener.mark())
     assert after["data"].startswith("mine")
+
+
+def test_rest_can_be_off(appliance: Appliance) -> None:
+    """With `--api off` there is no process, no port, no token."""
+    assert appliance.ready["api"] is None
+    assert "token" not in appliance.ready
+    assert appliance.pids("api") == []

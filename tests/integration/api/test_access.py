@@ -24,6 +24,12 @@ READS = (
 )  # fmt: skip
 
 
+@pytest.fixture
+def rest(running: Appliance) -> Rest:
+    """REST as the holder of the first token, where it is now: a test starts the appliance anew."""
+    return running.rest()
+
+
 def new_token(appliance: Appliance, name: str, role: str, expires: str = "1h") -> str:
     """A token, made as an operator makes one."""
     made = appliance.rosrv("token", "add", name, "--role", role, "--expires", expires, "--json").stdout
@@ -182,20 +188,6 @@ def test_a_flood_of_one_host_is_slowed_down(tmp_path: Path) -> None:
         assert int(refused[0].headers["retry-after"]) >= 1
 
 
-def test_the_first_token_is_shown_once(tmp_path: Path) -> None:
-    """With --json it is in the ready line of the first start and of no other; it works after a restart."""
-    with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off")) as appliance:
-        token = appliance.ready["token"]
-        assert list(appliance.ready) == ["event", "master", "api", "revision", "token"]
-        assert appliance.stop() == 0
-        appliance.start()
-        assert "token" not in appliance.ready
-        assert appliance.rest(token).get("/v1/status").status == 200
-        for file in appliance.state.rglob("*"):
-            if file.is_file() and not file.is_socket():
-                assert token.split("_", 2)[2].encode() not in file.read_bytes(), file
-
-
 def test_without_json_the_first_token_is_in_a_file(tmp_path: Path) -> None:
     """Beside the one line for scripts, the path is printed; the file is its owner's only, the token an admin's."""
     with Appliance(options=("--api", "127.0.0.1:0", "--api-tls", "off"), json=False) as appliance:
@@ -223,14 +215,6 @@ def test_clear_text_stays_on_loopback(tmp_path: Path) -> None:
             appliance.start()
     finally:
         appliance.close()
-
-
-def test_rest_can_be_off() -> None:
-    """With `--api off` there is no process, no port, no token."""
-    with Appliance(options=("--api", "off")) as appliance:
-        assert appliance.ready["api"] is None
-        assert "token" not in appliance.ready
-        assert appliance.pids("api") == []
 
 
 def test_slow_clients_are_cut_off_and_others_served(rest: Rest) -> None:
@@ -275,3 +259,16 @@ def test_who_polls_is_not_sent_again_what_he_has(running: Appliance, rest: Rest)
         "--event", "rest call", "--topic", "*healthz"
     )  # those that were refused are recorded
     assert [one for one in probes if one["detail"]["status"] in (200, 304)] == []
+
+
+def test_the_first_token_is_shown_once(running: Appliance) -> None:
+    """With --json it is in the ready line of the first start and of no other; it works after a restart."""
+    token = running.ready["token"]
+    assert list(running.ready) == ["event", "master", "api", "revision", "token"]
+    assert running.stop() == 0
+    running.start()
+    assert "token" not in running.ready
+    assert running.rest(token).get("/v1/status").status == 200
+    for file in running.state.rglob("*"):
+        if file.is_file() and not file.is_socket():
+            assert token.split("_", 2)[2].encode() not in file.read_bytes(), file
