@@ -38,7 +38,14 @@ static:
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-unit:
+# Once after a clone: the workers, which all begin with the same files, would each compile every test. What is wrong with
+# a test is said when it is to run.
+build/collected:
+	mkdir -p build
+	$(PYTEST) tests/unit tests/integration tests/proofs --collect-only --quiet > /dev/null || true
+	touch $@
+
+unit: build/collected
 	$(PYTEST) tests/unit $(addprefix --ignore=,$(LONG_UNIT)) -n auto --quiet
 
 test: check ## check, the long unit tests, and those with real ROS nodes (root: they make network namespaces)
