@@ -53,18 +53,37 @@ def test_a_certificate_is_on_the_list_until_it_has_ended(store: StateStore) -> N
     assert {row.serial for row in revoked.listed({"a"})} == {"a1", "a2"}
 
 
+def test_a_clock_that_stood_too_late_lets_no_certificate_in_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody set the wrong year, and then the right one: what was revoked is on the list, also after a restart."""
+    now = time.time()
+    store = StateStore(tmp_path, failed=pytest.fail)
+    RevokedCertificates(store.hosts).add("a", "a1", now + DAY)
+    with monkeypatch.context() as patched:
+        patched.setattr(time, "time", lambda: now + 366 * DAY)
+        revoked = RevokedCertificates(store.hosts)
+        revoked.forget_ended()
+        assert revoked.listed({"a"}) == []
+        assert revoked.missing({"a"}) == revoked.wait_for_room({"a"}) == 0
+    store.close()
+    again = StateStore(tmp_path, failed=pytest.fail)
+    assert [row.serial for row in RevokedCertificates(again.hosts).listed({"a"})] == ["a1"]
+    again.close()
+
+
 def test_what_is_revoked_is_kept_over_restarts(tmp_path: Path) -> None:
-    """And what has ended is in the state no more; one whose end was not noted counts as long as there may be one."""
+    """And what ended long since is not; one whose end was not noted counts as long as there may be one."""
     now = time.time()
     first = StateStore(tmp_path, failed=pytest.fail)
     revoked = RevokedCertificates(first.hosts)
     revoked.add("a", "a1", now + DAY)
-    revoked.add("a", "a2", now - 2 * DAY)
+    revoked.add("a", "a2", now - 401 * DAY)
     first.close()
     with contextlib.closing(sqlite3.connect(tmp_path / "state.db")) as database, database:
         for serial, moment in (
             ("b1", now - 10 * DAY),
-            ("b2", now - 400 * DAY),
+            ("b2", now - 800 * DAY),
         ):  # as a version before has written
             database.execute("INSERT INTO revoked_certificate VALUES (?, ?)", (serial, moment))
     second = StateStore(tmp_path, failed=pytest.fail)
