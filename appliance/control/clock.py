@@ -65,7 +65,7 @@ class Clock:
         if ahead > _STEP_SECONDS:
             self._trail.happened(
                 "clock set forward",
-                f"the machine's clock went {ahead:.0f} s further than time has passed",
+                f"the machine's clock went {ahead:.0f} s further than time has passed; that of monitors did not",
                 severity=Severity.WARNING,
                 seconds=round(ahead, 3),
             )

@@ -77,7 +77,7 @@ def test_samples_grow_in_time_when_the_clock_is_set_back(monkeypatch: Any) -> No
     async def scenario() -> list[float]:
         history = History(measures)
         await _running(history, len(times))
-        return [one.time for one in history.samples(1000) if one.time < 1020.0]
+        return [one.time for one in history.samples(1000) if one.time != 1020.0]
 
     assert asyncio.run(scenario()) == [1005.0, 1015.0]
 
