@@ -11,7 +11,9 @@ nearest that is one. Relative paths in the file are relative to the file's folde
 working directory.
 """
 
+import dataclasses
 import difflib
+import functools
 import re
 import sys
 import typing
@@ -21,9 +23,12 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from appliance.config import Settings
+
+if typing.TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 DEFAULT_FILE = Path("appliance.yaml")
 _PREFIX = "ROSRV_"
@@ -41,7 +46,7 @@ _SHORT_NAMES: dict[str, KeyPath] = {
     "ROSRV_RELAY": ("relaying",),  # as --relay; with a table it is the section, like any other
 }
 _FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
-_Model = typing.TypeVar("_Model", bound=BaseModel)
+_Section = typing.TypeVar("_Section", bound="DataclassInstance")
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,27 @@ class ConfigError(Exception):
 def _line_of(mistake: Mistake) -> int:
     line = mistake.place.rpartition(":")[2]
     return int(line) if line.isdigit() else sys.maxsize
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON schema of `appliance.yaml`."""
+    return _reader().json_schema()
+
+
+def read(values: Mapping[str, Any]) -> Settings:
+    """The settings that such a file has. Raises `pydantic.ValidationError`."""
+    return _reader().validate_python(values)
+
+
+def plain(settings: Settings) -> dict[str, Any]:
+    """The settings as such a file has them."""
+    found: dict[str, Any] = _reader().dump_python(settings, mode="json")
+    return found
+
+
+@functools.cache
+def _reader() -> TypeAdapter[Settings]:
+    return TypeAdapter(Settings)
 
 
 def resolve(file: Path | None, environment: Mapping[str, str], flags: Mapping[str, Any]) -> Settings:
@@ -143,7 +169,7 @@ class _Gathered:
 
     def settings(self) -> Settings:
         try:
-            settings = Settings.model_validate(self._values)
+            settings = read(self._values)
         except ValidationError as error:
             for detail in error.errors(include_url=False):
                 self._mistakes.append(
@@ -186,7 +212,7 @@ class _Gathered:
         if kind == "invalid_key":
             path = (*path[:-1], str(path[-1]))
         place = self._place_of(path)
-        if kind in ("extra_forbidden", "invalid_key"):
+        if kind in ("unexpected_keyword_argument", "invalid_key"):
             return Mistake(place, _unknown_key(path))
         if kind == "missing":
             return Mistake(place, f"{_dotted(path)} must be given")
@@ -234,16 +260,20 @@ def _unknown_key(path: KeyPath) -> str:
     return f"unknown key {_dotted(path)}: {advice}"
 
 
-def _with_absolute_paths(section: _Model) -> _Model:
+def _with_absolute_paths(section: _Section) -> _Section:
     """A copy in which no path depends on the working directory."""
     changes: dict[str, Any] = {}
-    for key in type(section).model_fields:
+    for key in (field.name for field in dataclasses.fields(section)):
         value = getattr(section, key)
         if isinstance(value, Path):
             changes[key] = value.absolute()
-        elif isinstance(value, BaseModel) and (absolute := _with_absolute_paths(value)) != value:
+        elif (
+            dataclasses.is_dataclass(value)
+            and not isinstance(value, type)
+            and (absolute := _with_absolute_paths(value)) != value
+        ):
             changes[key] = absolute
-    return section.model_copy(update=changes) if changes else section
+    return dataclasses.replace(section, **changes) if changes else section
 
 
 def _resolve_path(values: dict[str, Any], path: tuple[str, ...], folder: Path) -> None:
@@ -258,24 +288,23 @@ def _resolve_path(values: dict[str, Any], path: tuple[str, ...], folder: Path) -
         values[key] = str(folder / values[key])
 
 
-def _keys_at(model: type[BaseModel], path: KeyPath) -> set[str]:
+def _keys_at(section: type, path: KeyPath) -> set[str]:
     for key in path:
-        if isinstance(key, int):
-            continue
-        model = _section_of(model.model_fields[key].annotation) or model
-    return set(model.model_fields)
+        if not isinstance(key, int):
+            section = _section_of(typing.get_type_hints(section)[key]) or section
+    return set(typing.get_type_hints(section))
 
 
-def _all_keys(model: type[BaseModel], path: KeyPath) -> Iterator[KeyPath]:
-    for name, field in model.model_fields.items():
+def _all_keys(section: type, path: KeyPath) -> Iterator[KeyPath]:
+    for name, annotation in typing.get_type_hints(section).items():
         yield (*path, name)
-        section = _section_of(field.annotation)
-        if section is not None:
-            yield from _all_keys(section, (*path, name))
+        below = _section_of(annotation)
+        if below is not None:
+            yield from _all_keys(below, (*path, name))
 
 
-def _section_of(annotation: Any) -> type[BaseModel] | None:
+def _section_of(annotation: Any) -> type | None:
     inner = typing.get_args(annotation)
     if inner:
         return next(filter(None, map(_section_of, inner)), None)
-    return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
+    return annotation if isinstance(annotation, type) and dataclasses.is_dataclass(annotation) else None

@@ -10,6 +10,7 @@ import datetime
 import os
 import socket
 from concurrent.futures import ThreadPoolExecutor
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,7 @@ class _Api:
                 socket.gethostname(),
             ],
             tunnels=self._settings.ipsec.pool,
-            networks=self._settings.api_networks,
+            networks=map(ip_network, self._settings.api_networks),
         )
         listener = Listener(gate, self._settings.api_limits, self._doorkeeper.standing)
         await self._given.wait()

@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 import yaml
 
-from appliance.config import Settings
-from appliance.config_sources import ConfigError, resolve
+from appliance.config_sources import ConfigError, json_schema, plain, resolve
 
 _CheckedFile = Annotated[Path | None, typer.Argument(metavar="[FILE]", help="The same as --config FILE")]
 _File = Annotated[
@@ -48,9 +47,9 @@ def show(
     Example: rosrv config show --schema
     """
     if schema:
-        _print(json.dumps(Settings.model_json_schema(), indent=2))
+        _print(json.dumps(json_schema(), indent=2))
         return
-    settings = resolve(config, os.environ, {}).model_dump(mode="json")
+    settings = plain(resolve(config, os.environ, {}))
     _print(json.dumps(settings) if as_json else yaml.safe_dump(settings, sort_keys=False).rstrip())
 
 

@@ -10,7 +10,9 @@ import socket
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from ipaddress import ip_address, ip_network
 
+from appliance import late
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.config import Settings
@@ -59,7 +61,6 @@ from appliance.master.upkeep.reminders import Reminders
 from appliance.policy import Policy
 from appliance.policy.model import Address
 from appliance.ros import log_message
-from appliance.ros.standard import standard_definitions
 from appliance.rpc.bulk import bulk_turns
 from appliance.shares.pool import Pool
 from appliance.shares.table import PARAMETER_BYTES
@@ -144,7 +145,7 @@ class Parts:
             relays=settings.relays,
         )
         self._addresses = Addresses(
-            [(advertised.network, advertised.address) for advertised in settings.advertise],
+            [(ip_network(each.network), ip_address(each.address)) for each in settings.advertise],
             base.lifeline.route_to if settings.isolation == "netns" else None,
             base.sockets[RVMASTER].getsockname()[0],
         )
@@ -167,7 +168,7 @@ class Parts:
             policy=self._policy,
             monitors=lambda: self.monitors,
             broken=self._watchlist.look_at,
-            own_header=rosout.header(standard_definitions()) if settings.monitors_on_rosout else None,
+            own_header=_header_of_rosout() if settings.monitors_on_rosout else None,
             own_call=self.recordings.called,
         )
         self.rosmaster = RosMaster(
@@ -387,3 +388,10 @@ def _make_mirror(base: Foundation) -> ParameterMirror:
         together=base.store.together,
         since=base.store.parameter_changes(),
     )
+
+
+def _header_of_rosout() -> messages.OwnHeaderStated:
+    stated: messages.OwnHeaderStated = rosout.header(
+        late.load("appliance.ros.standard").standard_definitions()
+    )
+    return stated

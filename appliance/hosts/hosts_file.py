@@ -15,12 +15,11 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from msgspec import Meta, Struct
 
 _LARGEST = 1 << 20
-_MOST_GROUPS = 32
-_GROUP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
 class DeclaredHostsError(Exception):
@@ -69,18 +68,16 @@ class Declared:
         return host is None or host.wanted
 
 
-class _Host(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?$")]
+class _Host(Struct, forbid_unknown_fields=True):
+    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?\Z")]
     address: IPv4Address | None = None
     groups: Annotated[
-        list[Annotated[str, Field(pattern=f"^{_GROUP.pattern}$")]], Field(max_length=_MOST_GROUPS)
+        list[Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}\Z")]], Meta(max_length=32)
     ] = []
     tunnel: bool = True
 
 
-class _File(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+class _File(Struct, forbid_unknown_fields=True):
     hosts: list[_Host] = []
 
 
@@ -96,11 +93,13 @@ def read_declared(path: Path) -> dict[str, DeclaredHost]:
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise DeclaredHostsError(f"{path}: the declared hosts cannot be read: {error}") from error
     try:
-        file = _File.model_validate({} if content is None else content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the file"
-        raise DeclaredHostsError(f"{path}: {where}: {first['msg']}") from error
+        file = msgspec.convert(
+            {} if content is None else content, _File, dec_hook=lambda kind, value: kind(value)
+        )
+    except msgspec.ValidationError as error:
+        why, _at, place = str(error).partition(" - at `$")
+        where = re.sub(r"\W+", ".", place).strip(".") or "the file"
+        raise DeclaredHostsError(f"{path}: {where}: {why}") from error
     found: dict[str, DeclaredHost] = {}
     addresses: dict[str, str] = {}
     for host in file.hosts:

@@ -203,11 +203,12 @@ def _environment(home: str) -> dict[str, str]:
         "TMPDIR": home,  # of SQLite: no other folder may be written
         "PATH": _PROGRAM_PATH,
         "PYTHONPATH": str(Path(appliance.__file__).parent.parent),
+        "PYDANTIC_DISABLE_PLUGINS": "__all__",  # it looks for them in all that is installed
     }
 
 
 def program_environment(home: str, extra: dict[str, str]) -> dict[str, str]:
     """The environment of a program that is not ours: nothing of the caller's but language and time zone."""
     environment = _environment(home)
-    del environment["PYTHONPATH"]
+    del environment["PYTHONPATH"], environment["PYDANTIC_DISABLE_PLUGINS"]
     return {**environment, **extra}

@@ -1,6 +1,6 @@
 """Starts a relay with the limits of the configuration; the relay itself reads no configuration."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from appliance.config import Settings, load_resolved
@@ -15,4 +15,4 @@ def main(lifeline_fd: int, index: int, config: Path) -> None:
 
 def limits_of(settings: Settings) -> Limits:
     """The limits that the `relay` section sets; the others keep their defaults."""
-    return replace(Limits(), **settings.relay.model_dump())
+    return replace(Limits(), **asdict(settings.relay))

@@ -27,7 +27,7 @@ class Rings:
     def __init__(self, rules: RecorderRules, relays: int) -> None:
         if rules.memory > (left := _left()):
             raise StartError(
-                f"recorder.memory: {rules.memory.human_readable()} are more than the machine has left "
+                f"recorder.memory: {ByteSize(rules.memory).human_readable()} are more than the machine has left "
                 f"({left.human_readable()}): give less, or end what else takes memory"
             )
         size = int(rules.memory) // relays // _PAGE * _PAGE

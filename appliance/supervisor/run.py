@@ -1,14 +1,17 @@
 """One life of the appliance: what must be right before the first process starts, and what is left behind."""
 
 import asyncio
+import json
 import os
 import socket
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import structlog
 
-from appliance.config import Settings
+from appliance.config import Settings, Unasked
+from appliance.config_sources import plain
 from appliance.network.firewall.iptables import load_modules
 from appliance.network.protect import local_port_range
 from appliance.supervisor import signals
@@ -91,7 +94,7 @@ def _run(
         )
         enclosure = enclosure_of(settings.isolation, ports, settings.firewall.backend)
         state.prepare(roles)
-        state.write_config(settings.model_dump_json())
+        state.write_config(json.dumps(plain(settings)))
         raise_file_limit(_FILES)
         enclosure.build()
         try:
@@ -133,8 +136,9 @@ def _with_ports(settings: Settings) -> Settings:
     if port == 0 and settings.isolation != "none":
         port = free_port()
     rosmaster = settings.rosmaster_port or free_port()
-    changes = {"listen": _shown(host, port), "rosmaster_port": rosmaster, "api": _api_with_port(settings)}
-    return settings.model_copy(update=changes)
+    return replace(
+        settings, listen=_shown(host, port), rosmaster_port=rosmaster, api=_api_with_port(settings)
+    )
 
 
 def _api_with_port(settings: Settings) -> str:
@@ -142,7 +146,7 @@ def _api_with_port(settings: Settings) -> str:
     if settings.api_address is None:
         return settings.api
     host, port = settings.api_address
-    if port != 0 and "api" not in settings.model_fields_set:
+    if port != 0 and isinstance(settings.api, Unasked):
         try:
             require_free(host, port)
         except StartError as error:

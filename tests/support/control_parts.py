@@ -348,7 +348,7 @@ class ControlParts:
             self.enactor,
             self.watchlist,
             nodes=self.nodes,
-            settings=config.Liveness.model_construct(silent=silent),
+            settings=config.Liveness(silent=silent),
             standing=lambda _host: Standing.REGISTERED,
         )
         self._serving = functools.partial(

@@ -1,5 +1,6 @@
 """Tests of `appliance.config_sources`."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -162,7 +163,7 @@ def test_the_variable_of_a_flag_with_another_key() -> None:
     )
     with pytest.raises(ConfigError, match=r"ROSRV_RELAY: relaying: .*'some'"):
         resolve(None, {"ROSRV_RELAY": "some"}, {})
-    key, value = next(iter(Settings().relay.model_dump().items()))
+    key, value = next(iter(asdict(Settings().relay).items()))
     as_table = resolve(None, {"ROSRV_RELAY": f"{{{key}: {value}}}"}, {})
     as_key = resolve(None, {f"ROSRV_RELAY__{key.upper()}": str(value)}, {})
     assert as_table == as_key == resolve(None, {}, {})

@@ -1,6 +1,7 @@
 """Tests that the Debian package keeps step with the program, the container image and the list of packages."""
 
 import re
+from dataclasses import fields
 from pathlib import Path
 
 from appliance.config_sources import resolve
@@ -42,7 +43,7 @@ def test_the_installed_configuration_is_right() -> None:
     settings = resolve(file, {}, {})
     assert settings.enable == "none"
     keys = re.findall(r"^(?:# )?([a-z_]+):", file.read_text(), re.MULTILINE)
-    assert set(keys) <= set(type(settings).model_fields)
+    assert set(keys) <= {field.name for field in fields(settings)}
 
 
 def test_it_serves_the_interpreters_that_it_says() -> None:

@@ -27,7 +27,7 @@ from appliance.channel.answers.hosts import Endpoint
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.policy import PolicyKnown
 from appliance.channel.messages import Asked
-from appliance.config import Settings
+from appliance.config import ApiLimits, Settings
 from appliance.control.rest_meaning import NoOrderError, meant
 from appliance.store.tokens import make_token
 from tests.support.answers import example
@@ -119,7 +119,7 @@ def api() -> tuple[Gate, Listening, dict[str, str]]:
         messages.TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
         for row, _token in made.values()
     ])  # fmt: skip
-    limits = Settings().api_limits.model_copy(update={"burst": 100_000})
+    limits = ApiLimits(burst=100_000)
     gate = Gate(
         application(control, door, journal), limits=limits, doorkeeper=door, journal=journal, names=["api"]
     )

@@ -29,8 +29,9 @@ def test_no_file_and_an_empty_one_declare_nobody(tmp_path: Path) -> None:
     [
         ("hosts: [", "cannot be read"),
         ("hosts:\n  - name: 'a b'\n", "hosts.0.name"),
+        ('hosts:\n  - name: "a\\n"\n', "hosts.0.name"),
         ("hosts:\n  - name: a\n    address: 10.0.0\n", "hosts.0.address"),
-        ("hosts:\n  - name: a\n    group: b\n", "hosts.0.group"),
+        ("hosts:\n  - name: a\n    group: b\n", "hosts.0: Object contains unknown field `group`"),
         ("hosts:\n  - name: a\n  - name: a\n", "declared twice"),
         ("- a\n", "the file"),
         ("hosts:\n  - name: a\n    groups: ['b c']\n", "hosts.0.groups.0"),

@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from appliance.config import Settings
+from appliance.config_sources import read
 from appliance.hosts.rest_place import rest_place
 
 NET = ["192.168.1.0/24"]
@@ -27,7 +28,7 @@ NET = ["192.168.1.0/24"]
 )
 def test_who_cannot_be_reached_says_what_to_set(settings: dict[str, Any], trouble: str) -> None:
     """No host can enrol itself, and the reason is a thing to do."""
-    place = rest_place(Settings.model_validate(settings))
+    place = rest_place(read(settings))
     assert place.port is None
     assert trouble in place.trouble
 
@@ -42,7 +43,7 @@ def test_who_cannot_be_reached_says_what_to_set(settings: dict[str, Any], troubl
 )
 def test_who_can_be_reached(settings: dict[str, Any], port: int, inner: int | None) -> None:
     """In a namespace of its own always where the networks are named; bound to one address, not through tunnels."""
-    place = rest_place(Settings.model_validate(settings))
+    place = rest_place(read(settings))
     assert (place.port, place.trouble, place.inner_port) == (port, "", inner)
 
 
@@ -54,4 +55,4 @@ def test_in_a_namespace_hosts_renew_without_any_setting() -> None:
 def test_a_port_that_is_not_published_is_there_for_tunnels() -> None:
     """They end in the container, past what its engine publishes."""
     settings = {"api": "0.0.0.0:8443", "isolation": "container", "api_networks": NET, "api_published": False}
-    assert rest_place(Settings.model_validate(settings)).inner_port == 8443
+    assert rest_place(read(settings)).inner_port == 8443

@@ -1,6 +1,6 @@
 """Which records are triggers, and that a flood of one kind hides no other."""
 
-from typing import get_args
+from typing import get_args, get_type_hints
 
 import pytest
 
@@ -48,7 +48,7 @@ def test_a_trigger_has_nothing_that_a_message_said() -> None:
 
 def test_all_kinds_but_orders_can_be_configured() -> None:
     """The words of the configuration are those of the recordings."""
-    configurable = get_args(get_args(RecorderRules.model_fields["triggers"].annotation)[0])
+    configurable = get_args(get_args(get_type_hints(RecorderRules)["triggers"])[0])
     assert set(configurable) == set(KINDS) - {"order"}
 
 

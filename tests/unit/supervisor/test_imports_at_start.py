@@ -12,9 +12,10 @@ NEVER: Final = {"rich", "pygments", "typer", "lark", "numpy", "pyroute2", "z3", 
 """What is not needed until somebody asks for help, loads specifications or builds a namespace."""
 
 ENTRIES: Final = {role.name: role.entry.partition(":")[0] for role in ROLES if role.entry is not None}
+_BARE = {"pydantic", "rosbags"}
 ALSO: Final = {
-    "signer": {"rosbags"}, "relay": {"cryptography", "rosbags"}, "charon": {"rosbags"},
-    "syslog": {"rosbags"},
+    "signer": _BARE, "relay": _BARE | {"cryptography"}, "control": _BARE, "charon": _BARE, "syslog": _BARE,
+    "recorder": {"pydantic"},
 }  # fmt: skip
 
 
