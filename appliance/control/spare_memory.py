@@ -28,19 +28,17 @@ def give_back() -> None:
 
 
 class SpareMemory:
-    """Gives memory back while the process has `much` more than the least it has had.
+    """Gives memory back while the process has `MUCH` more than the least it has had.
 
     So it goes on where that much is in use: what comes free of it later is kept by the allocator until it is asked.
     """
 
     def __init__(
         self,
-        much: int = MUCH,
         *,
         size: Callable[[], int] = resident,
         give_back: Callable[[], None] = give_back,
     ) -> None:
-        self._much = much
         self._size = size
         self._give_back = give_back
         self._least = size()
@@ -55,5 +53,5 @@ class SpareMemory:
         """Give back what is spare, if it may be much."""
         size = self._size()
         self._least = min(self._least, size)
-        if size > self._least + self._much:
+        if size > self._least + MUCH:
             await asyncio.to_thread(self._give_back)

@@ -24,7 +24,7 @@ from appliance.hosts.hosts_file import DeclaredHostsError
 from appliance.hosts.self_service import SelfService
 from appliance.hosts.table import LONGEST_DAYS, HostRefusedError
 from appliance.hosts.view import HostView
-from appliance.ipsec.enrolment import Enrolment
+from appliance.ipsec.kit import filled
 from appliance.policy.model import Address
 from appliance.store.hosts import AwaitedRow
 
@@ -169,7 +169,9 @@ class Hosts:
             await self._store.settled()
             place = f"[{found.endpoint}]" if ":" in found.endpoint else found.endpoint
             url = f"https://{place}:{self._certification.rest.port}"
-            joining = Enrolment(name, url, self._certification.pin, _fingerprint(authority))
+            # The script makes the key on the host, which it never leaves, and has no token. It knows the appliance by
+            # the pin of REST's key and the fingerprint of the authority: who stands in between gets and gives nothing.
+            known = {"url": url, "pin": self._certification.pin, "authority": _fingerprint(authority)}
             return answers.EnrolmentToken(
                 revision=self._table.revision,
                 name=name,
@@ -178,10 +180,8 @@ class Hosts:
                 expires=row.expires,
                 endpoint=found.endpoint,
                 endpoint_reason=found.reason,
-                url=url,
-                pin=joining.pin,
-                authority=joining.authority,
-                script=joining.script(),
+                **known,
+                script=filled("enrol.sh", {"name": name, **known}),
             )
 
     async def revoke(self, request: admin.HostRevoke, who: str) -> answers.Revoked:

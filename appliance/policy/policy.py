@@ -130,22 +130,14 @@ class Policy:
                 self.kept[key] = decision
         return decision
 
-    def decide_parameter(
-        self, request: Request, *, subtree: bool = True, namespace: bool = False
-    ) -> Decision:
-        """Whether a parameter call may touch the key and what is below it.
+    def decide_parameter(self, request: Request, *, namespace: bool = False) -> Decision:
+        """Whether a parameter call may touch the key and what is below it: a rule there that denies the host denies it.
 
-        `subtree`: a rule below the key that denies the host denies the call. `namespace`: the key is known to
-        hold other keys; then the rule for those of them that have no key of their own must grant the host too
-        (an exact key `/arm` says nothing of `/arm/speed`).
+        `namespace`: the key is known to hold other keys; then the rule for those of them that have no key of their own
+        must grant the host too (an exact key `/arm` says nothing of `/arm/speed`).
         """
         decision = self.decide(request)
-        if (
-            not decision.allowed
-            or decision.would_deny
-            or request.category not in self._present
-            or not subtree
-        ):
+        if not decision.allowed or decision.would_deny or request.category not in self._present:
             return decision
         host = request.host
         key = (host.version, int(host), request.category, request.resource, namespace)

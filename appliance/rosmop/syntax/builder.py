@@ -355,7 +355,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         return tree.Cast(self.at(meta), *(child for child in children if not isinstance(child, Token)))
 
     def convert(self, meta: Meta, *children: Any) -> tree.Construct:
-        words = tuple(str(child) for child in children if _is_word(child, "BUILTIN"))
+        words = tuple(str(child) for child in children if _is_builtin(child))
         return tree.Construct(self.at(meta), tree.TypeName(self.at(meta), words), children[-1] or ())
 
     def construct_vector(self, meta: Meta, kind: Any, arguments: Any) -> tree.Construct:
@@ -365,7 +365,7 @@ class Builder(Transformer_NonRecursive[Token, Any]):
         return tree.Construct(self.at(meta), kind, (self.elements_in_braces(meta, items),))
 
     def new(self, meta: Meta, *children: Any) -> tree.NewCharacters:
-        words = [str(child) for child in children if _is_word(child, "BUILTIN")]
+        words = [str(child) for child in children if _is_builtin(child)]
         if words != ["char"]:
             self.refuse(
                 meta, f"`new {' '.join(words)}[…]` is not part of the language; write a `std::vector`"
@@ -414,8 +414,8 @@ def _referenced(kind: tree.TypeName) -> tree.TypeName:
     return replace(kind, reference=True)
 
 
-def _is_word(child: Any, kind: str) -> bool:
-    return isinstance(child, Token) and child.type == kind
+def _is_builtin(child: Any) -> bool:
+    return isinstance(child, Token) and child.type == "BUILTIN"
 
 
 def _unquoted(token: Token) -> str:
