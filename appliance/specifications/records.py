@@ -3,6 +3,7 @@
 import datetime
 from collections import Counter
 from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 from typing import Any
 
 from appliance.audit.record import Severity
@@ -23,6 +24,7 @@ KINDS = tuple(_EVENTS)
 _LEVELS = {"WARN": Severity.WARNING, "ERROR": Severity.WARNING, "FATAL": Severity.ALARM}
 
 
+@dataclass(frozen=True, slots=True)
 class MonitorRecords:
     """Makes records of reports; `fields(topic, data)` reads a message.
 
@@ -31,17 +33,11 @@ class MonitorRecords:
     Each of `told` hears of every event.
     """
 
-    def __init__(
-        self,
-        trail: AuditTrail,
-        fields: Callable[[str, bytes], dict[str, Any] | None],
-        told: Collection[Callable[[MonitorEvent], None]],
-    ) -> None:
-        self._trail = trail
-        self._fields = fields
-        self.counts: Counter[tuple[str, str]] = Counter()
-        self.at: Counter[tuple[str, str]] = Counter()
-        self._told = told
+    trail: AuditTrail
+    fields: Callable[[str, bytes], dict[str, Any] | None]
+    told: Collection[Callable[[MonitorEvent], None]]
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter, init=False)
+    at: Counter[tuple[str, str]] = field(default_factory=Counter, init=False)
 
     def reported(self, events: list[MonitorEvent], lost: int) -> None:
         """A batch of the relay."""
@@ -51,11 +47,11 @@ class MonitorRecords:
             if event.kind in ("drop", "change"):
                 self.at[event.kind, event.resource] += event.count or 1
             self._record(event)
-            for tell in self._told:
+            for tell in self.told:
                 tell(event)
         if lost:
             text = f"{lost} reports of monitors were lost while the relay had no control"
-            self._trail.happened("records lost", text, severity=Severity.ALARM, lost=lost)
+            self.trail.happened("records lost", text, severity=Severity.ALARM, lost=lost)
 
     def _record(self, event: MonitorEvent) -> None:
         name, severity = _EVENTS.get(event.kind, ("monitor log", Severity.INFO))
@@ -70,7 +66,7 @@ class MonitorRecords:
         for word, data in (("before", event.before), ("after", event.after)):
             if data:
                 detail[word] = data.hex()
-                read = self._fields(event.resource, data)
+                read = self.fields(event.resource, data)
                 if read is not None:
                     detail[f"{word}_fields"] = read
         if event.size:
@@ -81,7 +77,7 @@ class MonitorRecords:
             text = f"{event.count} more in the same second" + (f": {text}" if text else "")
         if tried is not None:
             text = f"on trial, not done: {text}" if tried in _NOT_DONE else f"on trial: {text}"
-        self._trail.happened(
+        self.trail.happened(
             name,
             text,
             severity=severity,

@@ -8,6 +8,7 @@ ROSMaster once. A read of what a run writes begins the next. Everything else wai
 import asyncio
 import time
 from collections import deque
+from dataclasses import dataclass
 
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
@@ -28,16 +29,14 @@ _FORM = "a part of a multicall has methodName and params, nothing else"
 _Parts = deque["Value | Attempt"]
 
 
+@dataclass(frozen=True, slots=True)
 class Multicall:
     """Answers multicalls. The answers to one have as many bytes as one call can be answered."""
 
-    def __init__(
-        self, execution: Execution, parameters: ParameterCalls, trail: AuditTrail, *, offload: int
-    ) -> None:
-        self._execution = execution
-        self._parameters = parameters
-        self._trail = trail
-        self._offload = offload
+    execution: Execution
+    parameters: ParameterCalls
+    trail: AuditTrail
+    offload: int
 
     async def answer(self, visit: Visit, params: tuple[Value, ...]) -> Value:
         """The answers to the parts of one multicall."""
@@ -47,10 +46,10 @@ class Multicall:
             return [-1, why, 0]
         left: _Parts = deque(params[0])
         results: list[Value] = []
-        limit = room = self._parameters.mirror.bytes_limit
+        limit = room = self.parameters.mirror.bytes_limit
         since = time.monotonic()  # not the loop's time, which stands still meanwhile
         while left:
-            why = self._trail.owing(visit.caller.peer.text)
+            why = self.trail.owing(visit.caller.peer.text)
             if room <= 0:
                 why = f"the answers to a multicall have more than {limit} bytes"
             if why:
@@ -71,7 +70,7 @@ class Multicall:
         answers: list[Value] = []
         run: list[tuple[int, Attempt]] = []
         written: list[str] = []
-        weight, most = 0, min(room, self._offload)
+        weight, most = 0, min(room, self.offload)
         while left and len(answers) < _LONGEST_RUN and weight < most and _in_run(visit, left[0]):
             attempt = await self._understand(visit, left[0])
             if isinstance(attempt, Attempt):
@@ -81,17 +80,17 @@ class Multicall:
                     left[0] = attempt
                     break
                 run.append((len(answers), attempt))
-                weight += self._parameters.weight_of_answer(attempt)
+                weight += self.parameters.weight_of_answer(attempt)
             left.popleft()
             answers.append(None if isinstance(attempt, Attempt) else attempt)
-        done = await self._execution.answer_run(visit, [attempt for _place, attempt in run])
+        done = await self.execution.answer_run(visit, [attempt for _place, attempt in run])
         for (place, _one), answer in zip(run, done, strict=True):
             answers[place] = [answer]
         return answers
 
     async def _one(self, visit: Visit, part: "Value | Attempt") -> Value:
         attempt = await self._understand(visit, part)
-        return [await self._execution.answer(visit, attempt)] if isinstance(attempt, Attempt) else attempt
+        return [await self.execution.answer(visit, attempt)] if isinstance(attempt, Attempt) else attempt
 
     async def _understand(self, visit: Visit, part: "Value | Attempt") -> "Value | Attempt":
         """A part as it was understood; else what stands for it in the answer."""
@@ -101,24 +100,24 @@ class Multicall:
             case {"methodName": "system.multicall"}:
                 return self._refused(visit, "a multicall inside a multicall is not served")
             case {"methodName": str(method), "params": list(params), **rest} if not rest:
-                attempt = await self._execution.understand(visit, method, params)
+                attempt = await self.execution.understand(visit, method, params)
                 return attempt if isinstance(attempt, Attempt) else [attempt]
         return self._refused(visit, _FORM)
 
     async def _weigh(self, visit: Visit, answers: list[Value]) -> int:
         """About how many bytes answers have, which are kept until the other parts have theirs."""
-        weight = weigh(answers, self._offload)
-        if weight < self._offload:
+        weight = weigh(answers, self.offload)
+        if weight < self.offload:
             return weight
         await visit.bulk.take()
-        return await asyncio.to_thread(weigh, answers, self._parameters.mirror.bytes_limit)
+        return await asyncio.to_thread(weigh, answers, self.parameters.mirror.bytes_limit)
 
     def _refused(self, visit: Visit, why: str) -> Value:
         return self._fault(visit, PARSE_FAULT, "malformed", why)
 
     def _fault(self, visit: Visit, code: int, event: str, why: str) -> Value:
         """A fault in the place of a part's answer, recorded as this event."""
-        record = self._trail.happened(
+        record = self.trail.happened(
             event,
             why,
             severity=Severity.WARNING,

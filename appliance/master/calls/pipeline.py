@@ -5,6 +5,7 @@ The same way serves the Master API and the outer faces, with another table of ca
 
 import asyncio
 import time
+from dataclasses import dataclass
 
 import structlog
 
@@ -29,41 +30,30 @@ _log = structlog.get_logger()
 _INTERNAL_FAULT = -32603
 
 
+@dataclass(frozen=True, slots=True)
 class Pipeline:
     """Serves requests by a table of calls. Bodies and answers over `offload` bytes are read and written in a thread.
 
     Those of different hosts take the turns of `bulk` for that.
     """
 
-    def __init__(
-        self,
-        execution: Execution,
-        multicall: Multicall,
-        *,
-        repetitions: Repetitions,
-        addresses: Addresses,
-        trail: AuditTrail,
-        limits: Limits,
-        offload: int,
-        bulk: Turns,
-    ) -> None:
-        self._execution = execution
-        self._multicall = multicall
-        self.repetitions = repetitions
-        self._addresses = addresses
-        self._trail = trail
-        self._limits = limits
-        self._offload = offload
-        self._bulk = bulk
+    execution: Execution
+    multicall: Multicall
+    repetitions: Repetitions
+    addresses: Addresses
+    trail: AuditTrail
+    limits: Limits
+    offload: int
+    bulk: Turns
 
     def handler(self, table: Table, *, own: bool = False, target: Incarnation | None = None) -> Handler:
         """The handler of one listener: its table, whether it is for the appliance's own nodes, and its target."""
 
         async def handle(request: HttpRequest) -> bytes:
-            await self._addresses.learn(request.peer)
+            await self.addresses.learn(request.peer)
             caller = Caller(request.peer, "", request.arrived, own=own, target=target)
             before = self.repetitions.state
-            with Bulk(self._bulk, caller.peer.host) as bulk:
+            with Bulk(self.bulk, caller.peer.host) as bulk:
                 call, answer = await self._serve(Visit(table, caller, bulk), request.body)
             if call is not None and not own and target is None:
                 self.repetitions.note(table, request, call, answer, before=before)
@@ -74,8 +64,8 @@ class Pipeline:
     async def _serve(self, visit: Visit, body: bytes) -> tuple[MethodCall | None, bytes]:
         """The call, if it was understood, and the answer."""
         try:
-            if len(body) <= self._offload:
-                call = parse_call(body, self._limits)
+            if len(body) <= self.offload:
+                call = parse_call(body, self.limits)
             else:
                 call = await self._parse_large(body, visit.bulk)
         except PeerError as error:
@@ -84,8 +74,8 @@ class Pipeline:
             answer = await self._answer(visit, call)
             known = call.method in visit.table or call.method == MULTICALL
             seconds = (time.monotonic_ns() - visit.caller.arrived) / 1e9
-            self._trail.meter.called(call.method if known else "unknown", seconds)
-            if weigh(answer, self._offload) < self._offload:
+            self.trail.meter.called(call.method if known else "unknown", seconds)
+            if weigh(answer, self.offload) < self.offload:
                 return call, build_response(answer)
             await visit.bulk.take()
             return call, await asyncio.to_thread(build_response, answer)
@@ -97,21 +87,21 @@ class Pipeline:
 
     async def _answer(self, visit: Visit, call: MethodCall) -> Value:
         if call.method == MULTICALL and visit.caller.target is None:
-            return await self._multicall.answer(visit, call.params)
-        attempt = await self._execution.understand(visit, call.method, call.params)
-        return await self._execution.answer(visit, attempt) if isinstance(attempt, Attempt) else attempt
+            return await self.multicall.answer(visit, call.params)
+        attempt = await self.execution.understand(visit, call.method, call.params)
+        return await self.execution.answer(visit, attempt) if isinstance(attempt, Attempt) else attempt
 
     async def _parse_large(self, body: bytes, bulk: Bulk) -> MethodCall:
         bulk.large = True
         await bulk.take()
         try:
-            return await asyncio.to_thread(parse_call, body, self._limits)
+            return await asyncio.to_thread(parse_call, body, self.limits)
         finally:
             bulk.give_back()  # to carry it out may take long
 
     def _not_understood(self, caller: Caller, body: bytes, error: PeerError) -> bytes:
         limit = isinstance(error, LimitExceededError)
-        decision = self._trail.happened(
+        decision = self.trail.happened(
             "limit exceeded" if limit else "malformed",
             str(error),
             severity=Severity.WARNING,

@@ -16,7 +16,7 @@ any other, but is neither parsed, nor decided, nor written anew where nothing ca
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from appliance.audit.record import Repeated
 from appliance.audit_trail import AuditTrail
@@ -64,34 +64,24 @@ class _Question:
     seen: State
 
 
+@dataclass(slots=True)
 class Repetitions:
     """What was asked at RVMaster's listener, by host and words."""
 
-    def __init__(
-        self,
-        gate: Gate,
-        registry: Registry,
-        mirror: ParameterMirror,
-        *,
-        rosmaster: RosMaster,
-        addresses: Addresses,
-        policy: Callable[[], Policy],
-        trail: AuditTrail,
-    ) -> None:
-        self._gate = gate
-        self._registry = registry
-        self._mirror = mirror
-        self._rosmaster = rosmaster
-        self._addresses = addresses
-        self._policy = policy
-        self._trail = trail
-        self._questions: dict[tuple[str, bytes], _Question | None] = {}  # None: asked once
-        self._bytes = 0
+    gate: Gate
+    registry: Registry
+    mirror: ParameterMirror
+    rosmaster: RosMaster
+    addresses: Addresses
+    policy: Callable[[], Policy]
+    trail: AuditTrail
+    _questions: dict[tuple[str, bytes], _Question | None] = field(default_factory=dict)  # None: asked once
+    _bytes: int = 0
 
     @property
     def state(self) -> State:
         """Registry and parameters, another after every change; and whether ROSMaster is there, and whole."""
-        return self._registry.version, self._mirror.version, self._rosmaster.reachable
+        return self.registry.version, self.mirror.version, self.rosmaster.reachable
 
     def answer(self, request: HttpRequest) -> bytes | None:
         """The answer to a question that was asked before, decided and recorded once more; None for any other."""
@@ -101,7 +91,7 @@ class Repetitions:
         question = self._questions.get((peer.text, request.body))
         if question is None:
             return None
-        trail = self._trail
+        trail = self.trail
         host = peer.text
         if trail.strict or trail.obstacle or trail.shut_out(host) or trail.owing(host):
             return None
@@ -114,10 +104,10 @@ class Repetitions:
 
     def _holds(self, question: _Question, peer: Peer) -> bool:
         if (
-            question.policy is not self._policy()
-            or question.revision != self._trail.revision
-            or not self._rosmaster.reachable
-            or question.told != self._addresses.told_to(peer)
+            question.policy is not self.policy()
+            or question.revision != self.trail.revision
+            or not self.rosmaster.reachable
+            or question.told != self.addresses.told_to(peer)
         ):
             return False
         state = self.state
@@ -132,9 +122,9 @@ class Repetitions:
         """Whether a part holds after a change: if it is about a parameter that has the same value (no namespace)."""
         return (
             part.key != ""
-            and self._registry.holder(part.caller_id) is part.holder
+            and self.registry.holder(part.caller_id) is part.holder
             and not isinstance(part.value, dict)
-            and standing_at(self._mirror.tree, part.key)[0] is part.value
+            and standing_at(self.mirror.tree, part.key)[0] is part.value
         )
 
     def note(
@@ -145,7 +135,7 @@ class Repetitions:
         key = caller.peer.text, body
         if len(body) > _LARGEST_QUESTION or len(answer) > _LARGEST_ANSWER or before != self.state:
             return
-        if not self._rosmaster.reachable:
+        if not self.rosmaster.reachable:
             return
         if key not in self._questions:
             self._put(key, None)
@@ -153,9 +143,9 @@ class Repetitions:
         parts = self._parts(table, caller, call)
         if parts is None:
             return
-        told = self._addresses.told_to(caller.peer)
+        told = self.addresses.told_to(caller.peer)
         self._put(
-            key, _Question(call.method, parts, answer, self._policy(), self._trail.revision, told, before)
+            key, _Question(call.method, parts, answer, self.policy(), self.trail.revision, told, before)
         )
 
     def _put(self, key: tuple[str, bytes], question: _Question | None) -> None:
@@ -191,12 +181,12 @@ class Repetitions:
             attempt = attempt_of(caller, params)
         except PeerError:
             return None
-        decision = self._gate.decide(attempt, self._mirror.tree)
+        decision = self.gate.decide(attempt, self.mirror.tree)
         if not isinstance(decision, Decision) or decision.word != "allow":
             return None
         request, asker = attempt.request, attempt.caller.asker
-        same = self._trail.repeatable(
+        same = self.trail.repeatable(
             asker, attempt.call.name, request.category.value, request.resource, decision, **attempt.about
         )
-        value = standing_at(self._mirror.tree, attempt.resource)[0] if attempt.resource else None
-        return _Part(asker.caller_id, self._registry.holder(asker.caller_id), attempt.resource, value, same)
+        value = standing_at(self.mirror.tree, attempt.resource)[0] if attempt.resource else None
+        return _Part(asker.caller_id, self.registry.holder(asker.caller_id), attempt.resource, value, same)

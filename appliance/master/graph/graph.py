@@ -10,6 +10,7 @@ ROSMaster is rebuilt), out of date or misread by ROSMaster never reaches a node.
 import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass
 
 from appliance.audit.record import Severity
 from appliance.master.graph.effects import (
@@ -40,21 +41,14 @@ from appliance.store.state import PermissionRow
 _CARRIED = (Kind.PUBLICATION, Kind.SERVICE)
 
 
+@dataclass(frozen=True, slots=True)
 class Graph:
     """The verbs. `may_be_told(node, key, value)` says whether the policy lets a node read a parameter's value."""
 
-    def __init__(
-        self,
-        registry: Registry,
-        grants: Grants,
-        mediation: Mediation,
-        *,
-        may_be_told: Callable[[Incarnation, str, Value], bool],
-    ) -> None:
-        self._registry = registry
-        self._grants = grants
-        self._mediation = mediation
-        self._may_be_told = may_be_told
+    registry: Registry
+    grants: Grants
+    mediation: Mediation
+    may_be_told: Callable[[Incarnation, str, Value], bool]
 
     def registered(self, incarnation: Incarnation, kind: Kind, resource: str, detail: str) -> Effects:
         """ROSMaster took a registration."""
@@ -62,11 +56,11 @@ class Graph:
         if incarnation.life is Life.SHADOW:  # it was lost while its call was under way
             effects += self.returned(incarnation)
         if kind is Kind.SERVICE:
-            for provider in list(self._registry.registered(Kind.SERVICE, resource)):
+            for provider in list(self.registry.registered(Kind.SERVICE, resource)):
                 if provider is not incarnation:  # ROSMaster keeps one provider of a service: the last
                     effects += self.unregistered(provider, Kind.SERVICE, resource)
         new = (kind, resource) not in incarnation.registrations
-        effects += self._registry.register(incarnation, kind, resource, detail)
+        effects += self.registry.register(incarnation, kind, resource, detail)
         if kind in _CARRIED:
             effects.append(Place(incarnation, kind, resource, detail))
         if kind is Kind.PUBLICATION:
@@ -78,9 +72,9 @@ class Graph:
 
     def unregistered(self, incarnation: Incarnation, kind: Kind, resource: str) -> Effects:
         """A registration is gone at ROSMaster."""
-        effects: Effects = [*self._registry.unregister(incarnation, kind, resource)]
+        effects: Effects = [*self.registry.unregister(incarnation, kind, resource)]
         if not effects:
-            return [*self._registry.unshelve(incarnation, kind, resource)]
+            return [*self.registry.unshelve(incarnation, kind, resource)]
         if kind in _CARRIED:
             effects.append(Withdraw(incarnation, kind, resource))
         if kind is Kind.PUBLICATION:
@@ -99,7 +93,7 @@ class Graph:
         effects: Effects = [
             revocation(decision, str(incarnation.host), incarnation.name, kind.value, resource, call=call),
             *self.unregistered(incarnation, kind, resource),
-            *self._registry.shelve(incarnation, registration),
+            *self.registry.shelve(incarnation, registration),
         ]
         if kind is Kind.SUBSCRIPTION and incarnation.life is Life.LIVE:
             effects.append(_emptied(incarnation, resource))
@@ -109,21 +103,21 @@ class Graph:
         """What the policy took back counts again, and ROSMaster is to hear of it; unless another has it now."""
         kind, resource = registration.kind, registration.resource
         if kind is Kind.SERVICE and self._others_offer(incarnation, resource):
-            return [*self._registry.unshelve(incarnation, kind, resource)]
+            return [*self.registry.unshelve(incarnation, kind, resource)]
         effects = self.registered(incarnation, kind, resource, registration.detail)
         return effects + self.remind(incarnation, resource) if kind is Kind.SUBSCRIPTION else effects
 
     def _others_offer(self, incarnation: Incarnation, service: str) -> bool:
-        return any(holder is not incarnation for holder in self._registry.registered(Kind.SERVICE, service))
+        return any(holder is not incarnation for holder in self.registry.registered(Kind.SERVICE, service))
 
     def _take_name(self, incarnation: Incarnation) -> Effects:
         """From whoever has it: also from one that has nothing left, and is not to get anything back any more."""
-        other = self._registry.occupant(incarnation.name)
+        other = self.registry.occupant(incarnation.name)
         if other is None or other is incarnation:
             return []
         effects = self.replaced(other, incarnation) if other.registrations else []
         for kind, resource in list(other.shelf):
-            effects += self._registry.unshelve(other, kind, resource)
+            effects += self.registry.unshelve(other, kind, resource)
         return effects
 
     def replaced(self, incarnation: Incarnation, by: Incarnation) -> Effects:
@@ -132,7 +126,7 @@ class Graph:
         reason = f"[{incarnation.name}] Reason: new node registered with same name"
         other = by.host != incarnation.host
         return [
-            *self._registry.replace(incarnation, time.time()),
+            *self.registry.replace(incarnation, time.time()),
             TellNode(incarnation, NodeCall("shutdown", (reason,))),
             *self._tell_withdrawn(lost),
             *self._close(incarnation),
@@ -147,7 +141,7 @@ class Graph:
     def lost(self, incarnation: Incarnation, why: str) -> Effects:
         """The node does not answer any more: what it had counts for nobody until it returns."""
         return [
-            *self._registry.overshadow(incarnation, time.time()),
+            *self.registry.overshadow(incarnation, time.time()),
             *self._tell_withdrawn(incarnation.registrations.values()),
             WithdrawNode(incarnation),
             DropCalls(incarnation),
@@ -163,7 +157,7 @@ class Graph:
         for service in incarnation.resources(Kind.SERVICE):
             if self._others_offer(incarnation, service):
                 effects += self.unregistered(incarnation, Kind.SERVICE, service)
-        effects += self._registry.revive(incarnation, time.time())
+        effects += self.registry.revive(incarnation, time.time())
         effects.append(PlaceNode(incarnation))
         for registration in incarnation.in_order():
             if registration.kind is Kind.PUBLICATION:
@@ -179,8 +173,8 @@ class Graph:
     def forgotten(self, incarnation: Incarnation) -> Effects:
         """An incarnation is dropped for good."""
         registrations = list(incarnation.registrations.values())
-        effects: Effects = [*self._registry.forget(incarnation), *self._tell_withdrawn(registrations)]
-        if self._registry.holder(incarnation.name) is None:
+        effects: Effects = [*self.registry.forget(incarnation), *self._tell_withdrawn(registrations)]
+        if self.registry.holder(incarnation.name) is None:
             for registration in registrations:
                 if registration.kind is Kind.SUBSCRIPTION:
                     effects += self._give_up(incarnation, registration.resource)
@@ -188,25 +182,25 @@ class Graph:
 
     def _close(self, incarnation: Incarnation) -> Effects:
         """Nobody gets anything of it any more."""
-        return [WithdrawNode(incarnation), *self._grants.forget(incarnation.key), CloseNode(incarnation)]
+        return [WithdrawNode(incarnation), *self.grants.forget(incarnation.key), CloseNode(incarnation)]
 
     # --- grants ---
 
     def topic_granted(self, publisher: Incarnation, topic: str, host: Address, caller_id: str) -> Effects:
         """This subscriber may have this topic of that publisher."""
-        return self._grants.give(PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id))
+        return self.grants.give(PermissionRow(publisher.key, TOPIC, topic, str(host), caller_id))
 
     def service_granted(self, provider: Incarnation, service: str, host: Address, caller_id: str) -> Effects:
         """This client may call this service of that provider. Nobody calls without a name."""
         row = PermissionRow(provider.key, SERVICE, service, str(host), caller_id)
-        return self._grants.give(row) if caller_id else []
+        return self.grants.give(row) if caller_id else []
 
     def _give_up(self, subscriber: Incarnation, topic: str) -> Effects:
         """The subscriber gave the topic up: its grants for it, on every publisher, are gone.
 
         Unless another of its name and host has the topic by now: grants are for these two, so they are its own.
         """
-        other = self._registry.holder(subscriber.name)
+        other = self.registry.holder(subscriber.name)
         if (
             other is not None
             and other is not subscriber
@@ -217,8 +211,8 @@ class Graph:
         host, name = str(subscriber.host), subscriber.name
         return [
             effect
-            for publisher in self._registry.registered(Kind.PUBLICATION, topic)
-            for effect in self._grants.take(PermissionRow(publisher.key, TOPIC, topic, host, name))
+            for publisher in self.registry.registered(Kind.PUBLICATION, topic)
+            for effect in self.grants.take(PermissionRow(publisher.key, TOPIC, topic, host, name))
         ]
 
     def limits_changed(self, before: Policy, now: Policy) -> Effects:
@@ -226,14 +220,14 @@ class Graph:
         if not before.limits_anything and not now.limits_anything:
             return []
         effects: Effects = []
-        for node in self._registry.live():
+        for node in self.registry.live():
             for registration in node.registrations.values():
                 parts = ((Part.PUBLISHER, node.host), (Part.TOPIC, None))
                 if registration.kind is Kind.PUBLICATION and _differ(
                     before, now, registration.resource, parts
                 ):
                     effects.append(Place(node, registration.kind, registration.resource, registration.detail))
-            for row in self._grants.of(node.key):
+            for row in self.grants.of(node.key):
                 reader = ((Part.SUBSCRIBER, address_of(row.host)),)
                 if row.kind == TOPIC and _differ(before, now, row.resource, reader):
                     effects.append(PlaceGrant(row))
@@ -243,7 +237,7 @@ class Graph:
 
     def tell(self, topic: str, *, always: bool = False) -> Effects:
         """Give every subscriber of a topic its list, if it has another one (or `always`)."""
-        subscribers = self._registry.registered(Kind.SUBSCRIPTION, topic)
+        subscribers = self.registry.registered(Kind.SUBSCRIPTION, topic)
         return [
             effect
             for subscriber in subscribers
@@ -257,13 +251,13 @@ class Graph:
         """
         topics = {
             registration.resource
-            for _node, registration in self._registry.in_order()
+            for _node, registration in self.registry.in_order()
             if registration.kind is Kind.SUBSCRIPTION
         }
         effects = [
             effect for topic in sorted(topics) if concerned(topic) for effect in self.tell(topic, always=True)
         ]
-        for node in self._registry.live():
+        for node in self.registry.live():
             for kind, topic in node.shelf:
                 if kind is Kind.SUBSCRIPTION and concerned(topic):
                     effects.append(_emptied(node, topic))
@@ -271,8 +265,8 @@ class Graph:
 
     def renew_all(self, topic: str) -> Effects:
         """Have every subscriber of a topic drop its publishers and take them again: they are reached elsewhere."""
-        publishers = list(self._registry.registered(Kind.PUBLICATION, topic))
-        subscribers = self._registry.registered(Kind.SUBSCRIPTION, topic)
+        publishers = list(self.registry.registered(Kind.PUBLICATION, topic))
+        subscribers = self.registry.registered(Kind.SUBSCRIPTION, topic)
         return [effect for subscriber in subscribers for effect in self.renew(subscriber, topic, publishers)]
 
     def remind(self, subscriber: Incarnation, topic: str) -> Effects:
@@ -291,16 +285,16 @@ class Graph:
 
     def _tell_parameters(self, key: str, value: Value, caller_id: str | None) -> Effects:
         effects: Effects = []
-        if not self._registry.tells_parameters:
+        if not self.registry.tells_parameters:
             return effects
         calls: dict[str, NodeCall] = {}
-        for update in updates_of(key, value, self._registry.subscribed_below(key)):
-            for subscriber in self._registry.registered(Kind.PARAMETER, update.subscribed):
+        for update in updates_of(key, value, self.registry.subscribed_below(key)):
+            for subscriber in self.registry.registered(Kind.PARAMETER, update.subscribed):
                 if update.key == key and subscriber.name == caller_id:
                     continue
                 if update.key not in calls:
                     calls[update.key] = _param_update(update.key, settled(update.value))
-                if self._may_be_told(subscriber, update.key, update.value):
+                if self.may_be_told(subscriber, update.key, update.value):
                     effects.append(TellNode(subscriber, calls[update.key]))
         return effects
 
@@ -310,7 +304,7 @@ class Graph:
         It is told what it may read: all that comes to be below a key is told to those who subscribed to it, which was
         decided by what was there then.
         """
-        told = self._may_be_told(subscriber, key, value)
+        told = self.may_be_told(subscriber, key, value)
         return [TellNode(subscriber, _param_update(key, value))] if told else []
 
     def renew(self, subscriber: Incarnation, topic: str, absent: Collection[Incarnation]) -> Effects:
@@ -329,14 +323,14 @@ class Graph:
         Whether they have a grant does not count: one that was taken while the subscriber heard nothing is asked for
         again only when it drops the publisher. So this follows from what is kept over a restart.
         """
-        used = self._grants.used()
+        used = self.grants.used()
         for subscriber in subscribers:
             for topic in subscriber.resources(Kind.SUBSCRIPTION):
                 publishers = [
                     publisher
-                    for publisher in self._registry.registered(Kind.PUBLICATION, topic)
+                    for publisher in self.registry.registered(Kind.PUBLICATION, topic)
                     if publisher is not subscriber
-                    and (publisher.own or subscriber.own or self._mediation.carries_topic(topic))
+                    and (publisher.own or subscriber.own or self.mediation.carries_topic(topic))
                     and PermissionRow(publisher.key, TOPIC, topic, str(subscriber.host), subscriber.name)
                     not in used
                 ]
@@ -357,8 +351,8 @@ class Graph:
         return [_list(subscriber, topic, uris)]
 
     def _publishers_for(self, subscriber: Incarnation, topic: str) -> tuple[str, ...]:
-        hidden = self._mediation.hides_publishers(topic)
-        return self._registry.uris_for(subscriber, Kind.PUBLICATION, topic, hidden=hidden)
+        hidden = self.mediation.hides_publishers(topic)
+        return self.registry.uris_for(subscriber, Kind.PUBLICATION, topic, hidden=hidden)
 
     def _tell_withdrawn(self, registrations: Iterable[Registration]) -> Effects:
         topics = [

@@ -5,6 +5,7 @@ confirmed in time) is put back, because a ROS 1 node never registers twice.
 """
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 from appliance.master.graph.effects import Effect, Effects, PutBack, Record, TakeBack, UsePorts
 from appliance.master.graph.grants import Grants
@@ -27,22 +28,15 @@ CALLS = {
 """The calls of the Master API by which a node has something of a kind, and gives it up."""
 
 
+@dataclass(frozen=True, slots=True)
 class Revocation:
     """Decides again what the registry and the grants hold, by the policy and the parameters (`tree`) at that moment."""
 
-    def __init__(
-        self,
-        registry: Registry,
-        grants: Grants,
-        graph: Graph,
-        policy: Callable[[], Policy],
-        tree: Callable[[], Tree],
-    ) -> None:
-        self._registry = registry
-        self._grants = grants
-        self._graph = graph
-        self._policy = policy
-        self._tree = tree
+    registry: Registry
+    grants: Grants
+    graph: Graph
+    policy: Callable[[], Policy]
+    tree: Callable[[], Tree]
 
     def live(self) -> list[Live]:
         """What `redecide` decides: all that nodes have by the policy."""
@@ -52,17 +46,17 @@ class Revocation:
                 for incarnation, registration in self._registrations()
                 if not incarnation.own
             ),
-            *(self._granted(row) for row in self._grants.all() if not self._is_own(row)),
+            *(self._granted(row) for row in self.grants.all() if not self._is_own(row)),
         ]
 
     def policy_changed(self, before: Policy, now: Policy) -> Effects:
         """All that follows from another policy, which is in force already."""
-        return [UsePorts(now.ports), *self.redecide(), *self._graph.limits_changed(before, now)]
+        return [UsePorts(now.ports), *self.redecide(), *self.graph.limits_changed(before, now)]
 
     def redecide(self) -> Effects:
         """Take back what the running policy no longer allows, and put back what it grants again."""
-        effects = self._redecide(self._registrations(), self._grants.all())
-        for incarnation in self._registry.live():
+        effects = self._redecide(self._registrations(), self.grants.all())
+        for incarnation in self.registry.live():
             effects += self.returned(incarnation)
         return effects
 
@@ -70,7 +64,7 @@ class Revocation:
         """Take back what one caller may not have: his call was decided before the policy changed, made after."""
         return self._redecide(
             [pair for pair in self._registrations() if (pair[0].host, pair[0].name) == (host, caller_id)],
-            [row for row in self._grants.all() if (row.host, row.caller_id) == (str(host), caller_id)],
+            [row for row in self.grants.all() if (row.host, row.caller_id) == (str(host), caller_id)],
         )
 
     def _redecide(
@@ -95,7 +89,7 @@ class Revocation:
         for incarnation, registration in self._registrations():
             if incarnation.host == host and not incarnation.own:
                 effects += self._take_back(incarnation, registration, decision, "")
-        for row in self._grants.all():
+        for row in self.grants.all():
             if row.host == str(host):
                 effects += self._revoke(row, decision, "")
         return effects
@@ -105,14 +99,14 @@ class Revocation:
 
         The registry has it at once, so that the next change of the policy finds it; ROSMaster hears in its turn.
         """
-        holder = self._registry.holder(incarnation.name)
+        holder = self.registry.holder(incarnation.name)
         if holder is not None and holder is not incarnation:
             return []
         effects: Effects = []
         back: list[Registration] = []
         for registration in sorted(incarnation.shelf.values(), key=lambda registration: registration.order):
             if self.may_have(incarnation, registration.kind, registration.resource):
-                effects += self._graph.granted_again(incarnation, registration)
+                effects += self.graph.granted_again(incarnation, registration)
                 if (registration.kind, registration.resource) in incarnation.registrations:
                     back.append(registration)
         return [*effects, PutBack(incarnation, tuple(back))] if back else effects
@@ -121,7 +115,7 @@ class Revocation:
         """Every registration that counts now or will when its node is back, in the order they were made."""
         pairs = [
             (incarnation, registration)
-            for incarnation in self._registry.all()
+            for incarnation in self.registry.all()
             if incarnation.life is not Life.REPLACED
             for registration in incarnation.registrations.values()
         ]
@@ -130,14 +124,14 @@ class Revocation:
     def _take_back(
         self, incarnation: Incarnation, registration: Registration, decision: Decision, call: str
     ) -> Effects:
-        effects = self._graph.revoked(incarnation, registration, decision, call)
+        effects = self.graph.revoked(incarnation, registration, decision, call)
         if incarnation.life is Life.LIVE:  # else ROSMaster has been told
             effects.append(TakeBack(incarnation, registration))
         return effects
 
     def _revoke(self, row: PermissionRow, decision: Decision, call: str) -> Effects:
         record = revocation(decision, row.host, row.caller_id, row.kind, row.resource, call=call)
-        return [*self._grants.take(row), record]
+        return [*self.grants.take(row), record]
 
     def may_have(self, incarnation: Incarnation, kind: Kind, resource: str) -> bool:
         """Whether the policy in force grants a node what it has, had, or seems to have."""
@@ -147,19 +141,19 @@ class Revocation:
         if incarnation.own:
             known = incarnation.of_monitors or ROSOUT.may_have(kind, resource)
             return Decision(known, None, OWN if known else f"{OWN} does not have this any more")
-        return may_keep(self._policy(), self._registered(incarnation, kind, resource))
+        return may_keep(self.policy(), self._registered(incarnation, kind, resource))
 
     def _decide_grant(self, row: PermissionRow) -> Decision:
         if self._is_own(row):
             return Decision(True, None, OWN)
-        return may_keep(self._policy(), self._granted(row))
+        return may_keep(self.policy(), self._granted(row))
 
     def _is_own(self, row: PermissionRow) -> bool:
-        holder = self._registry.holder(row.caller_id)
+        holder = self.registry.holder(row.caller_id)
         return row.kind == TOPIC and holder is not None and holder.own
 
     def _registered(self, incarnation: Incarnation, kind: Kind, resource: str) -> Live:
-        return live_by(CALLS[kind][0], incarnation.host, incarnation.name, resource, self._tree())
+        return live_by(CALLS[kind][0], incarnation.host, incarnation.name, resource, self.tree())
 
     def _granted(self, row: PermissionRow) -> Live:
         call = "requestTopic" if row.kind == TOPIC else "lookupService"

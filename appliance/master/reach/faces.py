@@ -10,6 +10,7 @@ needs no reading: ROSMaster joins the names in a value into keys that nobody was
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 from appliance.master.graph.registry import PUBLISHER_PATH, Durable, Incarnation, Registry, SaveNode
 from appliance.master.reach.places import NoPortError, Places
@@ -22,44 +23,32 @@ from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Visitors
 
 
+@dataclass(frozen=True, slots=True)
 class Faces:
     """Opens and closes faces. `serve(incarnation)` makes the handler of an outer face."""
 
-    def __init__(
-        self,
-        registry: Registry,
-        places: Places,
-        *,
-        inner_port: int,
-        serve: Callable[[Incarnation], Handler],
-        limits: HttpLimits,
-        visitors: Visitors[Address],
-        turns: Turns,
-        refuse: Callable[[Peer], Refusal | None],
-        troubled: Callable[[Peer, str], None],
-    ) -> None:
-        self._registry = registry
-        self.places = places
-        self._inner_port = inner_port
-        self._serve = serve
-        self._limits = limits
-        self._visitors = visitors
-        self._turns = turns
-        self._refuse = refuse
-        self._troubled = troubled
-        self.servers: dict[str, HttpServer] = {}
+    registry: Registry
+    places: Places
+    inner_port: int
+    serve: Callable[[Incarnation], Handler]
+    limits: HttpLimits
+    visitors: Visitors[Address]
+    turns: Turns
+    refuse: Callable[[Peer], Refusal | None]
+    troubled: Callable[[Peer, str], None]
+    servers: dict[str, HttpServer] = field(default_factory=dict, init=False)
 
     def inner_uri(self, incarnation: Incarnation) -> str:
         """What ROSMaster knows the incarnation by."""
-        return node_uri("127.0.0.1", self._inner_port, f"/{incarnation.key}/")
+        return node_uri("127.0.0.1", self.inner_port, f"/{incarnation.key}/")
 
     def nobody(self) -> str:
         """An inner URI that is no incarnation's: for unregistering what was never registered."""
-        return node_uri("127.0.0.1", self._inner_port, "/nobody/")
+        return node_uri("127.0.0.1", self.inner_port, "/nobody/")
 
     def by_inner_uri(self, text: str) -> Incarnation | None:
         """The incarnation of an inner URI that ROSMaster gave back."""
-        return self._registry.by_key(text.rstrip("/").rpartition("/")[2])
+        return self.registry.by_key(text.rstrip("/").rpartition("/")[2])
 
     async def open(self, incarnation: Incarnation) -> None:
         """Serve the outer face. Raises `NoPortError`; the ports are closed then."""
@@ -70,12 +59,12 @@ class Faces:
             raise NoPortError(f"no face for {incarnation.name}: {error.strerror}") from error
         server = HttpServer(
             sock,
-            self._serve(incarnation),
-            limits=self._limits,
-            visitors=self._visitors,
-            turns=self._turns,
-            refuse=self._refuse,
-            troubled=self._troubled,
+            self.serve(incarnation),
+            limits=self.limits,
+            visitors=self.visitors,
+            turns=self.turns,
+            refuse=self.refuse,
+            troubled=self.troubled,
         )
         self.servers[incarnation.key] = server
         await server.start()

@@ -5,6 +5,7 @@ other for ever.
 """
 
 import time
+from dataclasses import dataclass
 
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.graph.graph import Graph
@@ -16,31 +17,21 @@ from appliance.master.upkeep.liveness import Liveness
 from appliance.policy.model import Address
 
 
+@dataclass(frozen=True, slots=True)
 class Arrivals:
     """Finds the incarnation that calls, or makes it."""
 
-    def __init__(
-        self,
-        registry: Registry,
-        graph: Graph,
-        enactor: Enactor,
-        liveness: Liveness,
-        *,
-        places: Places,
-        faces: Faces,
-        addresses: Addresses,
-    ) -> None:
-        self._registry = registry
-        self._graph = graph
-        self._enactor = enactor
-        self._liveness = liveness
-        self._places = places
-        self._faces = faces
-        self._addresses = addresses
+    registry: Registry
+    graph: Graph
+    enactor: Enactor
+    liveness: Liveness
+    places: Places
+    faces: Faces
+    addresses: Addresses
 
     def known(self, caller: Caller, api: ApiUri) -> Incarnation | None:
         """The incarnation that calls, if it is known."""
-        return self._registry.find(caller.caller_id, caller.peer.host, api.text)
+        return self.registry.find(caller.caller_id, caller.peer.host, api.text)
 
     async def incarnation_for(self, caller: Caller, api: ApiUri) -> Incarnation:
         """The incarnation that calls; made, with its ports and durably, when it is new.
@@ -48,25 +39,25 @@ class Arrivals:
         Raises `NoPortError` when the range of ports is exhausted, or control has no descriptors; nothing stays then.
         """
         identity = (caller.caller_id, caller.peer.host, api.text)
-        incarnation = self._registry.find(*identity)
+        incarnation = self.registry.find(*identity)
         if incarnation is not None and incarnation.life is Life.LIVE:
             incarnation.touched = time.monotonic()
-            incarnation.told = self._addresses.told_to(caller.peer)
+            incarnation.told = self.addresses.told_to(caller.peer)
             return incarnation
         if incarnation is not None and incarnation.life is Life.SHADOW:
-            if self._registry.holder(incarnation.name) is None:
+            if self.registry.holder(incarnation.name) is None:
                 # It was away and adds to what it had, before anybody saw that it is back.
                 with MakingRoomForNobody(incarnation):
-                    await self._liveness.revive(incarnation)
+                    await self.liveness.revive(incarnation)
                 return incarnation
             # Another took its name meanwhile: it begins anew.
-            self._enactor.carry_out(self._graph.forgotten(incarnation))
+            self.enactor.carry_out(self.graph.forgotten(incarnation))
         incarnation = self._make(caller, api)
         try:
             with MakingRoomForNobody(incarnation):
-                await self._faces.open(incarnation)
+                await self.faces.open(incarnation)
         except NoPortError:
-            self._enactor.carry_out(self._graph.forgotten(incarnation))
+            self.enactor.carry_out(self.graph.forgotten(incarnation))
             raise
         return incarnation
 
@@ -78,7 +69,7 @@ class Arrivals:
             host=caller.peer.host,
             api=api.uri,
             api_text=api.text,
-            told=self._addresses.told_to(caller.peer),
+            told=self.addresses.told_to(caller.peer),
             outer_port=outer_port,
             relay_port=relay_port,
             more_relay_ports=tuple(more),
@@ -86,19 +77,19 @@ class Arrivals:
             changed=time.time(),
             touched=time.monotonic(),
         )
-        self._enactor.carry_out(self._registry.add(incarnation))
+        self.enactor.carry_out(self.registry.add(incarnation))
         return incarnation
 
     def _open_ports(self, host: Address) -> tuple[int, ...]:
         """Ports for a node of this host; who has no registration makes room at once. Raises `NoPortError`."""
         while True:
             try:
-                return self._places.open(host)
+                return self.places.open(host)
             except NoPortError:
-                spare = self._registry.spare(host)
+                spare = self.registry.spare(host)
                 if spare is None:
                     raise
-                self._enactor.carry_out(self._graph.forgotten(spare))
+                self.enactor.carry_out(self.graph.forgotten(spare))
 
 
 class MakingRoomForNobody:

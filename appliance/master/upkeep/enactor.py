@@ -5,6 +5,7 @@ What the store was told of the registry comes back after a restart (`restore`).
 
 import asyncio
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import assert_never
 
 import structlog
@@ -54,54 +55,43 @@ from appliance.store.state import IncarnationRow, RegistrationRow, StateStore
 _log = structlog.get_logger()
 
 
+@dataclass(slots=True)
 class Enactor:
     """Tells nodes, relays, ROSMaster, the store and the audit log. ROSMaster hears of changes in their order."""
 
-    def __init__(
-        self,
-        graph: Graph,
-        entries: Entries,
-        *,
-        store: StateStore,
-        trail: AuditTrail,
-        delivery: Delivery,
-        relay: RelayControl,
-        faces: Faces,
-        places: Places,
-    ) -> None:
-        self._graph = graph
-        self._entries = entries
-        self._store = store
-        self._trail = trail
-        self._delivery = delivery
-        self._relay = relay
-        self._faces = faces
-        self._places = places
-        self._last: asyncio.Task[None] | None = None  # of what ROSMaster is told
+    graph: Graph
+    entries: Entries
+    store: StateStore
+    trail: AuditTrail
+    delivery: Delivery
+    relay: RelayControl
+    faces: Faces
+    places: Places
+    _last: asyncio.Task[None] | None = None  # of what ROSMaster is told
 
     def carry_out(self, effects: Iterable[Effect]) -> None:
         """Do all of this, now and in this order; what ROSMaster is told is done in its turn."""
         for effect in effects:
             match effect:
                 case TellNode(node, call):
-                    self._delivery.push(node, call)
+                    self.delivery.push(node, call)
                 case DropCalls(node):
-                    self._delivery.drop(node)
+                    self.delivery.drop(node)
                 case CloseNode(node):
-                    self._relay.carried.forgotten(node.key)
-                    self._faces.close(node)
+                    self.relay.carried.forgotten(node.key)
+                    self.faces.close(node)
                 case UsePorts(ports):
-                    self._places.policy_changed(ports)
+                    self.places.policy_changed(ports)
                 case PutBack() | TakeBack():
                     self._last = asyncio.get_running_loop().create_task(self._tell_master(effect, self._last))
                 case SaveGrant(row):
-                    self._store.save_permission(row)
+                    self.store.save_permission(row)
                 case EraseGrant(row):
-                    self._store.remove_permission(row)
+                    self.store.remove_permission(row)
                 case SaveNode() | EraseNode() | SaveRegistration() | EraseRegistration():
-                    write(effect, self._store)
+                    write(effect, self.store)
                 case Record():
-                    self._trail.happened(
+                    self.trail.happened(
                         effect.event,
                         effect.reason,
                         severity=effect.severity,
@@ -121,17 +111,17 @@ class Enactor:
     ) -> None:
         match effect:
             case Place(node, kind, resource, detail):
-                self._relay.place(node, kind, resource, detail)
+                self.relay.place(node, kind, resource, detail)
             case Withdraw(node, kind, resource):
-                self._relay.withdraw(node, kind, resource)
+                self.relay.withdraw(node, kind, resource)
             case PlaceNode(node):
-                self._relay.place_node(node)
+                self.relay.place_node(node)
             case WithdrawNode(node):
-                self._relay.withdraw_node(node)
+                self.relay.withdraw_node(node)
             case PlaceGrant(row):
-                self._relay.place_grant(row)
+                self.relay.place_grant(row)
             case RevokeGrant(row):
-                self._relay.revoke_grant(row)
+                self.relay.revoke_grant(row)
             case _:
                 assert_never(effect)
 
@@ -140,17 +130,17 @@ class Enactor:
     async def put_back(self, node: Incarnation, registrations: Sequence[Registration]) -> None:
         """Tell ROSMaster what a returned node has. A call that fails is made up for by the reconcile loop."""
         try:
-            values = await self._entries.put_back(node, registrations)
+            values = await self.entries.put_back(node, registrations)
         except CallFailedError as error:
             _not_told(node, error)
             return
         for key, value in values:
-            self.carry_out(self._graph.tell_parameter(node, key, value))
+            self.carry_out(self.graph.tell_parameter(node, key, value))
 
     async def take_out(self, node: Incarnation, registrations: Sequence[Registration]) -> None:
         """Tell ROSMaster what a lost node has no more. A call that fails is made up for by the reconcile loop."""
         try:
-            await self._entries.end_lost(node, registrations)
+            await self.entries.end_lost(node, registrations)
         except CallFailedError as error:
             _not_told(node, error)
 
@@ -164,7 +154,7 @@ class Enactor:
         if (taken.kind, taken.resource) in node.registrations:  # it has been granted again
             return
         try:
-            await self._entries.end(node, taken.kind, taken.resource)
+            await self.entries.end(node, taken.kind, taken.resource)
         except CallFailedError as error:
             _not_told(node, error)
 

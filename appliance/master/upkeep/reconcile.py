@@ -13,6 +13,7 @@ Whatever happened (ROSMaster died, control died, a call was cut in its middle) i
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import cast
 
 import structlog
@@ -32,105 +33,91 @@ from appliance.rpc.client import CallFailedError
 
 _log = structlog.get_logger()
 _RETRY_SECONDS = 0.1
+_ROUND_SECONDS = 30.0
 Seen = set[tuple[Kind, str, str]]
 
 
+@dataclass(frozen=True, slots=True)
 class Reconciler:
-    """Runs rounds when ROSMaster is in doubt and every `interval` seconds. `ready` is set after the first whole one."""
+    """Runs rounds when ROSMaster is in doubt and every `_ROUND_SECONDS`. `ready` is set after the first whole one."""
 
-    def __init__(  # noqa: PLR0917 - the parts it compares
-        self,
-        rosmaster: RosMaster,
-        entries: Entries,
-        registry: Registry,
-        faces: Faces,
-        graph: Graph,
-        revocation: Revocation,
-        enactor: Enactor,
-        parameters: ParameterMirror,
-        trail: AuditTrail,
-        *,
-        own_parameters: Callable[[], Tree],
-        interval: float = 30.0,
-    ) -> None:
-        self._rosmaster = rosmaster
-        self._entries = entries
-        self._registry = registry
-        self._faces = faces
-        self._graph = graph
-        self._revocation = revocation
-        self._enactor = enactor
-        self._parameters = parameters
-        self._trail = trail
-        self._own_parameters = own_parameters
-        self._interval = interval
-        self.ready = asyncio.Event()
+    rosmaster: RosMaster
+    entries: Entries
+    registry: Registry
+    faces: Faces
+    graph: Graph
+    revocation: Revocation
+    enactor: Enactor
+    parameters: ParameterMirror
+    trail: AuditTrail
+    own_parameters: Callable[[], Tree]
+    ready: asyncio.Event = field(default_factory=asyncio.Event, init=False)
 
     def wake(self) -> None:
         """Something happened: run a round now."""
-        self._rosmaster.doubtful.set()
+        self.rosmaster.doubtful.set()
 
     async def run(self) -> None:
         """Run until cancelled; a round that fails is tried again until it succeeds."""
         while True:
-            self._rosmaster.doubtful.clear()
+            self.rosmaster.doubtful.clear()
             try:
                 await self.round()
             except CallFailedError as error:
-                self._rosmaster.shut()
+                self.rosmaster.shut()
                 _log.warning("the ROS Master is away", error=str(error))
                 await asyncio.sleep(_RETRY_SECONDS)
                 continue
             self.ready.set()
             try:
-                async with asyncio.timeout(self._interval):
-                    await self._rosmaster.doubtful.wait()
+                async with asyncio.timeout(_ROUND_SECONDS):
+                    await self.rosmaster.doubtful.wait()
             except TimeoutError:
                 pass
 
     async def round(self) -> None:
         """Compare what ROSMaster has with what the registry has, once, and settle every difference."""
-        async with self._rosmaster.alone():
-            pid = (await self._rosmaster.call_now("getPid", NAME))[2]
-            if pid == self._entries.pid:
+        async with self.rosmaster.alone():
+            pid = (await self.rosmaster.call_now("getPid", NAME))[2]
+            if pid == self.entries.pid:
                 await self._compare()
             elif (
-                self._entries.pid is None
-                and (await self._rosmaster.call_now("hasParam", NAME, "/run_id"))[2] is True
+                self.entries.pid is None
+                and (await self.rosmaster.call_now("hasParam", NAME, "/run_id"))[2] is True
             ):
-                tree = (await self._rosmaster.call_now("getParam", NAME, "/"))[2]
-                self._parameters.replace(cast(Tree, tree))
-                types = (await self._rosmaster.call_now("getTopicTypes", NAME))[2]
-                self._registry.adopt_types(cast(list[tuple[str, str]], types))
+                tree = (await self.rosmaster.call_now("getParam", NAME, "/"))[2]
+                self.parameters.replace(cast(Tree, tree))
+                types = (await self.rosmaster.call_now("getTopicTypes", NAME))[2]
+                self.registry.adopt_types(cast(list[tuple[str, str]], types))
                 await self._compare()
                 self._tell_parameters()
             else:
                 await self._rebuild()
-            self._entries.pid = cast(int, pid)
+            self.entries.pid = cast(int, pid)
 
     def _tell_parameters(self) -> None:
         """Control is new: what it had not told yet, or not even heard of as done, is told."""
-        for node, registration in self._registry.in_order():
+        for node, registration in self.registry.in_order():
             if registration.kind is Kind.PARAMETER:
-                value, _ = standing_at(self._parameters.tree, registration.resource)
+                value, _ = standing_at(self.parameters.tree, registration.resource)
                 told = {} if value is None else settled(value)
-                self._enactor.carry_out(self._graph.tell_parameter(node, registration.resource, told))
+                self.enactor.carry_out(self.graph.tell_parameter(node, registration.resource, told))
 
     # --- a new ROSMaster ---
 
     async def _rebuild(self) -> None:
-        self._rosmaster.shut()
-        tree = {**self._own_parameters(), **self._parameters.tree}
-        await self._rosmaster.call_now("setParam", NAME, "/", tree)
-        self._parameters.replace(tree)
-        self._registry.forget_types()
-        made = len(await together(self._entries.make(*pair) for pair in self._registry.in_order()))
-        self._enactor.carry_out(self._graph.tell_everybody())
+        self.rosmaster.shut()
+        tree = {**self.own_parameters(), **self.parameters.tree}
+        await self.rosmaster.call_now("setParam", NAME, "/", tree)
+        self.parameters.replace(tree)
+        self.registry.forget_types()
+        made = len(await together(self.entries.make(*pair) for pair in self.registry.in_order()))
+        self.enactor.carry_out(self.graph.tell_everybody())
         if made:
             text = (
                 f"a new ROS Master was told {made} registrations and {len(tree)} parameter namespaces again"
             )
-            self._trail.happened("reconciled", text, registrations=made)
+            self.trail.happened("reconciled", text, registrations=made)
 
     # --- the same ROSMaster ---
 
@@ -138,29 +125,29 @@ class Reconciler:
         seen = await self._seen()
         wanted = {
             (registration.kind, registration.resource, incarnation.name): (incarnation, registration)
-            for incarnation, registration in self._registry.in_order()
+            for incarnation, registration in self.registry.in_order()
             if registration.kind
             is not Kind.PARAMETER  # ROSMaster does not tell who subscribed to a parameter
         }
         uris = await self._inner_uris({name for _kind, _resource, name in seen})
         missing = await together(
-            self._entries.make(*pair)
+            self.entries.make(*pair)
             for key, pair in wanted.items()
-            if key not in seen or uris.get(pair[0].name) != self._faces.inner_uri(pair[0])
+            if key not in seen or uris.get(pair[0].name) != self.faces.inner_uri(pair[0])
         )
         extra = sorted(entry for entry in seen if entry not in wanted)
         if extra:
-            rows = (await self._rosmaster.call_now("getTopicTypes", NAME))[2]
+            rows = (await self.rosmaster.call_now("getTopicTypes", NAME))[2]
             types = dict(cast(list[tuple[str, str]], rows))
             await together(
                 self._settle(kind, what, name, uris.get(name), types) for kind, what, name in extra
             )
         if missing or extra:
             text = f"{len(missing)} registrations were made again, {len(extra)} adopted or removed"
-            self._trail.happened("reconciled", text, made=len(missing), settled=len(extra))
+            self.trail.happened("reconciled", text, made=len(missing), settled=len(extra))
 
     async def _seen(self) -> Seen:
-        state = (await self._rosmaster.call_now("getSystemState", NAME))[2]
+        state = (await self.rosmaster.call_now("getSystemState", NAME))[2]
         publishers, subscribers, services = cast(list[list[tuple[str, list[str]]]], state)
         return {
             (kind, resource, name)
@@ -175,28 +162,26 @@ class Reconciler:
 
     async def _inner_uris(self, nodes: set[str]) -> dict[str, str]:
         names = sorted(nodes)
-        answers = await asyncio.gather(
-            *(self._rosmaster.call_now("lookupNode", NAME, name) for name in names)
-        )
+        answers = await asyncio.gather(*(self.rosmaster.call_now("lookupNode", NAME, name) for name in names))
         return {name: str(answer[2]) for name, answer in zip(names, answers, strict=True) if answer[0] == 1}
 
     async def _settle(
         self, kind: Kind, resource: str, name: str, inner: str | None, types: dict[str, str]
     ) -> None:
-        incarnation = self._faces.by_inner_uri(inner) if inner is not None else None
+        incarnation = self.faces.by_inner_uri(inner) if inner is not None else None
         if (
             incarnation is not None
             and incarnation.life is Life.LIVE
             and kind is not Kind.SERVICE
             and incarnation.name == name
             and (kind, resource) not in incarnation.shelf
-            and self._revocation.may_have(incarnation, kind, resource)
+            and self.revocation.may_have(incarnation, kind, resource)
         ):
-            adopted = self._graph.registered(incarnation, kind, resource, types.get(resource, "*"))
-            self._enactor.carry_out(adopted)
+            adopted = self.graph.registered(incarnation, kind, resource, types.get(resource, "*"))
+            self.enactor.carry_out(adopted)
             return
         # A service's real port is not known to ROSMaster, so an offer that was not written down is withdrawn.
-        call = self._rosmaster.call_now
+        call = self.rosmaster.call_now
         if kind is Kind.SERVICE:
             uri = stand_in(incarnation) if incarnation is not None else NO_SERVICE
             await call("unregisterService", name, resource, uri)
