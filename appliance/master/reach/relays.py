@@ -21,7 +21,7 @@ from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Places
 from appliance.master.reach.topic_looks import TopicLooks
-from appliance.master.reach.traffic import Carried, Connection, Traffic
+from appliance.master.reach.traffic import Carried, Traffic
 from appliance.policy import Policy
 from appliance.policy.limits import Part, Rate
 from appliance.policy.model import address_of
@@ -132,7 +132,7 @@ class RelayControl:
         return incarnation.relay_ports[self._allocation.of(_WORDS[kind], resource)]
 
     @property
-    def connections(self) -> dict[tuple[int, int], Connection]:
+    def connections(self) -> dict[tuple[int, int], messages.ConnectionOpened]:
         """Who is connected through which relay."""
         return self.carried.connections
 

@@ -5,6 +5,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from itertools import zip_longest
 
+import msgspec
+
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
@@ -18,21 +20,6 @@ MOST_RESOURCES = 2000
 OTHERS = "(others)"  # no name of ROS has a bracket
 
 _STILL_SECONDS = 3.0  # without a report: nothing flows
-
-
-@dataclass(frozen=True, slots=True)
-class Connection:
-    """A subscriber or client that is connected through a relay; `kind` is "topic" or "service".
-
-    `number` is unique among all relays.
-    """
-
-    number: int
-    key: str
-    resource: str
-    kind: str
-    host: str
-    caller_id: str
 
 
 @dataclass(slots=True)
@@ -79,7 +66,8 @@ class Carried:
         self._trail = trail
         self._registry = registry
         self._relays = relays
-        self.connections: dict[tuple[int, int], Connection] = {}
+        self.connections: dict[tuple[int, int], messages.ConnectionOpened] = {}
+        """By relay and its own number of them; the `number` in each is unique among all relays."""
         self.traffic: dict[tuple[str, str], Traffic] = {}
         self.limited_messages: Counter[tuple[str, str]] = Counter()
         """How many messages limits dropped, by topic and whose limit it was; of at most `MOST_RESOURCES` topics."""
@@ -153,14 +141,8 @@ class Carried:
 
     def opened(self, relay: int, message: messages.ConnectionOpened) -> None:
         """Somebody is connected."""
-        self.connections[relay, message.number] = Connection(
-            message.number * self._relays + relay,
-            message.key,
-            message.resource,
-            message.kind,
-            message.host,
-            message.caller_id,
-        )
+        number = message.number * self._relays + relay
+        self.connections[relay, message.number] = msgspec.structs.replace(message, number=number)
         name = self._name(message.key)
         self._trail.happened(
             "connection opened",

@@ -25,8 +25,8 @@ def test_ports_are_closed_once() -> None:
     In between the ports may have become another node's.
     """
     places, server = Told(), Told()
-    faces = cast(Any, Faces.__new__(Faces))
-    faces.places, faces.servers = places, {"key": server}
+    faces = Faces(cast(Any, None), cast(Any, places), *[cast(Any, None)] * 7)
+    faces.servers["key"] = cast(Any, server)
     uri = "http://10.0.0.5:4000/"
     host = ipaddress.ip_address("10.0.0.5")
     node = Incarnation("key", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 19001, 19002)
