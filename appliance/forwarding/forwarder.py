@@ -11,6 +11,7 @@ Invariants:
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,30 +37,21 @@ _SAVE_SECONDS = 1.0
 _log = structlog.get_logger()
 
 
+@dataclass(slots=True)
 class Forwarder:
     """Forwards the log at `log` to `receiver`; the position is kept in the file `kept`. Used by one thread."""
 
-    def __init__(
-        self,
-        log: Path,
-        kept: Path,
-        receiver: Receiver,
-        formatter: Formatter,
-        *,
-        chosen: Chosen,
-        clock: Callable[[], int] = time.time_ns,
-    ) -> None:
-        self._path = log
-        self._kept = kept
-        self._receiver = receiver
-        self._formatter = formatter
-        self._chosen = chosen
-        self._clock = clock
-        self._position: Position | None = None
-        self._saved: Position | None = None
-        self._saved_at = 0.0
-        self._failures = 0
-        self.progress = ForwardingReported()
+    log: Path
+    kept: Path
+    receiver: Receiver
+    formatter: Formatter
+    chosen: Chosen
+    clock: Callable[[], int] = time.time_ns
+    progress: ForwardingReported = field(default_factory=ForwardingReported)
+    _position: Position | None = None
+    _saved: Position | None = None
+    _saved_at: float = 0.0
+    _failures: int = 0
 
     def step(self) -> float:
         """Send the next batch; in how many seconds to come again."""
@@ -76,39 +68,39 @@ class Forwarder:
 
     def close(self) -> None:
         """Keep the position and let go of the receiver."""
-        self._receiver.close()
+        self.receiver.close()
         try:
             self._save(0.0)
         except OSError as error:
             _log.error("the position is not kept: some records will be forwarded again", error=str(error))
 
     def _begin(self) -> Position:
-        first, _last, log_id = _extent(self._path)
-        position = load_position(self._kept)
+        first, _last, log_id = _extent(self.log)
+        position = load_position(self.kept)
         if position is not None and position.log != log_id:
             _log.warning("another audit log is forwarded from its beginning", log=log_id, before=position.log)
             position = None
-        self._position = _in_log(self._path, position) if position else Position(log_id, first - 1)
+        self._position = _in_log(self.log, position) if position else Position(log_id, first - 1)
         return self._position
 
     def _forward(self, position: Position) -> bool:
         """Whether there is more."""
-        _first, head, log_id = _extent(self._path)
+        _first, head, log_id = _extent(self.log)
         if log_id != position.log or head < position.sequence:
             self._position = None
-            raise LogUnreadableError(f"{self._path}: another log than before; it is looked at afresh")
-        entries = search(self._path, Filter(), str(position.sequence), _BATCH, newest_first=False).entries
-        checkpoints = signed_checkpoints(self._path, position.checkpoint, _BATCH)
+            raise LogUnreadableError(f"{self.log}: another log than before; it is looked at afresh")
+        entries = search(self.log, Filter(), str(position.sequence), _BATCH, newest_first=False).entries
+        checkpoints = signed_checkpoints(self.log, position.checkpoint, _BATCH)
         missed = entries[0].sequence - position.sequence - 1 if entries else 0
         if missed:
             _log.error("retention removed records before they were forwarded", count=missed)
         through = entries[-1].sequence if entries else position.sequence
         ready = [checkpoint for checkpoint in checkpoints if checkpoint.sequence <= through or not entries]
         self._look(head - position.sequence, entries)
-        messages = [self._formatter.record(entry) for entry in entries if self._wanted(entry.record)]
-        messages += [self._formatter.checkpoint(checkpoint) for checkpoint in ready]
+        messages = [self.formatter.record(entry) for entry in entries if self._wanted(entry.record)]
+        messages += [self.formatter.checkpoint(checkpoint) for checkpoint in ready]
         if messages:
-            self._receiver.send(messages)
+            self.receiver.send(messages)
         last = ready[-1].number if ready else position.checkpoint
         self._position = Position(
             position.log, through, last, entries[-1].record.id if entries else position.record
@@ -125,7 +117,7 @@ class Forwarder:
 
     def _wanted(self, record: Record) -> bool:
         return (
-            self._chosen == "all"
+            self.chosen == "all"
             or record.decision in ("deny", "would deny")
             or record.severity in (Severity.WARNING, Severity.ALARM)
         )
@@ -136,10 +128,10 @@ class Forwarder:
         self.progress = msgspec.structs.replace(self.progress, behind=behind, seconds=seconds)
 
     def _waited(self, entries: list[Entry]) -> float:
-        return max(0.0, (self._clock() - entries[0].record.time) / 1e9) if entries else 0.0
+        return max(0.0, (self.clock() - entries[0].record.time) / 1e9) if entries else 0.0
 
     def _failed(self, reason: str) -> float:
-        self._receiver.close()
+        self.receiver.close()
         pause = _BACK_OFF[min(self._failures, len(_BACK_OFF) - 1)]
         if not self._failures:
             _log.error("the audit log is not forwarded; it is tried again and again", reason=reason)
@@ -151,7 +143,7 @@ class Forwarder:
         now = time.monotonic()
         if self._position is None or self._position == self._saved or now - self._saved_at < at_most_every:
             return
-        save_position(self._kept, self._position)
+        save_position(self.kept, self._position)
         self._saved, self._saved_at = self._position, now
 
 

@@ -7,6 +7,7 @@ there were is said. As with a node's own logger, DEBUG is left out.
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from appliance.channel.messages import MonitorEvent, OwnHeaderStated, OwnPublished
 from appliance.ros.definitions import Definitions
@@ -18,34 +19,28 @@ _LEVELS = {"DEBUG": DEBUG, "INFO": INFO, "WARN": WARN, "ERROR": ERROR, "FATAL": 
 _ALARMING = frozenset({"violation", "fail", "timeout"})  # categories of verdicts
 
 
+@dataclass(slots=True)
 class Rosout:
     """Puts reports of monitors on `/rosout` in the name of `node`; `publish(message)` sends one.
 
     `file_of(monitor)` is the file of its specification.
     """
 
-    def __init__(
-        self,
-        node: str,
-        publish: Callable[[OwnPublished], None],
-        file_of: Callable[[str], str],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._node = node
-        self._publish = publish
-        self._file_of = file_of
-        self._clock = clock
-        self._sequence = 0
-        self._second = 0
-        self._told = 0
-        self._left_out = 0
+    node: str
+    publish: Callable[[OwnPublished], None]
+    file_of: Callable[[str], str]
+    clock: Callable[[], float] = time.monotonic
+    _sequence: int = 0
+    _second: int = 0
+    _told: int = 0
+    _left_out: int = 0
 
     def reported(self, event: MonitorEvent) -> None:
         """A monitor did something; what is not output, a verdict or a fault is left to the audit log."""
         level, text = _words(event)
         if level < INFO:
             return
-        second = int(self._clock())
+        second = int(self.clock())
         if second != self._second:
             left, self._second, self._told, self._left_out = self._left_out, second, 0, 0
             if left:
@@ -59,9 +54,9 @@ class Rosout:
     def _say(self, time_ns: int, level: int, text: str, monitor: str) -> None:
         self._sequence += 1
         data = log_message(
-            self._sequence, time_ns, level, self._node, text, file=self._file_of(monitor), function=monitor
+            self._sequence, time_ns, level, self.node, text, file=self.file_of(monitor), function=monitor
         )
-        self._publish(OwnPublished(TOPIC, data))
+        self.publish(OwnPublished(TOPIC, data))
 
 
 def header(definitions: Definitions) -> OwnHeaderStated:

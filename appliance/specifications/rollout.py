@@ -11,7 +11,7 @@ its topics.
 import asyncio
 import itertools
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -40,41 +40,34 @@ class Revision:
     checked: Checked = field(default_factory=Checked)
 
 
+@dataclass(slots=True)
 class Rollout:
     """What the relays were told and what they said; `states(checked)` says of each monitor whether it is in force.
 
     `rows` has state and counters of the monitors, as far as their relays have told.
     """
 
-    def __init__(
-        self,
-        allocation: Allocation,
-        trail: AuditTrail,
-        on_fault: Literal["drop", "pass"],
-        states: Callable[[Checked], Mapping[str, Switch]],
-        relays: Relays,
-        *,
-        slices: int,
-    ) -> None:
-        self.allocation = allocation
-        self._relays = relays
-        self._trail = trail
-        self._on_fault: Literal["drop", "pass"] = on_fault
-        self._slices = slices
-        self._states = states
-        self._now = Revision()
-        self._known: set[int] = set()  # relays that had specifications before
-        self._fresh: set[int] = set()  # relays that have not answered since they are there
-        self._coming: tuple[Revision, Plan] | None = None  # being tried
-        self._answers: dict[int, asyncio.Future[list[str]]] = {}  # of those that gave something up
-        self._waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = {}  # by relay and statement
-        # Relays may outlive control: no number comes again.
-        self._numbers = itertools.count(time.monotonic_ns())
-        self._refusals: dict[int, list[str]] = {}
-        self._began: set[str] = set()  # by what is being changed
-        self._held: dict[int, set[str]] = {}
-        self._rows: dict[int, list[messages.MonitorRow]] = {}
-        self.rows: dict[str, messages.MonitorRow] = {}
+    allocation: Allocation
+    trail: AuditTrail
+    on_fault: Literal["drop", "pass"]
+    states: Callable[[Checked], Mapping[str, Switch]]
+    relays: Relays
+    slices: int
+    rows: dict[str, messages.MonitorRow] = field(default_factory=dict)
+    _now: Revision = field(default_factory=Revision)
+    _known: set[int] = field(default_factory=set)  # relays that had specifications before
+    _fresh: set[int] = field(default_factory=set)  # relays that have not answered since they are there
+    _coming: tuple[Revision, Plan] | None = None  # being tried
+    # Of those that gave something up.
+    _answers: dict[int, asyncio.Future[list[str]]] = field(default_factory=dict)
+    # By relay and statement.
+    _waiting: dict[tuple[int, int], asyncio.Future[list[str]]] = field(default_factory=dict)
+    # Relays may outlive control: no number comes again.
+    _numbers: Iterator[int] = field(default_factory=lambda: itertools.count(time.monotonic_ns()))
+    _refusals: dict[int, list[str]] = field(default_factory=dict)
+    _began: set[str] = field(default_factory=set)  # by what is being changed
+    _held: dict[int, set[str]] = field(default_factory=dict)
+    _rows: dict[int, list[messages.MonitorRow]] = field(default_factory=dict)
 
     @property
     def refused(self) -> list[str]:
@@ -113,11 +106,11 @@ class Rollout:
 
     def tell(self, monitor: str, message: messages.Message) -> bool:
         """Tell the relay that has a monitor; False when it is not there."""
-        return self._relays.send(message, self.relay_of(monitor))
+        return self.relays.send(message, self.relay_of(monitor))
 
     async def carried_out(self) -> None:
         """Wait until the relays have done what they were told: what comes after the answer is judged by it."""
-        await self._relays.carried_out()
+        await self.relays.carried_out()
 
     def resumed(self, monitor: str) -> None:
         """A monitor holds its topics no longer."""
@@ -135,15 +128,15 @@ class Rollout:
 
         Relays that are away are told when they are there. Raises `SpecificationsRefusedError`: nothing has changed.
         """
-        plan = self.allocation.plan(coming.checked, self._relays.carried_now())
+        plan = self.allocation.plan(coming.checked, self.relays.carried_now())
         self._began = set()
         for _ in range(_TRIES):
             await self._try(coming, plan)
-            tried, plan = plan, self.allocation.plan(coming.checked, self._relays.carried_now())
+            tried, plan = plan, self.allocation.plan(coming.checked, self.relays.carried_now())
             if plan == tried:
                 return self._settle(coming, plan)
             for relay in plan.losing - tried.losing:
-                self._relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
+                self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
         self._restate()
         raise SpecificationsRefusedError(["topics that would have to move come and go meanwhile; try again"])
 
@@ -182,7 +175,7 @@ class Rollout:
         answers: dict[int, asyncio.Future[list[str]]],
     ) -> None:
         """Tell a relay, and have its answer among these if it is there."""
-        if self._relays.send(statement, relay):
+        if self.relays.send(statement, relay):
             answers[relay] = asyncio.get_running_loop().create_future()
             self._waiting[relay, statement.statement] = answers[relay]
 
@@ -199,15 +192,15 @@ class Rollout:
         Those that have it already say so again.
         """
         self._now = coming
-        self._relays.withdraw(plan.moves)
+        self.relays.withdraw(plan.moves)
         self.allocation.adopt(plan)
         for relay in range(self.allocation.relays):
             statement = self._statement(coming, relay, self.allocation.of_file, plan.moved_files)
             if relay in plan.losing:
                 self._ask(relay, statement, self._answers)
             else:
-                self._relays.send(statement, relay)
-        self._relays.place(plan.moves)  # nothing to one that has just been asked: the plan goes one way
+                self.relays.send(statement, relay)
+        self.relays.place(plan.moves)  # nothing to one that has just been asked: the plan goes one way
         self._merge_rows()
         moved = [name for name, file in coming.checked.monitors.items() if file in plan.moved_files]
         if plan.moves:
@@ -226,7 +219,7 @@ class Rollout:
     def _say_moved(self, plan: Plan, monitors: list[str]) -> None:
         names = [move.name for move in plan.moves]
         anew = f"; {', '.join(monitors)} began in the initial state there" if monitors else ""
-        self._trail.happened(
+        self.trail.happened(
             "topics moved",
             f"{', '.join(names[:20])} {'are' if len(names) > 1 else 'is'} carried by another relay process{anew}",
             severity=Severity.ALARM if monitors else Severity.NOTICE,
@@ -238,7 +231,7 @@ class Rollout:
 
     def _restate(self) -> None:
         for relay in range(self.allocation.relays):
-            self._relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
+            self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
 
     def _statement(
         self,
@@ -252,19 +245,19 @@ class Rollout:
     ) -> messages.SpecificationsStated:
         files = [(name, text) for name, text in revision.sources.files.items() if of_file(name) == relay]
         mine = {name for name, file in revision.checked.monitors.items() if of_file(file) == relay}
-        states = self._states(revision.checked)
+        states = self.states(revision.checked)
         return messages.SpecificationsStated(
             revision.number,
             files,
             revision.sources.definitions,
             {name: states[name] is not False for name in revision.checked.monitors if name in mine},
             restarted,
-            self._on_fault,
+            self.on_fault,
             tuple(name for name, file in revision.checked.monitors.items() if name in mine and file in moved),
             next(self._numbers),
             ahead,
             tuple(name for name in revision.checked.monitors if name in mine and states[name] == TRIAL),
-            self._slices,
+            self.slices,
         )
 
     # --- what the relays say ---
@@ -291,7 +284,7 @@ class Rollout:
         if (relay, statement) in self._waiting:
             self._began |= set(began)
         if relay in self._fresh and began:
-            self._trail.happened(
+            self.trail.happened(
                 "monitors restarted",
                 f"a new relay process: {', '.join(began)} began in the initial state"
                 + (f"; {', '.join(held)} hold their topics until resumed" if held else ""),
@@ -307,7 +300,7 @@ class Rollout:
     def _refused(self, relay: int, number: int, findings: list[str], statement: int) -> None:
         if number == self._now.number:
             self._refusals[relay] = findings
-        self._trail.happened(
+        self.trail.happened(
             "specifications refused",
             f"the relay does not take revision {number}: {findings[0] if findings else ''}",
             severity=Severity.ALARM,

@@ -3,6 +3,7 @@
 import asyncio
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import structlog
@@ -40,28 +41,21 @@ def wanted(rows: Sequence[N], revision: int | None, present: int) -> N:
     return known[number]
 
 
+@dataclass(slots=True)
 class Trial:
     """A change that goes back by itself unless it is confirmed, over restarts of control and of the appliance.
 
-    `go_back(revision)` brings that revision into force. Where it raises one of `refusals`, it is called again after
-    `_AGAIN_SECONDS`: nobody is there who could do it by hand.
+    `setting` is the name under which the store has it. `go_back(revision)` brings that revision into force; where it
+    raises one of `refusals`, it is called again after `_AGAIN_SECONDS`: nobody is there who could do it by hand.
     """
 
-    def __init__(
-        self,
-        store: StateStore,
-        setting: str,
-        go_back: Callable[[int], Awaitable[object]],
-        refusals: tuple[type[Exception], ...],
-    ) -> None:
-        """`setting` is the name under which the store has it."""
-        self._store = store
-        self._setting = setting
-        self._go_back = go_back
-        self._refusals = refusals
-        self.task: asyncio.Task[None] | None = None
-        self._back_to = 0  # the last revision that needed no confirmation
-        self.confirm_by: float | None = None  # seconds since the epoch
+    store: StateStore
+    setting: str
+    go_back: Callable[[int], Awaitable[object]]
+    refusals: tuple[type[Exception], ...]
+    task: asyncio.Task[None] | None = None
+    confirm_by: float | None = None  # seconds since the epoch
+    _back_to: int = 0  # the last revision that needed no confirmation
 
     def announce(self, present: int, within: float | None) -> None:
         """A change comes; it is in the store before the revision is: control may die while the change is made."""
@@ -80,11 +74,11 @@ class Trial:
         if self.task is not None and self.task is not asyncio.current_task():
             self.task.cancel()
         self.task = self.confirm_by = None
-        self._store.save_setting(self._setting, "")
+        self.store.save_setting(self.setting, "")
 
     def resume(self) -> None:
         """Go on waiting after a start."""
-        kept = self._store.settings().get(self._setting, "")
+        kept = self.store.settings().get(self.setting, "")
         if kept:
             back_to, deadline, length = (*kept.split(), "inf")[:3]  # up to 0.1.0 the length was not kept
             within = float(length)
@@ -95,7 +89,7 @@ class Trial:
         return present if self.confirm_by is None else self._back_to
 
     def _save(self, back_to: int, deadline: float, within: float) -> None:
-        self._store.save_setting(self._setting, f"{back_to} {deadline} {within}")
+        self.store.save_setting(self.setting, f"{back_to} {deadline} {within}")
 
     def _await(self, back_to: int, deadline: float, within: float) -> None:
         self._back_to, self.confirm_by = back_to, deadline
@@ -106,8 +100,8 @@ class Trial:
         await asyncio.sleep(max(0.0, deadline - time.time()))
         while True:
             try:
-                await self._go_back(back_to)
-            except self._refusals as error:
+                await self.go_back(back_to)
+            except self.refusals as error:
                 _log.error("an unconfirmed change cannot go back yet", revision=back_to, error=str(error))
                 await asyncio.sleep(_AGAIN_SECONDS)
             except StoreError as error:

@@ -9,6 +9,7 @@ import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -79,6 +80,7 @@ _KINDS = {TOPIC: Kind.PUBLICATION, SERVICE: Kind.SERVICE}
 _WORDS = {kind: word for word, kind in _KINDS.items()}
 
 
+@dataclass(slots=True)
 class RelayControl:
     """What control knows and wants of the relays.
 
@@ -86,38 +88,27 @@ class RelayControl:
     answers calls of the service that the appliance itself offers; `monitors()` are what relays are told and tell of.
     """
 
-    def __init__(
-        self,
-        registry: Registry,
-        grants: Grants,
-        places: Places,
-        nodes: NodeApi,
-        carried: Carried,
-        *,
-        allocation: Allocation,
-        policy: Callable[[], Policy],
-        monitors: Callable[[], Monitors],
-        broken: Callable[[Incarnation], None],
-        own_header: messages.OwnHeaderStated | None,
-        own_call: Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]],
-    ) -> None:
-        self._registry = registry
-        self._grants = grants
-        self._places = places
-        self.carried = carried
-        self._nodes = nodes
-        self._broken = broken
-        self._allocation = allocation
-        self._policy = policy
-        self._monitors = monitors
+    registry: Registry
+    grants: Grants
+    places: Places
+    nodes: NodeApi
+    carried: Carried
+    allocation: Allocation
+    policy: Callable[[], Policy]
+    monitors: Callable[[], Monitors]
+    broken: Callable[[Incarnation], None]
+    own_header: messages.OwnHeaderStated | None
+    own_call: Callable[[messages.OwnServiceCalled], Awaitable[messages.OwnServiceAnswered]]
+    _posts: tuple[RelayPost, ...] = field(init=False)
+    _asking: set[asyncio.Task[None]] = field(default_factory=set)
+    _looks: TopicLooks = field(default_factory=TopicLooks)
+
+    def __post_init__(self) -> None:
+        """A place for each relay."""
         self._posts = tuple(
             RelayPost(index, partial(self._received, index), partial(self._lost, index))
-            for index in range(allocation.relays)
+            for index in range(self.allocation.relays)
         )
-        self._asking: set[asyncio.Task[None]] = set()
-        self._own_header = own_header
-        self._own_call = own_call
-        self._looks = TopicLooks()
 
     @property
     def presence(self) -> str:
@@ -129,7 +120,7 @@ class RelayControl:
 
     def port(self, incarnation: Incarnation, kind: Kind, resource: str) -> int:
         """The port that stands for a publication or a service of an incarnation."""
-        return incarnation.relay_ports[self._allocation.of(_WORDS[kind], resource)]
+        return incarnation.relay_ports[self.allocation.of(_WORDS[kind], resource)]
 
     @property
     def connections(self) -> dict[tuple[int, int], messages.ConnectionOpened]:
@@ -153,17 +144,17 @@ class RelayControl:
         self.carried.lost(index)
         post.attach(channel)
         post.send(
-            self._monitors().statement(index)
+            self.monitors().statement(index)
         )  # before anything is placed: nothing goes past the monitors
-        if self._own_header is not None:
-            post.send(self._own_header)
+        if self.own_header is not None:
+            post.send(self.own_header)
         with post.restating():
-            for incarnation in self._registry.live():
+            for incarnation in self.registry.live():
                 self._place(post, incarnation)
 
     def _lost(self, index: int, _reason: str) -> None:
         self.carried.lost(index)
-        self._monitors().relay_lost(index)
+        self.monitors().relay_lost(index)
 
     def send(self, message: messages.Message, relay: int) -> bool:
         """Tell a relay; False when it is not there."""
@@ -187,18 +178,18 @@ class RelayControl:
 
     def carries(self, relay: int, kind: str, resource: str) -> bool:
         """Whether a topic or service is carried by this relay."""
-        return self._allocation.of(kind, resource) == relay
+        return self.allocation.of(kind, resource) == relay
 
     def carried_now(self) -> set[Resource]:
         """Topics and services of nodes that live."""
         return {
             (_WORDS[registration.kind], registration.resource)
-            for _incarnation, registration in self._registry.in_order()
+            for _incarnation, registration in self.registry.in_order()
             if registration.kind in _WORDS
         }
 
     def _post(self, kind: str, resource: str) -> RelayPost:
-        return self._posts[self._allocation.of(kind, resource)]
+        return self._posts[self.allocation.of(kind, resource)]
 
     # --- what is wanted ---
 
@@ -210,7 +201,7 @@ class RelayControl:
                 self._place_one(
                     post, incarnation, registration.kind, registration.resource, registration.detail
                 )
-        for row in self._grants.of(incarnation.key):
+        for row in self.grants.of(incarnation.key):
             if self.carries(post.index, row.kind, row.resource):
                 self.place_grant(row)
 
@@ -219,7 +210,7 @@ class RelayControl:
     ) -> None:
         if incarnation.key not in post.placed:
             post.placed.add(incarnation.key)
-            listening = self._places.socket(incarnation.relay_ports[post.index])
+            listening = self.places.socket(incarnation.relay_ports[post.index])
             post.send(
                 messages.NodePlaced(
                     incarnation.key, incarnation.name, str(incarnation.host), incarnation.of_monitors
@@ -237,7 +228,7 @@ class RelayControl:
         """A subscriber or client is let in."""
         post = self._post(row.kind, row.resource)
         if row.kind == TOPIC:
-            post.send(_grant(self._policy(), row))
+            post.send(_grant(self.policy(), row))
         else:
             post.send(messages.ClientGranted(row.key, row.resource, row.host, row.caller_id))
 
@@ -260,7 +251,7 @@ class RelayControl:
         """
         for move in moves:
             post = self._posts[move.source]
-            for incarnation in self._registry.registered(_KINDS[move.kind], move.name):
+            for incarnation in self.registry.registered(_KINDS[move.kind], move.name):
                 _withdraw(post, incarnation, _KINDS[move.kind], move.name)
                 for row in self._rows_of(incarnation, move):
                     _revoke(post, row)
@@ -269,14 +260,14 @@ class RelayControl:
         """Carry what has moved, with its grants; the allocation is the new one."""
         for move in moves:
             kind, post = _KINDS[move.kind], self._posts[move.target]
-            for incarnation in self._registry.registered(kind, move.name):
+            for incarnation in self.registry.registered(kind, move.name):
                 detail = incarnation.registrations[kind, move.name].detail
                 self._place_one(post, incarnation, kind, move.name, detail)
                 for row in self._rows_of(incarnation, move):
                     self.place_grant(row)
 
     def _rows_of(self, incarnation: Incarnation, move: Move) -> list[PermissionRow]:
-        rows = self._grants.of(incarnation.key)
+        rows = self.grants.of(incarnation.key)
         return [row for row in rows if (row.kind, row.resource) == (move.kind, move.name)]
 
     def withdraw_node(self, incarnation: Incarnation) -> None:
@@ -292,7 +283,7 @@ class RelayControl:
             self._place(post, incarnation)
 
     def _publication(self, incarnation: Incarnation, topic: str, detail: str) -> messages.PublicationPlaced:
-        policy = self._policy()
+        policy = self.policy()
         return messages.PublicationPlaced(
             incarnation.key,
             topic,
@@ -311,10 +302,10 @@ class RelayControl:
                 self._asking.add(task)
                 task.add_done_callback(self._asking.discard)
             case messages.UpstreamLost():
-                incarnation = self._registry.by_key(message.key)
+                incarnation = self.registry.by_key(message.key)
                 if incarnation is not None:
                     self.carried.upstream_lost(message, str(incarnation.host))
-                    self._broken(incarnation)
+                    self.broken(incarnation)
             case messages.LatchRefused() | messages.MessagesLimited():
                 self._held_back(message)
             case messages.TrafficReported():
@@ -334,13 +325,13 @@ class RelayControl:
             case messages.PublicationRefused():
                 self.carried.publication_refused(message)
             case _:
-                self._monitors().received(message, post.index)
+                self.monitors().received(message, post.index)
 
     async def _answer(
         self, post: RelayPost, asked: messages.UpstreamWanted | messages.OwnServiceCalled
     ) -> None:
         if isinstance(asked, messages.OwnServiceCalled):
-            post.send(await self._own_call(asked))
+            post.send(await self.own_call(asked))
         else:
             await self._find_upstream(post, asked.key, asked.topic)
 
@@ -348,23 +339,23 @@ class RelayControl:
         """Messages were not kept or not passed on."""
         if isinstance(message, messages.MessagesLimited):
             for row in message.rows:
-                self.carried.limited(row, self._policy().limit_rule(row.topic) if row.topic else None)
+                self.carried.limited(row, self.policy().limit_rule(row.topic) if row.topic else None)
         else:
-            incarnation = self._registry.by_key(message.key)
+            incarnation = self.registry.by_key(message.key)
             if incarnation is not None:
                 self.carried.latch_refused(message, str(incarnation.host))
 
     async def _find_upstream(self, post: RelayPost, key: str, topic: str) -> None:
-        incarnation = self._registry.by_key(key)
+        incarnation = self.registry.by_key(key)
         if incarnation is None or (Kind.PUBLICATION, topic) not in incarnation.registrations:
             post.send(messages.UpstreamRefused(key, topic, "the node does not publish this topic any more"))
             return
         try:
-            answer = await self._nodes.call(incarnation, "requestTopic", RELAY_NAME, topic, [["TCPROS"]])
+            answer = await self.nodes.call(incarnation, "requestTopic", RELAY_NAME, topic, [["TCPROS"]])
             port = tcpros_port(answer)
         except CallFailedError as error:
             post.send(messages.UpstreamRefused(key, topic, str(error)))
-            self._broken(incarnation)
+            self.broken(incarnation)
             return
         post.send(messages.UpstreamFound(key, topic, str(incarnation.host), port))
 
