@@ -165,7 +165,7 @@ class Looks:
             shadows=lives.count(Life.SHADOW),
             topics=len({name for kind, name in named if kind in _TOPIC}),
             services=sum(kind is Kind.SERVICE for kind, _name in named),
-            connections=len(relay.connections),
+            connections=len(relay.carried.connections),
             messages=relay.carried.total.messages,
             dropped=relay.carried.total.dropped,
             audit=self.audit(),

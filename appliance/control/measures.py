@@ -64,7 +64,7 @@ def measures_of(parts: Parts, status: Status, hosts: list[Host], queued_deliveri
             what: sum(held.get(what, 0) for held in carried.memory.values())
             for what in ("frames", "queues", "latched", "headers")
         },
-        connections=dict(Counter(connection.kind for connection in parts.relay.connections.values())),
+        connections=dict(Counter(connection.kind for connection in parts.relay.carried.connections.values())),
     )
 
 

@@ -48,7 +48,9 @@ def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> lis
         for registration in incarnation.registrations.values():
             topic = registration.resource
             if registration.kind is Kind.PUBLICATION:
-                publisher = Publisher(**asdict(relay.flow(incarnation.key, topic)), node=incarnation.name)
+                publisher = Publisher(
+                    **asdict(relay.carried.flow(incarnation.key, topic)), node=incarnation.name
+                )
                 publishers.setdefault(topic, []).append(publisher)
             elif registration.kind is Kind.SUBSCRIPTION:
                 subscribers.setdefault(topic, []).append(incarnation.name)
@@ -69,7 +71,7 @@ def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> l
     relay = parts.relay
     return [
         Service(
-            **asdict(relay.flow(incarnation.key, registration.resource)),
+            **asdict(relay.carried.flow(incarnation.key, registration.resource)),
             name=registration.resource,
             node=incarnation.name,
             mediated=parts.mediation.carries_service(registration.resource),
@@ -84,6 +86,6 @@ def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> l
 def _connections(relay: RelayControl, kind: str, resource: str, names: dict[str, str]) -> list[Connection]:
     return [
         Connection(names[connection.key], connection.caller_id, connection.host)
-        for connection in relay.connections.values()
+        for connection in relay.carried.connections.values()
         if connection.kind == kind and connection.resource == resource and connection.key in names
     ]

@@ -125,7 +125,7 @@ class NodeCalls:
         """`getBusInfo(caller_id)` → `[[id, other end, direction, transport, topic, connected, text], …]`."""
         target, address = _target(caller), self.addresses.told_to(caller.peer)
         rows: list[Value] = []
-        for connection in self.relay.connections.values():
+        for connection in self.relay.carried.connections.values():
             if connection.kind != TOPIC_CONNECTION:
                 continue
             if connection.key == target.key:
@@ -148,12 +148,12 @@ class NodeCalls:
         target = _target(caller)
         connections = [
             connection
-            for connection in self.relay.connections.values()
+            for connection in self.relay.carried.connections.values()
             if connection.kind == TOPIC_CONNECTION
         ]
         published: list[Value] = []
         for topic in target.resources(Kind.PUBLICATION):
-            traffic = self.relay.traffic.get((target.key, topic))
+            traffic = self.relay.carried.traffic.get((target.key, topic))
             size, count = (traffic.bytes, traffic.messages) if traffic is not None else (0, 0)
             rows: list[Value] = [
                 [connection.number, size, count, True]
@@ -170,7 +170,7 @@ class NodeCalls:
                     and connection.caller_id == target.name
                     and connection.host == str(target.host)
                 ):
-                    traffic = self.relay.traffic.get((connection.key, topic))
+                    traffic = self.relay.carried.traffic.get((connection.key, topic))
                     rows.append([connection.number, traffic.bytes if traffic is not None else 0, -1, True])
             subscribed.append([topic, rows])
         return [1, "", [published, subscribed, []]]

@@ -14,7 +14,6 @@ from functools import partial
 from typing import Any
 
 from appliance.channel import messages
-from appliance.channel.answers.graph import Flow
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 from appliance.master.graph.grants import Grants
@@ -22,7 +21,7 @@ from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Places
 from appliance.master.reach.topic_looks import TopicLooks
-from appliance.master.reach.traffic import Carried, Traffic
+from appliance.master.reach.traffic import Carried
 from appliance.policy import Policy
 from appliance.policy.limits import Part, Rate
 from appliance.policy.model import address_of
@@ -121,20 +120,6 @@ class RelayControl:
     def port(self, incarnation: Incarnation, kind: Kind, resource: str) -> int:
         """The port that stands for a publication or a service of an incarnation."""
         return incarnation.relay_ports[self.allocation.of(_WORDS[kind], resource)]
-
-    @property
-    def connections(self) -> dict[tuple[int, int], messages.ConnectionOpened]:
-        """Who is connected through which relay."""
-        return self.carried.connections
-
-    @property
-    def traffic(self) -> dict[tuple[str, str], Traffic]:
-        """What went through each topic and service of each incarnation."""
-        return self.carried.traffic
-
-    def flow(self, key: str, resource: str) -> Flow:
-        """What went and goes through a topic or service of an incarnation."""
-        return self.carried.flow(key, resource)
 
     # --- the links ---
 

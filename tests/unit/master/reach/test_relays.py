@@ -283,9 +283,9 @@ async def test_one_relay_goes_and_its_connections_with_it() -> None:
     relay, (first, second) = world.relay, world.links
     for link, topic in ((first, "/left"), (second, "/right")):
         link.say(messages.ConnectionOpened(7, "key", topic, "topic", "10.0.0.5", "/ear"), ())
-    assert len({one.number for one in relay.connections.values()}) == 2
+    assert len({one.number for one in relay.carried.connections.values()}) == 2
     second.end()
-    assert [one.resource for one in relay.connections.values()] == ["/left"]
+    assert [one.resource for one in relay.carried.connections.values()] == ["/left"]
     assert (world.lost, relay.presence) == ([1], "1 of 2 are away")
     first.end()
     assert relay.presence == "away"
@@ -313,7 +313,7 @@ async def test_what_a_relay_could_not_tell_is_said() -> None:
     world = World()
     row = messages.TopicTraffic("key", "/left", 400, 4000, 0, 1)
     world.links[0].say(messages.TrafficReported([row], 40.0, 7), ())
-    assert world.relay.traffic["key", "/left"].messages_per_second == 10
+    assert world.relay.carried.traffic["key", "/left"].messages_per_second == 10
     ((event, reason, fields),) = world.records
     assert (event, fields["lost"]) == ("records lost", 7)
     assert "7 connections" in reason
