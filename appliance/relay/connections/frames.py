@@ -29,6 +29,9 @@ LARGE = 128 << 10
 SCRATCH = 512 << 10
 _KEEP_AREA = 8 << 20  # a frame of a camera: memory that is new for each one costs four times the rest
 
+LITTLE = 8
+"""Little is an eighth of what it stands in: it is copied rather than that the whole is held for it."""
+
 _MANY = 4  # frames
 _COLUMNS: dict[int, Literal["B", "H", "I"]] = {1: "B", 2: "H", 4: "I"}  # formats of so many bytes
 
@@ -67,6 +70,12 @@ class Batch:
         if self._kept is None:
             self._kept = self.view if self._owned else memoryview(bytes(self.view))
         return self._kept
+
+    def rest(self, sent: int) -> memoryview:
+        """What is behind the first `sent` bytes, in memory that stays as it is: of its own if it is little."""
+        if self._kept is None and LITTLE * (len(self.view) - sent) <= len(self.view):
+            return memoryview(bytes(self.view[sent:]))
+        return self.keep()[sent:]
 
     def within(self, size: float, most: int) -> int:
         """How many of the first `most` frames begin within so many bytes."""

@@ -6,12 +6,13 @@ subscriber), and apart from them the rest of a frame whose first bytes have been
 
 Invariants:
 - Bytes leave in the order they came; a frame whose first byte was sent is sent whole.
+- What is left of that frame is counted, and the memory that is held for it is less than `LITTLE` times as much.
 - After `trim`, at most `queue_messages` frames and `queue_bytes` wait besides the one being sent.
 """
 
 from collections import deque
 
-from appliance.relay.connections.frames import boundary_at
+from appliance.relay.connections.frames import LITTLE, boundary_at
 from appliance.relay.connections.memory import HostShare
 from appliance.relay.limits import Limits
 
@@ -68,14 +69,15 @@ class Outbox:
             or (self._messages > 0 and self._share.exhausted)
         )
 
-    def append(self, view: memoryview, messages: int, sent: int = 0) -> None:
-        """Queue a batch that stays as it is, of which the first `sent` bytes are sent already."""
+    def append(self, view: memoryview, messages: int, sent: int = 0, rest: memoryview | None = None) -> None:
+        """Queue a batch of which the first `sent` bytes are sent already. It stays as it is, or its `rest` does."""
         if sent:
+            rest = view[sent:] if rest is None else rest
             gone, end = boundary_at(view, sent)
             if end > sent:
-                self.begin(view[sent:end])
+                self.begin(rest[: end - sent])
                 gone += 1
-            view, messages = view[end:], messages - gone
+            view, messages = rest[end - sent :], messages - gone
         if messages:
             self._waiting.append((view, messages))
             self._count(messages, len(view))
@@ -83,7 +85,7 @@ class Outbox:
     def begin(self, rest: memoryview) -> None:
         """Something has been sent in part (a frame, or the connection header): `rest` goes before all
         else."""
-        self._started = rest
+        self._started = _apart(rest)
         self._share.add(len(rest))
 
     def vectors(self) -> list[memoryview]:
@@ -102,7 +104,7 @@ class Outbox:
             self._share.add(-taken)
             sent -= taken
             rest = self._started[taken:]
-            self._started = rest if len(rest) else None
+            self._started = _apart(rest) if len(rest) else None
         while sent:
             view, messages = self._waiting.popleft()
             self._count(-messages, -len(view))
@@ -150,3 +152,8 @@ class Outbox:
         self._messages += messages
         self._size += size
         self._share.add(size)
+
+
+def _apart(rest: memoryview) -> memoryview:
+    """The bytes; in memory of their own if they are little of what they stand in."""
+    return memoryview(bytes(rest)) if LITTLE * len(rest) <= memoryview(rest.obj).nbytes else rest

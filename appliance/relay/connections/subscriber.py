@@ -111,7 +111,10 @@ class Subscriber:
                 return 0
             if sent == len(view):
                 return 0
-            outbox.append(batch.keep(), batch.messages, sent)
+            if sent:
+                outbox.append(view, batch.messages, sent, batch.rest(sent))
+            else:
+                outbox.append(batch.keep(), batch.messages)
             self._write(True)
         if self.behind_since is None and outbox.behind:
             self.behind_since = self._loop.clock()

@@ -167,6 +167,18 @@ def test_a_kept_batch_survives_the_reuse_of_its_buffer() -> None:
     assert (bytes(last.view), last.messages, last.last) == (frame(4, 2), 1, 0)
 
 
+def test_for_little_of_a_large_frame_its_memory_is_not_kept() -> None:
+    """The next frame is received there; for more of it, or where all is kept already, nothing is copied."""
+    view = memoryview(bytearray(frame(1 << 20)))
+    batch = Batch(view, 1, 0, owned=True)
+    little, kept = batch.rest(len(view) - 1000), batch.kept
+    view[-1] = 99
+    assert bytes(little) == frame(1 << 20)[-1000:]
+    assert batch.rest(1000).obj is view.obj
+    assert (kept, batch.kept) == (False, True)
+    assert batch.rest(len(view) - 1000).obj is view.obj
+
+
 def test_boundary_at_finds_the_frame_a_send_stopped_in() -> None:
     """How many frames are sent, and where the one in progress ends."""
     view = memoryview(frame(6) + frame(0) + frame(10))

@@ -6,6 +6,7 @@ from dataclasses import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from appliance.relay.connections.frames import LITTLE
 from appliance.relay.connections.outbox import Outbox
 from appliance.relay.limits import Limits
 from tests.support.examples import examples
@@ -81,6 +82,17 @@ def test_the_outbox_does_what_a_list_of_frames_does(script: list[list[int] | flo
         assert budget.used == len(naive.started) + outbox.size
     outbox.clear()
     assert budget.used == 0
+
+
+def test_the_memory_of_a_message_that_is_nearly_sent_is_given_back() -> None:
+    """What is held is not much more than what is counted, however little of it the subscriber takes at a time."""
+    outbox, whole = Outbox(LIMITS, share(1 << 30)), frame(1 << 20)
+    outbox.append(memoryview(whole), 1, 1)
+    while outbox:
+        [view] = outbox.vectors()
+        assert bytes(view) == whole[-outbox.begun :]
+        assert memoryview(view.obj).nbytes < LITTLE * outbox.begun
+        outbox.advance(max(1, outbox.begun // 3))
 
 
 def test_a_message_that_has_been_started_is_never_dropped() -> None:
