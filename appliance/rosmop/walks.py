@@ -21,6 +21,7 @@ from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, SOONER, TOLD, Feed, FeedModule, module_of
 from appliance.rosmop.ir.layout import POSITION, SURE, UNDO, Cells
 from appliance.rosmop.ir.output import HEAD
+from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
 from appliance.rosmop.ir.values import Values, struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
@@ -116,6 +117,8 @@ class Home:
         self._cells = struct.Struct(
             "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in cells.variables.values())
         )
+        self._texts = [(self._names.index(name), buffer) for name, buffer in cells.texts.items()]
+        self._generation = cells.generation
         self._source, self._until = cells.source, cells.until
         self._clocks = [(running[number], address) for number, address in cells.clocks.items()]
         self._due = due
@@ -133,7 +136,11 @@ class Home:
 
     def _enter(self) -> None:
         states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
-        values = (self._namespace[name] for name in self._names)
+        values = [self._namespace[name] for name in self._names]
+        if self._texts:
+            _LENGTH.pack_into(self._memory, self._generation, 0)
+            for place, buffer in self._texts:
+                values[place] = self._entered(values[place], buffer)
         self._cells.pack_into(self._memory, self._base, *states, *values)
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
@@ -143,6 +150,13 @@ class Home:
         due = self._due(anew=False)
         _TIME.pack_into(self._memory, self._until, _NEVER if due is None else min(due - 1, _NEVER))
         self._inside = True
+
+    def _entered(self, text: bytes, buffer: int) -> int:
+        """Where a string is now, and how long it is (from bit 32 on)."""
+        if len(text) > MOST_KEPT:
+            return BEYOND << 32
+        self._memory[buffer : buffer + len(text)] = text
+        return buffer | len(text) << 32
 
     def hasten(self) -> None:
         """A deadline is earlier than what was due."""
@@ -164,11 +178,18 @@ class Home:
         for running, address in self._clocks:
             run: Any = running.run
             run.since, run.now = _CLOCK.unpack_from(self._memory, address)
-        self._namespace.update(zip(self._names, values[len(self._running) :], strict=True))
+        found = dict(zip(self._names, values[len(self._running) :], strict=True))
+        for place, _ in self._texts:
+            name = self._names[place]
+            at, size = found[name] & _ADDRESS, found[name] >> 32
+            found[name] = self._namespace[name] if size == BEYOND else bytes(self._memory[at : at + size])
+        self._namespace.update(found)
 
 
 def _cell(kind: Type) -> str:
     """The `struct` code of a variable in the module's memory, 8 bytes."""
+    if isinstance(kind, kinds.String):
+        return "Q"
     if isinstance(kind, kinds.Bool):
         return "?7x"
     if isinstance(kind, kinds.Integer) and kind.bits <= 32:
@@ -216,6 +237,7 @@ class Walker:
         self._later = struct.Struct(f"<{len(events) + len(feed.verdicts)}q")
         self._before: Sequence[int] = (0,) * (len(events) + len(feed.verdicts))
         self._call = home.machine.function(feed.name)
+        self._settle = home.machine.function(feed.settle) if feed.settle else None
 
     def writers(self, who: int) -> tuple[str, ...]:
         """What outcomes have as `changed_by`, from a set of events: bit N stands for event N."""
@@ -273,7 +295,7 @@ class Walker:
             try:
                 answer = self._call(frames + position, end, time_ns) or 0
             except MachineTrap:
-                answer = self._stopped()
+                answer = self._stopped(frames + position, end, time_ns)
             said |= answer
             seconds += self._put_out(lines, prepared.clock) if self._lines else 0
             if answer >= LEFT:
@@ -376,11 +398,21 @@ class Walker:
             at += line.size
         return clock() - began
 
-    def _stopped(self) -> int:
-        """What the module would have answered where it was stopped: the message that it looked at is left."""
+    def _stopped(self, *call: int) -> int:
+        """What the module would have answered where it was stopped: the message that it looked at is left.
+
+        If none had begun it is called again: the calls before have used up the fuel.
+        """
         self._home.machine.refuel(FUEL)
         at, effect = _POSITION.unpack_from(self._memory, POSITION)
-        return int(at | (effect + _EFFECT.size - self._effects) // _EFFECT.size << 32 | LEFT | TOLD)
+        if at:
+            _POSITION.pack_into(self._memory, POSITION, 0, effect)
+            effects = (effect + _EFFECT.size - self._effects) // _EFFECT.size
+            return int(at | effects << 32 | LEFT | TOLD | SOONER)  # there may be an earlier deadline
+        try:
+            return self._call(*call) or 0
+        except MachineTrap:
+            return self._stopped(*call)
 
     def _undo(self) -> None:
         """Take back what was done to the message that is left."""
@@ -390,6 +422,9 @@ class Walker:
         end = _LENGTH.unpack_from(memory, UNDO)[0]
         for at, size, old in [*_LOG.iter_unpack(memory[self._feed.log : end])][::-1]:
             memory[at : at + size] = old[:size]
+        if self._settle is not None:
+            self._home.machine.refuel(FUEL)
+            self._settle()
 
     def _counted(self) -> tuple[Sequence[int], Sequence[int]]:
         """How many messages each event has dropped, and how often there was each verdict, since this was last asked."""

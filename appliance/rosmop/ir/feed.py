@@ -6,7 +6,8 @@ one begins that is left (i64: the low 32 bits), how many effects there are (the 
 Python.
 
 - A message is either done, with all that follows from it, or left, and then `Feed.undo` says how to take back what was
-  begun. After a trap the message that is left begins at the number that stands at `POSITION`.
+  begun. After a trap the message that is left begins at the number that stands at `POSITION`; if that is 0, nothing has
+  begun.
 - What holds for all messages stands at `Cells.source`: their sender; of which events (bit N for the topic's event N)
   a drop is left, and with `LOUD` a change is (*told*); bits of the topic's specifications (*enabled*), and of which
   verdicts (bit N for `Feed.verdicts[N]`) are only counted (*counted*): what comes to another is left.
@@ -23,6 +24,7 @@ from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.assembly import PAGE, assembled
 from appliance.rosmop.ir.layout import NOW, POSITION, SAID, SURE, UNDO, Cells, NotScalarError
 from appliance.rosmop.ir.module import CHANGED, DROPPED, HAPPENED, RESET, Writer, Written
 from appliance.rosmop.ir.output import Line
@@ -41,7 +43,6 @@ from appliance.rosmop.ir.wasm import (
     load,
     row,
     store,
-    text,
     unsigned,
 )
 from appliance.rosmop.runtime.context import BUDGET
@@ -63,7 +64,6 @@ MAX_EFFECTS = 4096
 MAX_TABLES = 8 << 20
 """Bytes that the tables of all properties of a set may take."""
 
-_PAGE = 1 << 16
 _SLACK = 16  # bytes behind the frames that may be looked at
 _ADD, _SUB, _AND, _EQZ = b"\x6a", b"\x6b", b"\x71", b"\x45"
 _AND64, _OR64, _XOR64, _SHL64, _SHR64, _EQZ64 = b"\x83", b"\x84", b"\x85", b"\x86", b"\x88", b"\x50"
@@ -90,6 +90,8 @@ class Feed:
     brief: bool
     functions: Sequence[int]
     says: bool
+    settle: str
+    """The export that is called when what was done to the message that is left is taken back; none if it is empty."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,8 @@ class FeedModule:
     budgets: Mapping[str, int]
     """Where the budget of each specification stands, by its context."""
     lines: Sequence[Line]
+    strings: Mapping[bytes, int]
+    """Where constant strings stand."""
     said: int
     """Where lines of output are noted, by their places among the `lines`."""
 
@@ -132,18 +136,29 @@ def module_of(
         shared |= dict.fromkeys(variables, cells[-1])
     effects = writer.take(16 * (MAX_EFFECTS + 2))
     feeds: dict[str, Feed] = {}
-    walks, tables = [], _Tables(writer)
+    walks: dict[str, _Walk] = {}
+    tables = _Tables(writer)
     for component, own in zip(components, cells, strict=True):
         for topic, events in component.topics:
             try:
-                walk = _Walk(writer, own, tables, effects, events, stamped=topic in stamped)
+                walks[topic] = _Walk(writer, own, tables, effects, events, stamped=topic in stamped)
             except (NotScalarError, RecursionError):
                 continue
-            walks.append(walk.code())
-            feeds[topic] = walk.feed(f"feed {len(feeds)}")
-    frames = -(-writer.take(0) // _PAGE) * _PAGE  # the kernel copies faster from and to what is aligned
-    memory = -(-(frames + AREA + _SLACK) // _PAGE) * _PAGE
-    code = _assembled(writer, walks, feeds, tables, memory)
+    settled = [writer.settling(own) for own in cells if own.kept]
+    codes: list[bytes] = []
+    for topic, walk in walks.items():
+        try:
+            codes.append(walk.code())
+        except (NotScalarError, RecursionError):
+            continue
+        feeds[topic] = walk.feed(f"feed {len(feeds)}")
+    frames = -(-writer.take(0) // PAGE) * PAGE  # the kernel copies faster from and to what is aligned
+    memory = -(-(frames + AREA + _SLACK) // PAGE) * PAGE
+    wholes = [(one.parameters, one.result, one.code) for one in writer.written]
+    exports = {f"settle {number}": number for number in settled}
+    exports |= {feed.name: len(wholes) + place for place, feed in enumerate(feeds.values())}
+    wholes += [(_PARAMETERS, I64, code) for code in codes]
+    code = assembled(wholes, exports, writer.constants, memory)
     return FeedModule(
         code,
         memory,
@@ -154,6 +169,7 @@ def module_of(
         writer.throttles,
         writer.budgets,
         writer.lines,
+        {raw: writer.constants[raw] for raw in writer.strings},
         writer.said,
     )
 
@@ -163,7 +179,6 @@ class _Tables:
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer
-        self.known: dict[bytes, int] = {}
         self._size = 0
 
     def address(self, table: tuple[int, ...], code: str = "h") -> int:
@@ -171,12 +186,11 @@ class _Tables:
             raw = struct.pack(f"<{len(table)}{code}", *table)
         except struct.error:
             raise NotScalarError("a table of a property") from None
-        if raw not in self.known:
+        if raw not in self._writer.constants:
             self._size += len(raw)
             if self._size > MAX_TABLES:
                 raise NotScalarError("tables of properties")
-            self.known[raw] = self._writer.take(len(raw))
-        return self.known[raw]
+        return self._writer.constant(raw)
 
 
 _AT, _END, _NOW, _TOLD, _ENABLED = range(5)
@@ -228,6 +242,7 @@ class _Walk:
         assigned = sorted(
             {name for written in functions for name in written.assigned}.difference(cells.noted)
         )
+        self._settles = not set(cells.kept).isdisjoint(assigned)
         self._undo = tuple((cells.variables[name][0], writer.take(8)) for name in assigned)
         self._log = writer.take(16 * sum(written.writes for written in self._written))
         properties = {
@@ -264,6 +279,7 @@ class _Walk:
             all(written.brief for written in (*self._written, *self._run())),
             [written.number for written in self._written],
             self._says,
+            f"settle {self._cells.settle}" if self._settles else "",
         )
 
     def _run(self) -> list[Written]:
@@ -312,6 +328,8 @@ class _Walk:
         here += constant(I32, 4) + b"\x76\xad" + constant(I64, 32) + _SHL64 + _OR64
         if self.verdicts:
             here += _get(self._telling + 2) + b"\xad" + constant(I64, TOLD.bit_length() - 1) + _SHL64 + _OR64
+        settle = b"\x10" + unsigned(self._cells.settle) + b"\x1a" if self._settles else b""
+        over = store(I32, POSITION, constant(I32, 0))
         body = [
             store(I64, NOW, _get(_NOW)),
             store(I32, EFFECT, constant(I32, self._effects)),
@@ -330,8 +348,8 @@ class _Walk:
             self._dropped(), END,
             self._done(),
             _BR + b"\x00", END, END,
-            here, _get(self._sooner), b"\xad", constant(I64, 61), _SHL64, _OR64, RETURN, END,
-            here, constant(I64, LEFT), _OR64, END,
+            settle, over, here, _get(self._sooner), b"\xad", constant(I64, 61), _SHL64, _OR64, RETURN, END,
+            over, here, constant(I64, LEFT), _OR64, END,
         ]  # fmt: skip
         numbered = [I32] * (len(self._events) + len(self._states) + 3)
         made = [I64, I64, I32, I32, I64, I32, *numbered, *[I64] * (3 * len(self._clocks) + 2)]
@@ -585,32 +603,3 @@ class _Walk:
             code += _set(some, constant(I32, 0)) + _set(ever, constant(I32, 1)) + END
         code += _set(_AT, _get(_NEXT)) + self._begin()
         return code + (_get(self._sooner) + _BR_IF + b"\x01" if self._clocks else b"")
-
-
-def _assembled(
-    writer: Writer, walks: Sequence[bytes], feeds: Mapping[str, Feed], tables: _Tables, memory: int
-) -> bytes:
-    first = len(writer.written)
-    shapes = [(function.parameters, function.result) for function in writer.written]
-    shapes += [(_PARAMETERS, I64)] * len(walks)
-    types = [
-        b"\x60" + row([bytes((kind,)) for kind in given]) + row([bytes((result,))])
-        for given, result in shapes
-    ]
-    exports = [
-        text(feed.name) + b"\x00" + unsigned(first + index) for index, feed in enumerate(feeds.values())
-    ]
-    pages = unsigned(memory // _PAGE)
-    data = []
-    for raw, address in tables.known.items():
-        data.append(b"\x00" + constant(I32, address) + END + unsigned(len(raw)) + raw)
-    sections = (
-        (1, row(types)),
-        (3, row([unsigned(index) for index in range(len(types))])),
-        (5, row([b"\x01" + pages + pages])),
-        (7, row([*exports, text("memory") + b"\x02\x00"])),
-        (10, row([*(function.code for function in writer.written), *walks])),
-        (11, row(data)),
-    )
-    content = b"".join(bytes((number,)) + unsigned(len(part)) + part for number, part in sections)
-    return b"\0asm\x01\0\0\0" + content

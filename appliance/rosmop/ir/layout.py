@@ -1,9 +1,9 @@
 """What stands where in the memory of a module, and how large the values of a type are there.
 
-A variable of the set stands at its address, in 8 bytes.
+A variable of the set stands at its address, in 8 bytes: a number, or of a string where it is and how long (`texts.py`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from appliance.rosmop.ir import form
@@ -63,10 +63,21 @@ class Cells:
     """Where it stands (i64) when the next is due that Python knows of: an earlier deadline is told."""
     variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
     """Where each stands, and its type; in the order of the places."""
+    texts: dict[str, int] = field(default_factory=dict)
+    """Where strings may be put when there is 0 (i32) at `generation`, by the variable that holds them (`texts.py`)."""
+    generation: int = 0
+    settle: int = 0
+    """The number of the function that puts them there."""
+
+    @property
+    def kept(self) -> Sequence[str]:
+        """The variables that hold strings."""
+        return [name for name, (_, kind) in self.variables.items() if isinstance(kind, kinds.String)]
 
     def address(self, name: str, kind: Type) -> int:
         """Where a variable stands."""
-        machine_type(kind)
+        if not isinstance(kind, kinds.String):
+            machine_type(kind)
         place = self.base + 8 * (self.properties + len(self.variables))
         return self.variables.setdefault(name, (place, kind))[0]
 
@@ -83,6 +94,10 @@ class Layout:
         self.budgets: dict[str, int] = {}
         self.throttles: dict[tuple[str, int], int] = {}
         """Where it stands when output at a site of a specification was last due."""
+        self.constants: dict[bytes, int] = {}
+        """Where bytes stand from the beginning."""
+        self.strings: set[bytes] = set()
+        """Those of them that are strings."""
         self.lines: list[Line] = []
         self._used = FIRST
         self.said = self.take(LINES)
@@ -130,6 +145,12 @@ class Layout:
         at = self._used
         self._used += -(-size // 8) * 8
         return at
+
+    def constant(self, raw: bytes) -> int:
+        """Where these bytes stand from the beginning."""
+        if raw not in self.constants:
+            self.constants[raw] = self.take(len(raw))
+        return self.constants[raw]
 
     def budget(self, context: str) -> int:
         """Where the budget of a specification stands."""

@@ -1,15 +1,15 @@
 """A part of the form as WebAssembly: numbers, conditions, loops, what stands in the message, numbers put there, drops.
 
 Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
-has a fixed size (`places.py`).
+has a fixed size (`places.py`); strings are kept (`texts.py`).
 
 `Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
 
 - An event, and the handler of a verdict, takes where the message is in the memory and its size (i32, i32), and returns
   bits (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`, `RESET`.
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
-  it is taken back. Within a helper function it is a trap. Beyond are strings and vectors that are made, changed or
-  kept, whole messages, what is published, recursion, `sin` and its like. An event of which no message can
+  it is taken back. Within what it calls it is a trap. Beyond are strings and vectors that are made or changed,
+  vectors and messages that are kept, what is published, recursion, `sin` and its like. An event of which no message can
   come past such a place has no module: `NotScalarError` names what is beyond.
 - A line of output is noted behind those before, where `SAID` points, and the message at hand stands at `POSITION`
   (`output.py`).
@@ -39,18 +39,16 @@ from appliance.rosmop.ir.layout import (
     machine_type,
 )
 from appliance.rosmop.ir.output import BYTES, HEAD, Line, is_text
-from appliance.rosmop.ir.places import Places
+from appliance.rosmop.ir.texts import Texts, mismatch, settling
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.ir.wasm import (
     COMPARE,
     DROP,
-    ELSE,
     END,
     F32,
     F64,
     I32,
     I64,
-    IF,
     RETURN,
     STORE,
     UNREACHABLE,
@@ -118,8 +116,28 @@ class Writer(Layout):
             self.written.append(written)
         return self._numbers[key]
 
+    def mismatch(self) -> int:
+        """The number of the function that says where two strings differ."""
+        if ("mismatch",) not in self._numbers:
+            self._numbers["mismatch",] = self._added((I32, I32, I32), mismatch())
+        return self._numbers["mismatch",].number
 
-class _Body(Places):
+    def settling(self, cells: Cells) -> int:
+        """The number of the function that copies the strings of variables, which must all be known."""
+        cells.settle = self._added((), settling(self, cells)).number
+        return cells.settle
+
+    def _added(self, parameters: tuple[int, ...], code: bytes) -> Written:
+        """A function that no form has; what it returns is in 32 bits."""
+        written = Written(
+            len(self.written), parameters, I32, code, frozenset(), 0,
+            drops=False, brief=True, passes=True, says=False, early=False,
+        )  # fmt: skip
+        self.written.append(written)
+        return written
+
+
+class _Body(Texts):
     """Writes one function."""
 
     def __init__(
@@ -138,10 +156,8 @@ class _Body(Places):
         self._is_handler = answers and function.happens is None  # type: ignore[union-attr]  # has looked
         self._types = tuple(parameters.values())
         self._depends = False  # whether messages may have left before
-        self._assigned: set[str] = set()
         self._writes = 0
         self._drops = False
-        self._brief = True
         self._says = False
         self._early = False
         self._bits: tuple[tuple[str, int], ...] = ()
@@ -173,6 +189,9 @@ class _Body(Places):
             self._says,
             self._early,
         )
+
+    def _mismatch(self) -> int:
+        return self._writer.mismatch()
 
     # Statements
 
@@ -373,7 +392,9 @@ class _Body(Places):
         return self._cell(load, cells.address(node.name, node.type))
 
     def _assigned_to(self, node: form.Assign) -> bytes:
-        if isinstance(node.type, kinds.String | kinds.Vector) and node.name not in self._writer.shared:
+        if isinstance(node.type, kinds.String):
+            return self._assigned_text(node)
+        if isinstance(node.type, kinds.Vector) and node.name not in self._writer.shared:
             code, place, count = self._elements(node.value)
             code += place + self._set(f"place of {node.name}")
             return code + count + self._set(f"count of {node.name}", I64)
@@ -389,29 +410,6 @@ class _Body(Places):
 
     def _assign(self, node: form.Assign) -> bytes:
         return self._assigned_to(node) + self._read(form.Read(node.type, node.name))
-
-    def _compare_texts(self, node: form.CompareTexts) -> bytes:
-        """A string of the message and a short constant: as long, and the same bytes."""
-        given, known = (
-            (node.right, node.left) if isinstance(node.left, form.Literal) else (node.left, node.right)
-        )
-        if node.operator not in ("==", "!=") or not isinstance(known, form.Literal) or not node.short:
-            raise NotScalarError("std::string")
-        assert isinstance(known.value, bytes)  # noqa: S101  a constant of strings
-        first, place, count = self._elements(given)
-        if len(known.value) > form.SHORT:
-            raise NotScalarError("std::string")
-        same, at = constant(I32, 1), 0
-        while at < len(known.value):
-            size = max(size for size in (1, 2, 4, 8) if size <= len(known.value) - at)
-            number = int.from_bytes(known.value[at : at + size], "little")
-            machine, load = {1: (I32, 0x2D), 2: (I32, 0x2F), 4: (I32, 0x28), 8: (I64, 0x29)}[size]
-            same += place + bytes((load, 0)) + unsigned(at) + constant(machine, number)
-            same += bytes((COMPARE[machine]["=="],)) + b"\x71"
-            at += size
-        as_long = count + constant(I64, len(known.value)) + b"\x51"
-        code = first + as_long + IF + bytes((I32,)) + same + ELSE + constant(I32, 0) + END
-        return code + (b"\x45" if node.operator == "!=" else b"")
 
     def _log(self, node: form.Log) -> bytes:
         """Note the values of a line, and what line it is."""

@@ -6,7 +6,7 @@ function leaves the message to Python (which then judges it anew), or
 - the form neither faults nor publishes anything,
 - both say the same of whether the event happened, dropped the message, changed it,
 - and the bytes of the message, the variables and what is left of the budget are the same. (What lines of output say is
-  not compared.)
+  not compared, and an event that looks at a string that is kept, or changes one, is not proved.)
 
 Where it leaves the message, the walk takes back what it has done: each variable that it has written stands among those
 that are taken back, and each byte in the log (`module_terms.py`).
@@ -106,6 +106,9 @@ class Validation:
         self._clock = clock
         self._patience = patience
         self.codes = functions_of(module.code)
+        kept = [own.variables[name][0] for own in module.cells for name in own.kept]
+        self._strings = [range(at, at + 8) for at in kept]
+        self._strings += [range(at, at + len(raw)) for raw, at in module.strings.items()]
 
     def finding(self, topic: str, event: str, function: str, place: int) -> Finding:
         """What is known of the event that is at this place among those of a topic."""
@@ -122,7 +125,7 @@ class Validation:
     def _compared(self, name: str, number: int, topic: str) -> str:
         begin, cells, known = self._beginning()
         meant = Meaning(self._forms, self._values, begin, name).result()
-        done = Execution(self.codes, number, begin.message, begin.size, cells).done()
+        done = Execution(self.codes, number, begin.message, begin.size, cells, self._strings).done()
         self._check_undone(done, topic)
         left = either(done.trapped, done.bits == _ELSEWHERE)
         unknown = either(*meant.unknown.values())
@@ -195,6 +198,8 @@ class Validation:
         variables: dict[str, Term] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
+                if isinstance(kind, kinds.String):
+                    continue
                 variables[name] = cells[address] = _variable(name, kind)
                 if isinstance(kind, kinds.Time | kinds.Duration):
                     most = MAX_TIME + (1 << 32)
@@ -214,7 +219,8 @@ class Validation:
         """What each cell must hold at the end."""
         for component in self._module.cells:
             for name, (address, _) in component.variables.items():
-                yield address, meant.variables[name]
+                if name in meant.variables:
+                    yield address, meant.variables[name]
         for context, address in self._module.budgets.items():
             yield address, meant.budgets[context]
 

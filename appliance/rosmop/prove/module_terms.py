@@ -8,6 +8,8 @@ Three kinds of places are known, and an address that is none of them is a differ
 - the log, by which a message that is left is put back: whatever is written into the message was noted there before,
   address, size and the bytes that stood there, and a note is never written again.
 
+Of strings that variables keep, and of constant ones, nothing is known: who looks at them is not proved.
+
 What the function has left (`ELSEWHERE`) and a trap are the same: the walk takes back what was begun.
 """
 
@@ -84,12 +86,22 @@ class Done:
 
 
 class Execution:
-    """One event's function, by its number, begun with these cells (truths are numbers, too)."""
+    """One event's function, by its number, begun with these cells (truths are numbers, too).
 
-    def __init__(
-        self, functions: Sequence[Code], number: int, message: Term, size: Term, cells: Mapping[int, Term]
+    `strings` are the addresses of strings, and of the cells that say where they are.
+    """
+
+    def __init__(  # noqa: PLR0917  as `done` names them
+        self,
+        functions: Sequence[Code],
+        number: int,
+        message: Term,
+        size: Term,
+        cells: Mapping[int, Term],
+        strings: Sequence[range] = (),
     ) -> None:
         self._functions = functions
+        self._strings = strings
         self._size = size
         self._trapped: list[Term] = []
         self._outside: list[Term] = []
@@ -234,7 +246,7 @@ class Execution:
             return (
                 value if not missing else (z3.SignExt if how.endswith("_s") else z3.ZeroExt)(missing, value)
             )
-        place = _constant(address) + int(offset)
+        place = self._cell(address, int(offset))
         value = state.slots.get(("cell", place))
         if how or value is None or not _fits(value, family):
             raise DiffersError(
@@ -253,7 +265,7 @@ class Execution:
                 address, int(offset), size, value, state
             )
             return
-        place = _constant(address) + int(offset)
+        place = self._cell(address, int(offset))
         if place == UNDO and not how:
             self._add_note(value, state)
             return
@@ -267,6 +279,17 @@ class Execution:
         state.slots["cell", place] = value
         if place != SAID:
             self._stored.add(place)
+
+    def _cell(self, address: Any, offset: int) -> int:
+        """A constant address of what is no string."""
+        number = z3.simplify(_bits(address))
+        known = z3.is_bv_value(number)
+        place = int(number.as_long()) + offset if known else -1
+        if any(place in string for string in self._strings) or (self._strings and not known):
+            raise NotProvedError("uses a string that is kept, or a constant one")
+        if not known:
+            raise DiffersError("it looks at an address that is nowhere in the message")
+        return place
 
     def _within(self, pointer: Pointer, offset: int, size: int, state: State) -> Term:
         end = z3.ZeroExt(32, pointer.offset) + integer(offset + size, 64)
@@ -323,13 +346,6 @@ def _same(one: Term, other: Term) -> bool:
     """Whether they are plainly the same number; of two simplified terms one may be simpler."""
     rest = z3.simplify(one - other)
     return bool(z3.is_bv_value(rest) and rest.as_long() == 0)
-
-
-def _constant(address: Any) -> int:
-    number = z3.simplify(_bits(address))
-    if not z3.is_bv_value(number):
-        raise DiffersError("it looks at an address that is nowhere in the message")
-    return int(number.as_long())
 
 
 def _fits(value: Any, family: str) -> bool:

@@ -596,7 +596,7 @@ def test_what_happened_and_what_was_dropped_is_counted() -> None:
         ("if (n > 2) { return; }", True),
         ("for (int i = 0; i < 3; i++) { n++; }", True),
         ('ROS_INFO("each");', True),
-        ("std::string s;", False),
+        ('std::string s = "x" + std::to_string(count);', False),
         ("n = down(3);", False),
         ("v.push_back(1);", False),
         ("n = cos(count);", False),

@@ -90,6 +90,9 @@ UNPROVED = {
     "not loop-free": event("for (int i = 0; i < x; i++) { x += i; }", "int x", "count:x"),
     "uses seconds": event("d = t.toSec();", "ros::Time t", "when:t", "double d = 0;"),
     "uses the instruction f64.copysign": event("y = copysign(y, 1.0);", "double y", "x:y"),
+    "uses a string that is kept, or a constant one": event(
+        'if (x) { last = "x"; }', "int x", "count:x", "std::string last;"
+    ),
     IN_PYTHON: event("y = sin(y);", "double y", "x:y"),
 }
 

@@ -1,0 +1,212 @@
+"""Strings: constants, those of the message, and those that variables of the set keep.
+
+A variable is 8 bytes: where the string begins and how long it is (4 bytes each). While messages are looked at that may
+be in a message, in a constant, or where any variable's string stood before, so that to assign one copies nothing.
+When a walk ends all are copied together (`settling`) to where the strings of the walk before the last one stood: what
+lines of output show stays as it was until they are made.
+
+A string longer than `MOST_KEPT` is not kept here: the message that brings it is left, and of a variable that holds one
+only that is known (`BEYOND`); the message that looks at it is left.
+"""
+
+from abc import abstractmethod
+
+from appliance.rosmop.ir import form
+from appliance.rosmop.ir.layout import Cells, Layout, NotScalarError
+from appliance.rosmop.ir.places import Places
+from appliance.rosmop.ir.wasm import (
+    COMPARE,
+    ELSE,
+    END,
+    I32,
+    I64,
+    IF,
+    NOTHING,
+    SELECT,
+    constant,
+    load,
+    row,
+    store,
+    unsigned,
+)
+from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION
+from appliance.rosmop.types import kinds
+
+MOST_KEPT = 1024
+"""Bytes of a string that a variable keeps."""
+
+BEYOND = 0xFFFFFFFF
+"""In the place of the length of a longer one."""
+
+_CALL = b"\x10"
+
+
+class Texts(Places):
+    """Writes what looks at strings."""
+
+    @abstractmethod
+    def _mismatch(self) -> int:
+        """The number of the function that `mismatch` writes."""
+
+    def _elements(self, node: form.Expression) -> tuple[bytes, bytes, bytes]:
+        if not isinstance(node.type, kinds.String):
+            return super()._elements(node)
+        if isinstance(node, form.Literal | form.Zero):
+            raw = node.value if isinstance(node, form.Literal) else b""
+            assert isinstance(raw, bytes)  # noqa: S101  a constant of strings
+            self._layout.strings.add(raw)
+            return b"", constant(I32, self._layout.constant(raw)), constant(I64, len(raw))
+        if isinstance(node, form.Assign):
+            code = self._assigned_text(node)
+            first, place, count = self._elements(form.Read(node.type, node.name))
+            return code + first, place, count
+        if isinstance(node, form.Conditional):
+            return self._chosen(node)
+        if isinstance(node, form.Read) and node.name in self._layout.shared:
+            at = self._layout.shared[node.name].address(node.name, node.type)
+            code = self._cell(0x28, at) + self._cell(0x35, at + 4)
+            return self._noted(code, bounded=False)
+        return super()._elements(node)
+
+    def _noted(self, span: bytes, *, bounded: bool = True) -> tuple[bytes, bytes, bytes]:
+        """Address and length from the stack in local variables; left if it is not `bounded` and too long to be kept."""
+        place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
+        code = span + self._set(count, I64) + self._set(place)
+        if not bounded:
+            code += self._when(self._get(count, I64) + constant(I64, MOST_KEPT) + b"\x56", self._elsewhere)
+        return code, self._get(place), self._get(count, I64)
+
+    def _chosen(self, node: form.Conditional) -> tuple[bytes, bytes, bytes]:
+        """One of two, of which only that is looked at."""
+        test = self._value(node.test)
+        place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
+        self._local(place, I32)
+        self._local(count, I64)
+
+        def branch(value: form.Expression) -> bytes:
+            first, begin, length = self._elements(value)
+            return first + begin + self._set(place) + length + self._set(count, I64)
+
+        code = self._when(test, lambda: branch(node.yes), lambda: branch(node.no))
+        return code, self._get(place), self._get(count, I64)
+
+    def _assigned_text(self, node: form.Assign) -> bytes:
+        """Give a string to a variable."""
+        first, place, count = self._elements(node.value)
+        cells = self._layout.shared.get(node.name)
+        if cells is None:
+            code = first + place + count + self._set(f"count of {node.name}", I64)
+            return code + self._set(f"place of {node.name}")
+        at = cells.address(node.name, node.type)
+        code, place, count = self._noted(first + place + count, bounded=False)
+        self._assigned.add(node.name)
+        return code + self._cell(0x36, at, place) + self._cell(0x36, at + 4, count + b"\xa7")
+
+    def _compare_texts(self, node: form.CompareTexts) -> bytes:
+        given, known = (
+            (node.right, node.left) if isinstance(node.left, form.Literal) else (node.left, node.right)
+        )
+        if node.operator in ("==", "!=") and node.short and isinstance(known, form.Literal):
+            return self._is_constant(given, known) + (b"\x45" if node.operator == "!=" else b"")
+        code, place, count = self._noted(b"".join(self._elements(node.left)))
+        first, other, length = self._noted(b"".join(self._elements(node.right)))
+        code += first
+        if not node.short:
+            long = count + constant(I64, form.SHORT) + b"\x56"
+            if isinstance(node.right, form.Read):
+                long += length + constant(I64, form.SHORT) + b"\x56\x71"
+            spent = count + constant(I64, BYTES_PER_INSTRUCTION) + b"\x80"
+            code += self._when(long, lambda: self._spend(spent))
+        if not any(self._is_bounded(side) for side in (node.left, node.right)):
+            self._brief = False
+        call = _CALL + unsigned(self._mismatch())
+        if node.operator in ("==", "!="):
+            same = place + other + count + b"\xa7" + call + b"\xad" + count + b"\x51"
+            alike = count + length + b"\x51" + IF + bytes((I32,)) + same + ELSE + constant(I32, 0) + END
+            return code + alike + (b"\x45" if node.operator == "!=" else b"")
+        number = len(self._locals)
+        least, at = f"least {number}", f"mismatch {number}"
+        code += count + length + count + length + b"\x54" + SELECT + b"\xa7" + self._set(least)
+        code += place + other + self._get(least) + call + self._set(at)
+        opcode = bytes((COMPARE[I64][node.operator] + 1,))  # without a sign
+        one, two = (side + self._get(at) + b"\x6a\x31\x00\x00" for side in (place, other))
+        ends = self._get(at) + self._get(least) + b"\x46" + IF + bytes((I32,))
+        return code + ends + count + length + opcode + ELSE + one + two + opcode + END
+
+    def _is_bounded(self, node: form.Expression) -> bool:
+        return isinstance(node, form.Literal) or (
+            isinstance(node, form.Read) and node.name in self._layout.shared
+        )
+
+    def _is_constant(self, given: form.Expression, known: form.Literal) -> bytes:
+        """Whether a string is a short constant: as long, and the same bytes."""
+        assert isinstance(known.value, bytes)  # noqa: S101  a constant of strings
+        first, place, count = self._elements(given)
+        if len(known.value) > form.SHORT:
+            raise NotScalarError("std::string")
+        same, at = constant(I32, 1), 0
+        while at < len(known.value):
+            size = max(size for size in (1, 2, 4, 8) if size <= len(known.value) - at)
+            number = int.from_bytes(known.value[at : at + size], "little")
+            machine, opcode = {1: (I32, 0x2D), 2: (I32, 0x2F), 4: (I32, 0x28), 8: (I64, 0x29)}[size]
+            same += place + bytes((opcode, 0)) + unsigned(at) + constant(machine, number)
+            same += bytes((COMPARE[machine]["=="],)) + b"\x71"
+            at += size
+        as_long = count + constant(I64, len(known.value)) + b"\x51"
+        return first + as_long + IF + bytes((I32,)) + same + ELSE + constant(I32, 0) + END
+
+
+def _function(made: int, *code: bytes) -> bytes:
+    """A function with so many local variables (i32)."""
+    whole = row([unsigned(made) + bytes((I32,))]) + b"".join(code) + END
+    return unsigned(len(whole)) + whole
+
+
+def _turns(leave: bytes, *turn: bytes) -> bytes:
+    """A loop that ends when `leave` is true, or a turn leaves its block."""
+    return b"\x02\x40\x03\x40" + leave + b"\x0d\x01" + b"".join(turn) + b"\x0c\x00" + END + END
+
+
+def mismatch() -> bytes:
+    """A function of two addresses and a length (i32): where the first byte is that differs, or the length."""
+    one, other, size, at = (b"\x20" + unsigned(local) for local in range(4))
+
+    def compared(opcodes: bytes) -> bytes:
+        read, differs = opcodes[:1] + b"\x00\x00", opcodes[1:]
+        return one + at + b"\x6a" + read + other + at + b"\x6a" + read + differs + b"\x0d\x01"
+
+    def on(more: int) -> bytes:
+        return at + constant(I32, more) + b"\x6a\x21\x03"
+
+    few = size + at + b"\x6b" + constant(I32, 8) + b"\x49"
+    return _function(
+        1,
+        _turns(few, compared(b"\x29\x52"), on(8)),
+        _turns(at + size + b"\x46", compared(b"\x2d\x47"), on(1)),
+        at,
+    )
+
+
+def settling(layout: Layout, cells: Cells) -> bytes:
+    """A function that copies the strings of all variables to where they stay until the next time but one.
+
+    That there is another place now is said last: one that is stopped is begun again when what the message at hand
+    has done is taken back. It returns 0 (i32).
+    """
+    half = MOST_KEPT * len(cells.kept)
+    cells.generation, begin = layout.take(8), layout.take(2 * half)
+    cells.texts = {name: begin + place * MOST_KEPT for place, name in enumerate(cells.kept)}
+    other, target = b"\x20\x00", b"\x20\x01"
+    flip = constant(I32, half) + load(I32, cells.generation) + b"\x6b\x21\x00"
+    code = []
+    for name, begin in cells.texts.items():
+        address = cells.variables[name][0]
+        size = load(I32, address + 4)
+        code += [
+            size, constant(I32, MOST_KEPT), b"\x4d", IF, NOTHING,
+            other, constant(I32, begin), b"\x6a\x21\x01",
+            target, load(I32, address), size, b"\xfc\x0a\x00\x00",
+            store(I32, address, target),
+            END,
+        ]  # fmt: skip
+    return _function(2, flip, *code, store(I32, cells.generation, other), constant(I32, 0))
