@@ -98,7 +98,7 @@ def test_a_latched_message_reaches_early_and_late_subscribers_once(
 
 def test_a_stopped_subscriber_delays_nobody_and_grows_nothing(driver: RelayDriver, ros: RosSession) -> None:
     """Its messages are dropped and counted; the other gets all, in order; the relay's memory stays flat."""
-    ros.talker("roscpp", "/chatter", "--rate", "200", "--text", "x" * 60_000)
+    ros.talker("roscpp", "/chatter", "--rate", "100", "--text", "x" * 60_000)
     stuck = ros.listener("roscpp", "/chatter", name="stuck")
     stuck.wait_for(event="received")
     stuck.popen.send_signal(signal.SIGSTOP)
