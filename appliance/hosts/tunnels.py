@@ -217,9 +217,8 @@ class Tunnels:
                 )
             case messages.TunnelsReported(taken, rows):
                 self._reported(rows)
-                if (
-                    taken in self._stated
-                ):  # after the clock was set back, a greater one may be of an earlier life
+                # After the clock was set back, a greater number may be of an earlier life.
+                if taken in self._stated:
                     for number in [statement for statement in self._stated if statement <= taken]:
                         self._taken_changes = self._stated.pop(number)
                 self._wake.set()

@@ -154,9 +154,8 @@ class Authority:
 
     def _next_list(self) -> int:
         self._list_number = max(self._list_number + 1, time.time_ns())
-        with contextlib.suppress(
-            OSError
-        ):  # a full disk keeps nobody from revoking; this life knows the number
+        # A full disk keeps nobody from revoking: this life knows the number.
+        with contextlib.suppress(OSError):
             write_whole(self._list_path, b"%d" % self._list_number, 0o600)
         return self._list_number
 

@@ -194,9 +194,8 @@ def asked(host: str, caller_id: str, category: str, resource: str, detail: Mappi
         return Asked(request, rights_of(request))
     rights = rights_of_call(request, call, str(key) if key is not None else None)
     category, _, needed = str(detail.get("needs", "")).partition(" ")
-    if (
-        category in PARAMETERS
-    ):  # what the call was about held others, or stood in its way: only the record knows
+    # What the call was about held other parameters, or stood in its way: only the record knows.
+    if category in PARAMETERS:
         right = replace(request, category=Category(category), resource=needed.removesuffix("/**"))
         namespace = needed.endswith("/**")
         rights.append(Right(right, namespace=namespace, alone=not namespace))
