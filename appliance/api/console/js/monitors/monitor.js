@@ -94,8 +94,8 @@ function Margins(/** @type {{row: any}} */ { row }) {
   if (!row.margins.length) return null;
   const number = (/** @type {number | null | undefined} */ value) => value === null || value === undefined ? "–" : Number(value.toPrecision(6)).toString();
   return html`<section class="panel" aria-labelledby="margins"><div class="panel-head"><h2 id="margins">How close it came</h2></div>
-    <div class="table-wrap"><table class="table"><thead><tr><th>Condition</th><th>Was</th><th class="number">Today</th><th class="number">Since load</th><th class="number">At</th></tr></thead>
-      <tbody>${row.margins.map((/** @type {any} */ one) => html`<tr key=${`${one.line}:${one.column}${one.holds}`}><td><code><${Given} value=${one.condition} most=${120} /></code><div class="muted small">line ${one.line}</div></td><td>${one.holds ? "true" : "false"}</td>
+    <div class="table-wrap"><table class="table"><thead><tr><th>Condition</th><th class="number">Today</th><th class="number">Since load</th><th class="number">At</th></tr></thead>
+      <tbody>${row.margins.map((/** @type {any} */ one) => html`<tr key=${`${one.line}:${one.column}${one.holds}`}><td><code><${Given} value=${one.condition} most=${120} /></code><div class="muted small">line ${one.line}, was ${one.holds ? "true" : "false"}</div></td>
         <td class="number">${number(one.today?.distance)}</td><td class="number">${number(one.since_load.distance)}<div class="muted small"><${Moment} at=${one.since_load.time} /></div></td><td class="number">${number(one.since_load.threshold_at)}</td></tr>`)}</tbody></table></div></section>`;
 }
 
