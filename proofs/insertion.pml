@@ -13,8 +13,8 @@
  * A step is one turn of an event loop, as in the program: control and the relay are each one thread that carries out
  * one message after the other. Links between processes keep their order. `=` names what a step models.
  *
- * `tests/proofs/test_insertion.py` has the bounds that are checked, and mutants: each is this text with one thing wrong (a
- * name that begins with `MUTANT` is defined), and Spin finds what comes of it.
+ * `tests/proofs/test_insertion.py` has the bounds that are checked, `test_insertion_mutants.py` mutants: each is this text
+ * with one thing wrong (a name that begins with `MUTANT` is defined), and Spin finds what comes of it.
  *
  * With TRACE the steps that leave a record are only taken in the order of a trace of the running appliance (`kind`,
  * `first`, `second`, LENGTH), and all others when they like: a trace is one of the model's when its end can be reached

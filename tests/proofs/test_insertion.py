@@ -1,6 +1,6 @@
-"""The model of the insertion (`proofs/insertion.pml`), each way it can go, and its mutants.
+"""The model of the insertion (`proofs/insertion.pml`), each way it can go.
 
-Bounds that take longer are in `test_insertion_at_large.py`.
+Bounds that take longer are in `test_insertion_at_large.py`, wrong programs in `test_insertion_mutants.py`.
 """
 
 from pathlib import Path
@@ -15,23 +15,6 @@ BOUNDS = [
     Bounds(loads=1, crashes=1, refusing=True),
     Bounds(publishers=2, crashes=1, sending=False),
 ]
-ONE_OF_EACH = Bounds(loads=1, policies=1, crashes=1)
-MUTANTS = {
-    "STATED_LATER": ("judged", ONE_OF_EACH),
-    "NOT_AWAITED": ("judged", ONE_OF_EACH),
-    "ANSWERED_BEFORE_TAKEN": ("judged", ONE_OF_EACH),
-    "ANY_ANSWER": ("judged", Bounds(loads=2)),
-    "SWAP_IN_TWO": ("judged", ONE_OF_EACH),
-    "STALE_LANE": ("judged", ONE_OF_EACH),
-    "DECIDED_ONCE": ("judged", ONE_OF_EACH),
-    "SWAP_RECONNECTS": ("whole", ONE_OF_EACH),
-    "GIVEN_AGAIN": ("whole", ONE_OF_EACH),
-    "ANSWERED_BEFORE_CUT": ("barred", ONE_OF_EACH),
-    "REVOKED_NOT_CUT": ("barred", ONE_OF_EACH),
-    "NOT_REDECIDED": ("barred", ONE_OF_EACH),
-    "NOBODY_REMINDED": ("connected", Bounds(crashes=1, sending=False)),
-}
-"""Of each: the property that it breaks, and within which bounds."""
 
 
 @pytest.mark.parametrize("bounds", BOUNDS, ids=str)
@@ -40,10 +23,3 @@ def test_every_order_keeps_what_is_promised(tmp_path: Path, bounds: Bounds) -> N
     found = search(tmp_path, bounds)
     assert found.broken == ""
     assert found.states > 1000
-
-
-@pytest.mark.parametrize("mutant", MUTANTS)
-def test_a_wrong_program_would_be_found(tmp_path: Path, mutant: str) -> None:
-    """With one thing done wrong the model breaks the property that is about it."""
-    broken, bounds = MUTANTS[mutant]
-    assert search(tmp_path, bounds, mutant).broken == broken

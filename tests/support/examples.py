@@ -1,4 +1,4 @@
-"""How many examples a property is tried on: a quarter in each run, other ones each time; all in `make test-system`.
+"""How many examples a property is tried on: a sixth in each run, other ones each time; all in `make test-system`.
 
 @settings(max_examples=examples(400))
 """
@@ -8,4 +8,4 @@ import os
 
 def examples(many: int) -> int:
     """So many of `many` as this run has time for."""
-    return many if os.environ.get("TESTS_EXAMPLES") == "all" else many // 4
+    return many if os.environ.get("TESTS_EXAMPLES") == "all" else many // 6

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from tests.proofs.test_insertion import MUTANTS
+from tests.proofs.test_insertion_mutants import MUTANTS
 from tests.support.spin import MODEL
 
 ROOT = MODEL.parents[1]

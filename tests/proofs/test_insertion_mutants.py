@@ -1,0 +1,32 @@
+"""The model of the insertion (`proofs/insertion.pml`) with one thing wrong each: what it promises can be broken."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.support.spin import Bounds, search
+
+ONE_OF_EACH = Bounds(loads=1, policies=1, crashes=1)
+MUTANTS = {
+    "STATED_LATER": ("judged", ONE_OF_EACH),
+    "NOT_AWAITED": ("judged", ONE_OF_EACH),
+    "ANSWERED_BEFORE_TAKEN": ("judged", ONE_OF_EACH),
+    "ANY_ANSWER": ("judged", Bounds(loads=2)),
+    "SWAP_IN_TWO": ("judged", ONE_OF_EACH),
+    "STALE_LANE": ("judged", ONE_OF_EACH),
+    "DECIDED_ONCE": ("judged", ONE_OF_EACH),
+    "SWAP_RECONNECTS": ("whole", ONE_OF_EACH),
+    "GIVEN_AGAIN": ("whole", ONE_OF_EACH),
+    "ANSWERED_BEFORE_CUT": ("barred", ONE_OF_EACH),
+    "REVOKED_NOT_CUT": ("barred", ONE_OF_EACH),
+    "NOT_REDECIDED": ("barred", ONE_OF_EACH),
+    "NOBODY_REMINDED": ("connected", Bounds(crashes=1, sending=False)),
+}
+"""Of each: the property that it breaks, and within which bounds."""
+
+
+@pytest.mark.parametrize("mutant", MUTANTS)
+def test_a_wrong_program_would_be_found(tmp_path: Path, mutant: str) -> None:
+    """With one thing done wrong the model breaks the property that is about it."""
+    broken, bounds = MUTANTS[mutant]
+    assert search(tmp_path, bounds, mutant).broken == broken
