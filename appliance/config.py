@@ -67,6 +67,8 @@ def _section(cls: type[T]) -> type[T]:
 Seconds = Annotated[float, Read(lambda its: its.Field(gt=0, le=86_400 * 365, allow_inf_nan=False))]
 Count = Annotated[int, Read(lambda its: its.Field(gt=0))]
 Size = Annotated[int, Read(lambda its: its.Field(gt=0), "ByteSize")]
+SizeOfMebibytes = Annotated[int, Read(lambda its: its.Field(ge=1 << 20), "ByteSize")]  # one at least
+WithinAnHour = Annotated[float, Read(lambda its: its.Field(gt=0, le=3600, allow_inf_nan=False))]
 
 
 class Unasked(str):
@@ -263,10 +265,10 @@ class Audit:
     retention_days: Seconds | None = key(
         default=None, description="older records are removed, and that is recorded"
     )
-    retention_bytes: Annotated[int, Read(lambda its: its.Field(ge=1 << 20), "ByteSize")] | None = key(
+    retention_bytes: SizeOfMebibytes | None = key(
         default=None, description="beyond this size the oldest records are removed"
     )
-    reserve_bytes: Annotated[int, Read(lambda its: its.Field(ge=1 << 20), "ByteSize")] = key(
+    reserve_bytes: SizeOfMebibytes = key(
         default=64 << 20,
         description="of the disk: below it who causes many records is slowed more, so that the others are recorded",
     )
@@ -290,9 +292,7 @@ class Relay:
     connections_per_host: Count = 8_192
     header_bytes: Size = key(default=64 << 10, description="TCPROS connection header")
     header_seconds: Seconds = key(default=10.0, description="until the connection header must be there")
-    message_bytes: Annotated[int, Read(lambda its: its.Field(ge=1 << 20), "ByteSize")] = key(
-        default=256 << 20, description="one message"
-    )
+    message_bytes: SizeOfMebibytes = key(default=256 << 20, description="one message")
     queue_messages: Count = key(default=1000, description="messages waiting for one subscriber")
     queue_bytes: Size = key(default=64 << 20, description="bytes waiting for one subscriber")
     memory_bytes: Size = key(
@@ -310,13 +310,9 @@ class RecorderRules:
         default=64 << 20,
         description="of all relays together, for what they received last; it survives them",
     )
-    before: Annotated[float, Read(lambda its: its.Field(gt=0, le=3600, allow_inf_nan=False))] = key(
-        default=60.0, description="seconds before what happened"
-    )
-    after: Annotated[float, Read(lambda its: its.Field(gt=0, le=3600, allow_inf_nan=False))] = key(
-        default=10.0, description="seconds after it"
-    )
-    longest: Annotated[float, Read(lambda its: its.Field(gt=0, le=3600, allow_inf_nan=False))] = key(
+    before: WithinAnHour = key(default=60.0, description="seconds before what happened")
+    after: WithinAnHour = key(default=10.0, description="seconds after it")
+    longest: WithinAnHour = key(
         default=600.0, description="seconds of one recording, however much happens in it"
     )
     topics: list[str] = key(default=["/*"], description="what is recorded: names, `*` is anything")
