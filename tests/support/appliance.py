@@ -5,7 +5,7 @@ with Appliance(host, state, policy=OPEN_POLICY) as appliance:
     assert appliance.audit(decision="deny") == []
 """
 
-import fcntl
+import contextlib
 import json
 import os
 import signal
@@ -14,14 +14,13 @@ import subprocess
 import tempfile
 import urllib.parse
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import Any, Self
 
 from tests.support.command import ROSRV, rosrv
+from tests.support.own_namespace import own_namespace
 from tests.support.processes import LIMIT, Event, Host, Process, ThisMachine
 from tests.support.rest import Rest
 from tests.support.waiting import eventually
-
-_NAMESPACE = Path(tempfile.gettempdir()) / "rosrv-test-netns.lock"
 
 OPEN_POLICY = """\
 [Nodes]
@@ -67,7 +66,8 @@ class Appliance:
         self.ready: Event = {}
         self.token = ""  # the first one, which is said at the first start
         self._looked_at = 0  # the last record that `audit` leaves out
-        self._namespace: IO[str] | None = None
+        self._turn = contextlib.ExitStack()  # with isolation netns: until it is closed
+        self._has_turn = False
 
     @property
     def master_uri(self) -> str:
@@ -76,9 +76,9 @@ class Appliance:
 
     def start(self) -> Self:
         """Start (again, on the same state); returns when nodes may connect."""
-        if self.isolation == "netns" and self._namespace is None:
-            self._namespace = _NAMESPACE.open("w")
-            fcntl.flock(self._namespace, fcntl.LOCK_EX)  # a machine has one; other workers' tests take turns
+        if self.isolation == "netns" and not self._has_turn:
+            self._turn.enter_context(own_namespace())
+            self._has_turn = True
         loopback = isinstance(self.host, ThisMachine)
         command = [
             ROSRV,
@@ -205,9 +205,8 @@ class Appliance:
 
     def close(self) -> None:
         """Stop and remove the state."""
-        self.stop()
-        if self._namespace is not None:
-            self._namespace.close()
+        with self._turn:
+            self.stop()
         subprocess.run(["/bin/rm", "-rf", str(self.directory)], check=True)
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from examples.landshark.lab import Host, Lab
 from tests.support.command import ROSRV
+from tests.support.own_namespace import own_namespace
 from tests.support.processes import Process
 from tests.support.requirements import need_root
 
@@ -46,7 +47,7 @@ def steps() -> list[Step]:
 def hosts() -> Iterator[dict[str, Host]]:
     """The three machines of the page."""
     need_root()
-    with Lab("rosrv-hour") as lab:
+    with own_namespace(), Lab("rosrv-hour") as lab:
         yield {
             "machine": lab.host("machine", "10.84.0.2/24"),
             "robot": lab.host("robot", "10.84.0.10/24"),

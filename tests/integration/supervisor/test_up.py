@@ -19,6 +19,7 @@ import pytest
 from appliance.supervisor.roles import ROSMASTER, ROSOUT
 from examples.landshark.lab import Lab
 from tests.support.command import ROSRV, rosrv
+from tests.support.own_namespace import own_namespace
 from tests.support.processes import Process, ThisMachine
 from tests.support.requirements import need_root, needs
 from tests.support.waiting import allowed
@@ -169,7 +170,7 @@ def test_in_a_namespace_of_its_own_it_is_reached_through_the_host(directory: Pat
     """As root, on a host of the lab: the processes live in a namespace that is reached by the host's address;
     after the end the namespace is gone."""
     need_root()
-    with Lab("rosrv-up") as lab:
+    with own_namespace(), Lab("rosrv-up") as lab:
         host, robot = lab.host("machine", "10.81.0.2/24"), lab.host("robot", "10.81.0.10/24")
         flags = ("--json", "--isolation", "netns", "--listen", "0.0.0.0:11311")
         running = Process(host, command(directory, *flags), env=ENVIRONMENT, label="rosrv up")
