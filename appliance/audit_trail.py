@@ -75,7 +75,7 @@ class AuditTrail:
         reads: bool = False,
         **asked_of: str,
     ) -> str:
-        """Record a decision; its id. `asked_of` is what a command is about: a parameter, a node.
+        """Record a decision; the id by which it is found. `asked_of` is what a command is about: a parameter, a node.
 
         `reads`: the call changes nothing, so that its repetitions are counted when it is allowed.
         """
@@ -84,8 +84,7 @@ class AuditTrail:
         )
         duration = time.monotonic_ns() - asker.arrived
         self.meter.decided(category, decision.word, duration / 1e9)
-        self._log.record(record)
-        return record.id
+        return self._log.record(record)
 
     def _of_decision(
         self,
@@ -153,16 +152,15 @@ class AuditTrail:
         reads: bool = False,
         **detail: Any,
     ) -> str:
-        """Record an event that is no decision; its id. `more` is detail whose names others choose.
+        """Record an event that is no decision; the id by which it is found. `more` is detail whose names others choose.
 
         `reads`: it changed nothing, so that its repetitions are counted.
         """
-        record_id = self._ids.next()
         detail = {**(more or {}), **detail}
         stranger = self._marked(host, decision, detail)
-        self._log.record(
+        return self._log.record(
             Record(
-                id=record_id,
+                id=self._ids.next(),
                 time=time.time_ns(),
                 event=event,
                 severity=severity,
@@ -179,7 +177,6 @@ class AuditTrail:
                 folds=reads or (decision is None and host is not None and bool(self.owing(host))),
             )
         )
-        return record_id
 
     def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
         """Whether this is about a stranger whom something is refused; the detail says so then."""

@@ -91,6 +91,13 @@ class Folder:
         kind = self._kinds.get(key)
         return kind.state if kind is not None and kind.state.count else None
 
+    def in_full(self, record: Record) -> str:
+        """The id of the record in full that a denial repeats, if it is known by now; else its own. For any thread."""
+        kind = self._kinds.get(kind_of(keepable(record))) if record.decision == "deny" else None
+        if kind is None or (kind.state.caller_id, kind.state.resource) != (record.caller_id, record.resource):
+            return record.id  # a kind of a stranger is of many things
+        return kind.state.recorded_id
+
     def offer(self, record: Record, now: float) -> Iterator[Record]:
         """The records to write for this one: itself, nothing (counted), or summaries and itself."""
         if not self._settings.seconds:

@@ -138,13 +138,18 @@ class AuditLog:
 
     # --- for the owner, from any thread ---------------------------------------------------------------------
 
-    def record(self, record: Record) -> None:
-        """Take a record into the log. Its `detail` must not be changed afterwards."""
+    def record(self, record: Record) -> str:
+        """Take a record into the log; the id by which it is found there: its own, or that of the one it repeats.
+
+        Its `detail` must not be changed afterwards.
+        """
         if self._is_full:
             self._lost.add(record)
-            return
+            return record.id
         self.budget.charge(record)
+        found_by = self._folder.in_full(record)
         self._put(record)
+        return found_by
 
     def repeated(self, same: Repeated, duration_us: int) -> None:
         """What was recorded before has happened once more, and changed nothing."""

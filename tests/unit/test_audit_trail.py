@@ -24,10 +24,11 @@ class Log:
         self.records: list[Any] = []
         self.budget = Budget(lambda host: Standing.STRANGER if host == STRANGER else Standing.NAMED)
 
-    def record(self, record: Any) -> None:
+    def record(self, record: Any) -> str:
         """Take it."""
         self.budget.charge(record)
         self.records.append(record)
+        return str(record.id)
 
     async def wait_durable(self) -> str | None:
         """Say why not."""

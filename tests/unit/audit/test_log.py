@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -18,7 +19,7 @@ from appliance.audit.folding import FoldSettings
 from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.record import Repeated
-from appliance.audit.search import export, search
+from appliance.audit.search import export, search, show
 from appliance.audit.verify import verify
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
@@ -154,6 +155,28 @@ def test_flood_of_denials(make_log: MakeLog, path: Path) -> None:
     folded = sum(one.detail["count"] for one in records if one.event == "denials folded")
     assert folded + sum(one.event == "decision" for one in records) == 100_001
     assert verify(path).ok
+
+
+@pytest.mark.parametrize("stranger", [False, True], ids=["named", "stranger"])
+def test_whoever_is_denied_again_is_told_an_id_that_is_there(
+    make_log: MakeLog, path: Path, stranger: bool
+) -> None:
+    """The id of a repetition, which is only counted, is that of the record in full; another denial has its own."""
+    log = make_log()
+
+    def told(**about: Any) -> str:
+        record = decision(log, decision="deny", **about)
+        found_by = log.record(msgspec.structs.replace(record, stranger=stranger))
+        assert settle(log) is None
+        return found_by
+
+    again = [told() for _ in range(3)]
+    assert len(set(again)) == 1
+    shown = show(path, again[-1], 0)
+    assert shown is not None
+    assert shown.entry.record.decision == "deny"
+    assert told(resource="/another") not in again
+    assert told(caller_id="/another") not in again
 
 
 @pytest.mark.parametrize("seconds", [3600.0, 0.0], ids=["folded", "in full"])
