@@ -41,7 +41,7 @@ def _node(incarnation: Incarnation) -> Node:
 
 
 def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> list[Topic]:
-    relay = parts.relay
+    relay, connections = parts.relay, _connections(parts.relay, TOPIC, names)
     publishers: dict[str, list[Publisher]] = {}
     subscribers: dict[str, list[str]] = {}
     for incarnation in live:
@@ -61,21 +61,21 @@ def _topics(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> lis
             mediated=parts.mediation.carries_topic(name),
             publishers=publishers.get(name, []),
             subscribers=subscribers.get(name, []),
-            connections=_connections(relay, TOPIC, name, names),
+            connections=connections.get(name, []),
         )
         for name in sorted(publishers.keys() | subscribers.keys())
     ]
 
 
 def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> list[Service]:
-    relay = parts.relay
+    relay, connections = parts.relay, _connections(parts.relay, SERVICE, names)
     return [
         Service(
             **asdict(relay.carried.flow(incarnation.key, registration.resource)),
             name=registration.resource,
             node=incarnation.name,
             mediated=parts.mediation.carries_service(registration.resource),
-            connections=_connections(relay, SERVICE, registration.resource, names),
+            connections=connections.get(registration.resource, []),
         )
         for incarnation in live
         for registration in incarnation.registrations.values()
@@ -83,9 +83,11 @@ def _services(parts: Parts, live: list[Incarnation], names: dict[str, str]) -> l
     ]
 
 
-def _connections(relay: RelayControl, kind: str, resource: str, names: dict[str, str]) -> list[Connection]:
-    return [
-        Connection(names[connection.key], connection.caller_id, connection.host)
-        for connection in relay.carried.connections.values()
-        if connection.kind == kind and connection.resource == resource and connection.key in names
-    ]
+def _connections(relay: RelayControl, kind: str, names: dict[str, str]) -> dict[str, list[Connection]]:
+    """Who is connected, by topic or service."""
+    found: dict[str, list[Connection]] = {}
+    for connection in relay.carried.connections.values():
+        if connection.kind == kind and connection.key in names:
+            row = Connection(names[connection.key], connection.caller_id, connection.host)
+            found.setdefault(connection.resource, []).append(row)
+    return found

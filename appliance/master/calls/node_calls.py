@@ -8,6 +8,7 @@ are not in the table: only a master sends those, so from anybody else they are d
 """
 
 import os
+from collections import defaultdict
 from dataclasses import dataclass
 
 from appliance.master.caller import Answer, Caller
@@ -19,6 +20,7 @@ from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Addresses
 from appliance.master.reach.relays import RelayControl, tcpros_port
+from appliance.master.reach.traffic import Traffic
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.liveness import Liveness
 from appliance.ros.uris import node_uri
@@ -26,6 +28,8 @@ from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import NoAnswerError
 from appliance.specifications.allocation import TOPIC as TOPIC_CONNECTION
+
+_NOTHING = Traffic()
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,34 +149,23 @@ class NodeCalls:
 
     async def get_bus_stats(self, caller: Caller) -> Answer:
         """`getBusStats(caller_id)` → `[publications, subscriptions, services]`, from the relay's counters."""
-        target = _target(caller)
-        connections = [
-            connection
-            for connection in self.relay.carried.connections.values()
-            if connection.kind == TOPIC_CONNECTION
+        target, traffic, host = _target(caller), self.relay.carried.traffic, str(_target(caller).host)
+        sent: defaultdict[str, list[Value]] = defaultdict(list)
+        received: defaultdict[str, list[Value]] = defaultdict(list)
+        for connection in self.relay.carried.connections.values():
+            if connection.kind != TOPIC_CONNECTION:
+                continue
+            number, topic = connection.number, connection.resource
+            carried = traffic.get((connection.key, topic), _NOTHING)
+            if connection.key == target.key:
+                sent[topic].append([number, carried.bytes, carried.messages, True])
+            if (connection.caller_id, connection.host) == (target.name, host):
+                received[topic].append([number, carried.bytes, -1, True])
+        published: list[Value] = [
+            [topic, traffic.get((target.key, topic), _NOTHING).bytes, sent[topic]]
+            for topic in target.resources(Kind.PUBLICATION)
         ]
-        published: list[Value] = []
-        for topic in target.resources(Kind.PUBLICATION):
-            traffic = self.relay.carried.traffic.get((target.key, topic))
-            size, count = (traffic.bytes, traffic.messages) if traffic is not None else (0, 0)
-            rows: list[Value] = [
-                [connection.number, size, count, True]
-                for connection in connections
-                if connection.key == target.key and connection.resource == topic
-            ]
-            published.append([topic, size, rows])
-        subscribed: list[Value] = []
-        for topic in target.resources(Kind.SUBSCRIPTION):
-            rows = []
-            for connection in connections:
-                if (
-                    connection.resource == topic
-                    and connection.caller_id == target.name
-                    and connection.host == str(target.host)
-                ):
-                    traffic = self.relay.carried.traffic.get((connection.key, topic))
-                    rows.append([connection.number, traffic.bytes if traffic is not None else 0, -1, True])
-            subscribed.append([topic, rows])
+        subscribed: list[Value] = [[topic, received[topic]] for topic in target.resources(Kind.SUBSCRIPTION)]
         return [1, "", [published, subscribed, []]]
 
 

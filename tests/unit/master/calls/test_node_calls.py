@@ -1,0 +1,64 @@
+"""What tools ask about connections costs as much as there are, however many topics a host has besides."""
+
+import ipaddress
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from appliance.audit_trail import AuditTrail
+from appliance.channel.messages import ConnectionOpened
+from appliance.control.overview import graph_of
+from appliance.master.caller import Caller
+from appliance.master.calls.node_calls import NodeCalls
+from appliance.master.graph.registry import Incarnation, Kind, Registry
+from appliance.master.reach.traffic import Carried
+from appliance.ros.uris import parse_node_uri
+from tests.support.idle import idle
+
+pytestmark = pytest.mark.anyio
+TOPICS, CONNECTIONS = 200, 300
+
+
+class Counted(dict[Any, Any]):
+    """Connections that count how often one of them is looked at."""
+
+    looks = 0
+
+    def values(self) -> Any:
+        """Each look counts."""
+        for connection in super().values():
+            self.looks += 1
+            yield connection
+
+
+async def test_connections_are_looked_at_once() -> None:
+    """`getBusStats` and the graph have a row for each topic and each connection; none is multiplied by the other."""
+    registry, uri, host = Registry(), "http://10.0.0.5:4000/", ipaddress.ip_address("10.0.0.5")
+    node = Incarnation("key", "/node", host, parse_node_uri(uri), uri, "10.0.0.1", 1, 2)
+    registry.add(node)
+    for number in range(TOPICS):
+        for kind in (Kind.PUBLICATION, Kind.SUBSCRIPTION, Kind.SERVICE):
+            registry.register(node, kind, f"/{kind}_{number}", "std_msgs/String")
+    carried = Carried(idle(AuditTrail), registry, 1)
+    topic = f"/{Kind.PUBLICATION}_7"
+    carried.connections = connections = Counted(
+        {
+            (0, number): ConnectionOpened(number, "key", topic, "topic", "10.0.0.6", "/ear")
+            for number in range(CONNECTIONS)
+        }
+    )
+    relay = SimpleNamespace(carried=carried)
+    mediation = SimpleNamespace(carries_topic=lambda _name: True, carries_service=lambda _name: True)
+    other: Any = None
+    parts = (registry, other, other, relay, mediation, other, other, other, other)
+    calls = cast(Any, NodeCalls)(*parts, port=11311)
+    answer: Any = await calls.get_bus_stats(cast(Caller, SimpleNamespace(target=node)))
+    sent, received, _services = answer[2]
+    assert (len(sent), len(received)) == (TOPICS, TOPICS)
+    assert [name for name, _bytes, rows in sent if len(rows) == CONNECTIONS] == [topic]
+    assert connections.looks == CONNECTIONS
+    graph = graph_of(cast(Any, SimpleNamespace(registry=registry, relay=relay, mediation=mediation)))
+    assert {row.name: len(row.connections) for row in graph.topics if row.connections} == {topic: CONNECTIONS}
+    assert len(graph.services) == TOPICS
+    assert connections.looks <= 3 * CONNECTIONS
