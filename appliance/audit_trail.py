@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from appliance.audit.events import SEVERITIES
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Record, Repeated, RuleReference, Severity
 from appliance.metrics import Meter
@@ -141,7 +142,7 @@ class AuditTrail:
         event: str,
         reason: str,
         *,
-        severity: Severity = Severity.INFO,
+        severity: Severity | None = None,
         host: str | None = None,
         caller_id: str | None = None,
         category: str | None = None,
@@ -154,6 +155,7 @@ class AuditTrail:
     ) -> str:
         """Record an event that is no decision; the id by which it is found. `more` is detail whose names others choose.
 
+        `severity` is for an event that has not always the same (`audit/events.py`).
         `reads`: it changed nothing, so that its repetitions are counted.
         """
         detail = {**(more or {}), **detail}
@@ -163,7 +165,7 @@ class AuditTrail:
                 id=self._ids.next(),
                 time=time.time_ns(),
                 event=event,
-                severity=severity,
+                severity=severity or SEVERITIES.get(event, Severity.INFO),
                 decision=decision,
                 host=host,
                 caller_id=caller_id,

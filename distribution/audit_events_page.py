@@ -1,7 +1,8 @@
 """The page of audit events, made from the registry and from what the program really records.
 
-`python -m distribution.audit_events_page` prints docs/audit-events.md; a test holds the page against it. Severities and
-the fields of `detail` are read off the calls that record an event, so they cannot be forgotten; what is recorded under
+`python -m distribution.audit_events_page` prints docs/audit-events.md; a test holds the page against it. Severities
+that the registry does not have, and the fields of `detail`, are read off the calls that record an event, so they cannot
+be forgotten; what is recorded under
 names that are computed (the log's own records, what monitors did) is in `ELSEWHERE`.
 """
 
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import appliance
-from appliance.audit.events import EVENTS
+from appliance.audit.events import EVENTS, SEVERITIES
 from appliance.audit.kinds import ABOUT
 from appliance.audit.ocsf import class_text
 from appliance.audit.record import Severity
@@ -101,7 +102,7 @@ def _use(node: ast.Call, place: str) -> Iterator[Use]:
     fields = tuple(name for name in named if name not in _FIELDS) if called == "happened" else ()
     for name in _texts(event):
         denies = "decision" in named and any("deny" in _texts(one) for one in ast.walk(named["decision"]))
-        yield Use(name, place, _severities(node, called), fields, denies)
+        yield Use(name, place, _severities(node, called, name), fields, denies)
 
 
 def _texts(node: ast.AST) -> Iterator[str]:
@@ -114,7 +115,7 @@ def _texts(node: ast.AST) -> Iterator[str]:
             yield from _texts(other)
 
 
-def _severities(node: ast.Call, called: str) -> frozenset[str]:
+def _severities(node: ast.Call, called: str, event: str) -> frozenset[str]:
     known = {one.name: one.value for one in Severity}
     found = {
         known[one.attr]
@@ -122,9 +123,8 @@ def _severities(node: ast.Call, called: str) -> frozenset[str]:
         if isinstance(one, ast.Attribute) and getattr(one.value, "id", "") == "Severity" and one.attr in known
     }
     plain = not any(one.arg == "severity" for one in node.keywords)
-    return frozenset(
-        found or ({Severity.INFO.value} if called in ("happened", "_record") and plain else set())
-    )
+    usual = SEVERITIES.get(event, Severity.INFO).value
+    return frozenset(found or ({usual} if called in ("happened", "_record") and plain else set()))
 
 
 def markdown() -> str:

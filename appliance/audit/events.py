@@ -4,6 +4,8 @@ A name is never reused for something else and never renamed; a new one is added 
 description before it is recorded.
 """
 
+from appliance.audit.record import Severity
+
 EVENTS: dict[str, str] = {
     "decision": "A request was decided by the policy (allow, deny, would deny).",
     "registered": "A node registered a publication, subscription, service or parameter subscription.",
@@ -102,3 +104,27 @@ EVENTS: dict[str, str] = {
     "clock set back": "The machine's clock stands before the last record; `detail` has by how many seconds.",
     "log failed": "The log could not be written for a time, and can be again; `reason` says why.",
 }
+
+SEVERITIES: dict[str, Severity] = {
+    name: severity
+    for severity, names in {
+        Severity.NOTICE: (
+            "appliance started", "appliance stopped", "clock not synchronised", "clock synchronised",
+            "evidence exported", "forwarding resumed", "host awaited", "host awaited no longer", "host enrolled",
+            "host renewed", "hosts reloaded", "monitor resumed", "policy loaded", "recording closed",
+            "recording ordered", "recording fetched", "recording read", "recording removed", "specifications loaded",
+            "token added", "token revoked", "topic looked into", "tunnel down", "tunnel moved", "tunnel up",
+            "probe passed",
+        ),
+        Severity.WARNING: (
+            "certificate ended", "certificate ends soon", "clock set back", "clock set forward", "enrolment refused",
+            "forwarding failed", "host revoked", "limit exceeded", "malformed", "packets refused", "policy refused",
+            "recording missed", "renewal refused", "specifications refused", "tunnel refused",
+        ),
+        Severity.ALARM: (
+            "forwarding gap", "monitors restarted", "probe failed", "publication refused", "records lost",
+        ),
+    }.items()
+    for name in names
+}  # fmt: skip
+"""How much a person should care, where that is always the same; what records one of the others says it, or is INFO."""

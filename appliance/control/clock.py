@@ -9,7 +9,6 @@ import asyncio
 import time
 from collections.abc import Callable
 
-from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel.answers.status import ClockState
 
@@ -41,11 +40,10 @@ class Clock:
             self._trail.happened(
                 "clock not synchronised",
                 "no time service keeps the machine's clock: run chrony or systemd-timesyncd",
-                severity=Severity.NOTICE,
             )
         elif synchronised and before is False:
             text = "a time service keeps the machine's clock again"
-            self._trail.happened("clock synchronised", text, severity=Severity.NOTICE)
+            self._trail.happened("clock synchronised", text)
 
     def state(self) -> ClockState:
         """As it is now."""
@@ -66,7 +64,6 @@ class Clock:
             self._trail.happened(
                 "clock set forward",
                 f"the machine's clock went {ahead:.0f} s further than time has passed; that of monitors did not",
-                severity=Severity.WARNING,
                 seconds=round(ahead, 3),
             )
         behind = self.state().behind_seconds
@@ -74,7 +71,6 @@ class Clock:
             self._trail.happened(
                 "clock set back",
                 f"the machine's clock stands {behind:.0f} s before the last record; ids and sequence go on",
-                severity=Severity.WARNING,
                 seconds=round(behind, 3),
             )
         self._set_back = behind > 0

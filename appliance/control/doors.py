@@ -105,17 +105,13 @@ class Doors:
 
     def troubled(self, peer: Peer, reason: str) -> None:
         """A peer went over a limit."""
-        self._trail.happened(
-            "limit exceeded", reason, severity=Severity.WARNING, decision="deny", host=peer.text
-        )
+        self._trail.happened("limit exceeded", reason, decision="deny", host=peer.text)
 
     def probed(self, reason: str) -> None:
         """The supervisor looked whether the ROS Master is hidden; `reason` is empty if it is."""
         if bool(reason) != bool(self._unhidden):
-            event, severity = (
-                ("probe failed", Severity.ALARM) if reason else ("probe passed", Severity.NOTICE)
-            )
-            self._trail.happened(event, reason or "the ROS Master is hidden", severity=severity)
+            event = "probe failed" if reason else "probe passed"
+            self._trail.happened(event, reason or "the ROS Master is hidden")
         self._unhidden = reason
 
 

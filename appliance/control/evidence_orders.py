@@ -3,7 +3,6 @@
 import asyncio
 
 from appliance.audit.log import AuditLog
-from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import admin
 from appliance.channel.answers.evidence import Sealed
@@ -32,7 +31,6 @@ class EvidenceOrders:
         record = self._trail.happened(
             "evidence exported",
             f"{request.records} records were exported as evidence",
-            severity=Severity.NOTICE,
             who=who,
             manifest=request.manifest,
             since=request.since,

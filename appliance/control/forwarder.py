@@ -5,7 +5,6 @@ import asyncio
 import msgspec
 import structlog
 
-from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.answers.status import ForwardingState
@@ -46,7 +45,6 @@ class Forwarded:
             self._trail.happened(
                 "forwarding gap",
                 f"retention removed {count} records before {self._wanted.to} had them",
-                severity=Severity.ALARM,
                 count=count,
             )
         if report.trouble and self._failing is None:
@@ -58,10 +56,7 @@ class Forwarded:
             if self._failure_recorded:
                 self._failure_recorded = False
                 self._trail.happened(
-                    "forwarding resumed",
-                    f"{self._wanted.to} has the log again",
-                    severity=Severity.NOTICE,
-                    behind=report.behind,
+                    "forwarding resumed", f"{self._wanted.to} has the log again", behind=report.behind
                 )
 
     def _still_failing(self) -> None:
@@ -70,7 +65,6 @@ class Forwarded:
         self._trail.happened(
             "forwarding failed",
             f"{self._wanted.to}: {self._report.trouble}",
-            severity=Severity.WARNING,
             behind=self._report.behind,
             missed=self._report.missed,
         )

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import msgspec
 
 import appliance
-from appliance.audit.record import Severity
 from appliance.channel import admin
 from appliance.channel.answers.graph import Graph, Registration, Registrations, TopicMessage, TopicMessages
 from appliance.channel.answers.inventory import InUse, Inventory
@@ -122,7 +121,6 @@ class Looks:
         self.parts.trail.happened(
             "topic looked into",
             f"messages of {topic} are shown, for {ONE_LOOK:g} seconds from now",
-            severity=Severity.NOTICE,
             category="topic",
             resource=topic,
             who=who,

@@ -18,7 +18,6 @@ from typing import Any
 
 import structlog
 
-from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import admin
 from appliance.channel.answers import policy as answers
@@ -294,7 +293,6 @@ class Policies:
         self._trail.happened(
             "policy refused",
             f"revision {self.revision} stays in force: {error.findings[0]}",
-            severity=Severity.WARNING,
             findings=error.findings[:100],
             who=who,
         )
@@ -327,7 +325,6 @@ class Policies:
         self._trail.happened(
             "policy loaded",
             f"revision {number} is in force: {note}",
-            severity=Severity.NOTICE,
             who=by or who,
             file=policy.file,
             sha256=fingerprint(policy.text),

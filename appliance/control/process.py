@@ -19,7 +19,6 @@ import uvloop
 
 from appliance.audit.budget import Budget
 from appliance.audit.log import AuditLog
-from appliance.audit.record import Severity
 from appliance.audit.retention import Retention
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
@@ -306,7 +305,7 @@ class _Control:
         uri = node_uri(told, base.port(RVMASTER))
         self._lifeline.surroundings.master = uri.rstrip("/")
         if not restarted:
-            base.trail.happened("appliance started", f"nodes may connect at {uri}", severity=Severity.NOTICE)
+            base.trail.happened("appliance started", f"nodes may connect at {uri}")
         detail = {
             "master": uri.rstrip("/"),
             "revision": base.policies.revision,
@@ -329,7 +328,7 @@ class _Control:
         parts.reminders.close()
         parts.delivery.close()
         parts.rosmaster.close()
-        base.trail.happened("appliance stopped", "control ended in an orderly way", severity=Severity.NOTICE)
+        base.trail.happened("appliance stopped", "control ended in an orderly way")
         base.store.save_parameters(parts.parameters.tree)
         base.store.close()
         self._audit.close()

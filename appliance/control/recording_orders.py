@@ -4,12 +4,17 @@ import asyncio
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import Any, TypeVar
 
-from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import admin, messages
-from appliance.channel.answers.recordings import Recording, RecordingBegun, Recordings, Trigger
+from appliance.channel.answers.recordings import (
+    Recording,
+    RecordingBegun,
+    Recordings,
+    Trigger,
+    TriggerKind,
+)
 from appliance.channel.answers.status import RecorderState
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
@@ -21,9 +26,7 @@ _PATIENCE_SECONDS = 10.0
 _LONGEST_NOTE = 300
 _MOST_TOPICS = 20
 _LONGEST_NAME = 500
-_Answer = (
-    messages.RecordingBegun | messages.RecordingRemoved | messages.MemoryLent | messages.RecordingRefused
-)
+_M = TypeVar("_M", messages.RecordingBegun, messages.RecordingRemoved, messages.MemoryLent)
 
 
 class RecorderAwayError(Exception):
@@ -77,44 +80,40 @@ class RecordingOrders:
             raise SenselessError(
                 f"before is 0 to {self._rules.longest:g} seconds, after more than 0 (recorder.longest)"
             )
-        record = self._trail.happened(
-            "recording ordered",
-            request.note[:_LONGEST_NOTE],
-            severity=Severity.NOTICE,
-            who=who,
-            before=before,
-            after=after,
-        )
         text = f"{who}: {request.note}" if request.note else who
-        trigger = Trigger(time.time_ns(), "order", record, text[:_LONGEST_NOTE])
-        answer = await self._ask(lambda number: messages.RecordingWanted(number, trigger, before, after))
-        assert isinstance(answer, messages.RecordingBegun)  # noqa: S101  what this order is answered with
-        return RecordingBegun(answer.id, answer.ends)
+        begun = await self._record("order", request.note[:_LONGEST_NOTE], text, who, (before, after))
+        return RecordingBegun(begun.id, begun.ends)
 
     async def called(self, call: messages.OwnServiceCalled) -> messages.OwnServiceAnswered:
         """A node that the policy lets calls the service: record; the recording's id, or why there is none."""
         try:
             self._require()
-            before, after = self._rules.before, self._rules.after
-            record = self._trail.happened(
-                "recording ordered",
-                f"by a call of {call.service}",
-                severity=Severity.NOTICE,
-                host=call.host,
-                caller_id=call.caller_id,
-                category="call",
-                resource=call.service,
-                who=call.caller_id,
-                before=before,
-                after=after,
-            )
             text = f"{call.caller_id} of {call.host} called {call.service}"
-            trigger = Trigger(time.time_ns(), "service", record, text[:_LONGEST_NOTE])
-            answer = await self._ask(lambda number: messages.RecordingWanted(number, trigger, before, after))
+            span = self._rules.before, self._rules.after
+            caller = {
+                "host": call.host,
+                "caller_id": call.caller_id,
+                "category": "call",
+                "resource": call.service,
+            }
+            reason = f"by a call of {call.service}"
+            begun = await self._record("service", reason, text, call.caller_id, span, **caller)
         except (RecorderAwayError, UnknownThingError) as error:
             return messages.OwnServiceAnswered(call.number, False, str(error))
-        assert isinstance(answer, messages.RecordingBegun)  # noqa: S101  what this order is answered with
-        return messages.OwnServiceAnswered(call.number, True, answer.id)
+        return messages.OwnServiceAnswered(call.number, True, begun.id)
+
+    async def _record(
+        self, what: TriggerKind, reason: str, text: str, who: str, span: tuple[float, float], **caller: Any
+    ) -> messages.RecordingBegun:
+        """Have it recorded, of so many seconds before now and after, once it is on record who wants that."""
+        before, after = span
+        record = self._trail.happened(
+            "recording ordered", reason, who=who, before=before, after=after, **caller
+        )
+        trigger = Trigger(time.time_ns(), what, record, text[:_LONGEST_NOTE])
+        return await self._ask(
+            lambda number: messages.RecordingWanted(number, trigger, before, after), messages.RecordingBegun
+        )
 
     async def fetch(self, request: admin.RecordingFetch, who: str) -> Recording:
         """Say that somebody takes its messages, which he reads where they lie."""
@@ -137,7 +136,6 @@ class RecordingOrders:
         self._trail.happened(
             event,
             reason,
-            severity=Severity.NOTICE,
             resource=recording.id,
             reads=reads,
             recording=recording.id,
@@ -158,23 +156,24 @@ class RecordingOrders:
         record = self._trail.happened(
             "recording ordered",
             f"of what is in memory, not to be kept, by {who}",
-            severity=Severity.NOTICE,
             who=who,
             before=min(self._rules.before, max(0, now - since) / 1e9),
             after=0.0,
         )
         trigger = Trigger(now, "order", record, f"{who}: of what is in memory")
-        answer = await self._ask(lambda number: messages.MemoryWanted(number, trigger, since, until))
-        assert isinstance(answer, messages.MemoryLent)  # noqa: S101  what this order is answered with
-        self._lent = dict([*self._lent.items(), (answer.recording.id, answer.recording)][-MOST_LENT:])
-        return answer.recording
+        lent = await self._ask(
+            lambda number: messages.MemoryWanted(number, trigger, since, until), messages.MemoryLent
+        )
+        self._lent = dict([*self._lent.items(), (lent.recording.id, lent.recording)][-MOST_LENT:])
+        return lent.recording
 
     async def remove(self, request: admin.RecordingRemove, who: str) -> Recording:
         """Take it away."""
         self._require()
-        answer = await self._ask(lambda number: messages.RecordingRemovalWanted(number, request.id, who))
-        assert isinstance(answer, messages.RecordingRemoved)  # noqa: S101  what this order is answered with
-        return answer.recording
+        removed = await self._ask(
+            lambda number: messages.RecordingRemovalWanted(number, request.id, who), messages.RecordingRemoved
+        )
+        return removed.recording
 
     def _require(self) -> None:
         if not self._rules.enabled:
@@ -194,16 +193,17 @@ class RecordingOrders:
             raise UnknownThingError(f"there is no recording {recording_id[:40]}")
         return known[recording_id]
 
-    async def _ask(self, order: Callable[[int], messages.Message]) -> _Answer:
-        """The recorder's answer to an order, which is given a number."""
+    async def _ask(self, order: Callable[[int], messages.Message], kind: type[_M]) -> _M:
+        """The recorder's answer of this kind to an order, which is given a number."""
         try:
-            answer: _Answer = await self.link.ask(order, _PATIENCE_SECONDS)
+            answer: _M | messages.RecordingRefused = await self.link.ask(order, _PATIENCE_SECONDS)
         except ChannelClosedError:
             raise RecorderAwayError("the flight recorder ended before it answered") from None
         except TimeoutError:
             raise RecorderAwayError("the flight recorder did not answer") from None
         if isinstance(answer, messages.RecordingRefused):
             raise (UnknownThingError if answer.unknown else RecorderAwayError)(answer.reason)
+        assert isinstance(answer, kind)  # noqa: S101  what such an order is answered with
         return answer
 
     # --- what the recorder says ---------------------------------------------------------------------------
@@ -220,19 +220,12 @@ class RecordingOrders:
                 self._note(recording.id)
             case messages.RecordingMissed(trigger, reason):
                 self._begun = None
-                self._trail.happened(
-                    "recording missed",
-                    reason,
-                    severity=Severity.WARNING,
-                    what=trigger.what,
-                    record=trigger.record,
-                )
+                self._trail.happened("recording missed", reason, what=trigger.what, record=trigger.record)
             case messages.RecordingRemoved(_number, recording, who, reason):
                 self._kept.pop(recording.id, None)
                 self._trail.happened(
                     "recording removed",
                     reason or f"by {who}",
-                    severity=Severity.NOTICE,
                     recording=recording.id,
                     sha256=recording.sha256,
                     who=who or "recorder",
@@ -262,7 +255,6 @@ class RecordingOrders:
         self._trail.happened(
             "recording closed",
             "complete" if recording.complete else f"not complete: {recording.why_not}",
-            severity=Severity.NOTICE,
             recording=recording.id,
             sha256=recording.sha256,
             size=recording.size,

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable
 from typing import cast
 
-from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import admin
 from appliance.channel.answers import tokens as answers
@@ -98,7 +97,6 @@ class Tokens:
         self._trail.happened(
             "token added",
             f"token {row.name} ({row.role}) was made",
-            severity=Severity.NOTICE,
             token=row.name,
             id=row.id,
             role=row.role,
@@ -128,11 +126,7 @@ class Tokens:
         revoked = row._replace(revoked=time.time())
         self._keep(revoked)
         self._trail.happened(
-            "token revoked",
-            f"token {row.name} ({row.role}) was revoked",
-            severity=Severity.NOTICE,
-            token=row.name,
-            id=row.id,
+            "token revoked", f"token {row.name} ({row.role}) was revoked", token=row.name, id=row.id
         )
         return revoked
 

@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import admin
 from appliance.channel.answers.hosts import AuthorityCertificate, KitParts, RevocationList
@@ -97,7 +96,6 @@ class Certification:
         self.trail.happened(
             "host enrolled",
             f"{name} may come through its tunnel as {address}",
-            severity=Severity.NOTICE,
             name=name,
             address=address,
             serial=made.serial,
@@ -111,7 +109,6 @@ class Certification:
         self.trail.happened(
             "host renewed",
             f"{name} has a new certificate; its tunnel comes back with it",
-            severity=Severity.NOTICE,
             name=name,
             serial=serial,
             replaced=before,
@@ -198,7 +195,6 @@ class Certification:
                 self.trail.happened(
                     "certificate ends soon" if row.expires > now else "certificate ended",
                     f"the certificate of {row.name} ends at {row.expires:.0f}; renewal or `rosrv host kit {row.name}`",
-                    severity=Severity.WARNING,
                     name=row.name,
                     serial=row.serial,
                     expires=row.expires,

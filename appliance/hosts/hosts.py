@@ -13,7 +13,6 @@ import ipaddress
 import ssl
 from collections.abc import Awaitable, Callable
 
-from appliance.audit.record import Severity
 from appliance.channel import admin
 from appliance.channel.answers import hosts as answers
 from appliance.channel.answers.status import IpsecState
@@ -159,7 +158,6 @@ class Hosts:
             self._trail.happened(
                 "host awaited",
                 f"whoever brings the one-time token {row.id} is enrolled as {name}",
-                severity=Severity.NOTICE,
                 name=name,
                 address=promised,
                 id=row.id,
@@ -202,7 +200,6 @@ class Hosts:
         self._trail.happened(
             "host revoked",
             f"{name} ({row.address}) may no longer come; {taken} registrations and grants were taken back",
-            severity=Severity.WARNING,
             name=name,
             address=row.address,
             serial=row.serial,
@@ -238,7 +235,6 @@ class Hosts:
         self._trail.happened(
             "hosts reloaded",
             f"{self._table.declared.path}: {len(self._table.declared.hosts)} hosts are declared",
-            severity=Severity.NOTICE,
             opened=sorted(after - before),
             closed=sorted(before - after),
             taken_back=taken,
@@ -266,7 +262,6 @@ class Hosts:
         self._trail.happened(
             "host awaited no longer",
             f"the one-time token {awaited.id} of {awaited.name} was revoked",
-            severity=Severity.NOTICE,
             name=awaited.name,
             id=awaited.id,
             who=who,

@@ -16,7 +16,6 @@ import asyncio
 import ipaddress
 import time
 
-from appliance.audit.record import Severity
 from appliance.channel import admin
 from appliance.channel.answers.hosts import KitParts, NewCertificate, Renewed
 from appliance.hosts.certification import Certification
@@ -51,13 +50,7 @@ class SelfService:
             try:
                 awaited = self._certification.awaited.take(request.token)
             except BadEnrolmentTokenError as error:
-                self._trail.happened(
-                    "enrolment refused",
-                    str(error),
-                    severity=Severity.WARNING,
-                    decision="deny",
-                    host=request.peer,
-                )
+                self._trail.happened("enrolment refused", str(error), decision="deny", host=request.peer)
                 raise HostForbiddenError(str(error)) from error
             name = awaited.name
             try:
@@ -118,11 +111,7 @@ class SelfService:
         row = self._table.at(str(mapped or address)) if self._tunnels.enclosed else None
         if row is None or row.name != name or not self._table.declared.wants(name):
             self._trail.happened(
-                "renewal refused",
-                f"not in the tunnel of {name[:80]}",
-                severity=Severity.WARNING,
-                decision="deny",
-                host=peer,
+                "renewal refused", f"not in the tunnel of {name[:80]}", decision="deny", host=peer
             )
             raise HostForbiddenError(f"{peer} is not the address of {name} in its tunnel")
         return row

@@ -17,7 +17,6 @@ from collections.abc import Callable
 
 import structlog
 
-from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.channel import Channel
@@ -203,18 +202,9 @@ class Tunnels:
             case messages.TunnelChanged(name, up, remote):
                 self._changed(name, up, remote)
             case messages.TunnelRefused(remote, reason, packets) if packets:
-                self._trail.happened(
-                    "packets refused",
-                    reason,
-                    severity=Severity.WARNING,
-                    decision="deny",
-                    host=remote,
-                    packets=packets,
-                )
+                self._trail.happened("packets refused", reason, decision="deny", host=remote, packets=packets)
             case messages.TunnelRefused(remote, reason):
-                self._trail.happened(
-                    "tunnel refused", reason, severity=Severity.WARNING, decision="deny", host=remote
-                )
+                self._trail.happened("tunnel refused", reason, decision="deny", host=remote)
             case messages.TunnelsReported(taken, rows):
                 self._reported(rows)
                 # After the clock was set back, a greater number may be of an earlier life.
@@ -258,12 +248,7 @@ class Tunnels:
             self.seen[name] = messages.TunnelSeen(name, remote, 0, 0, 0)
             self.last[name] = time.time()
             self._trail.happened(
-                "tunnel up",
-                f"{name} is here, from {remote}",
-                severity=Severity.NOTICE,
-                host=row.address,
-                name=name,
-                remote=remote,
+                "tunnel up", f"{name} is here, from {remote}", host=row.address, name=name, remote=remote
             )
 
     def _reported(self, rows: list[messages.TunnelSeen]) -> None:
@@ -285,7 +270,6 @@ class Tunnels:
             self._trail.happened(
                 "tunnel moved",
                 f"{row.name} comes from {row.remote} now, before from {before}",
-                severity=Severity.NOTICE,
                 host=self._table.rows[row.name].address,
                 name=row.name,
                 remote=row.remote,
@@ -299,7 +283,6 @@ class Tunnels:
         self._trail.happened(
             "tunnel down",
             f"the tunnel of {name} is down: {reason}",
-            severity=Severity.NOTICE,
             host=self._table.rows[name].address,
             name=name,
             remote=seen.remote,

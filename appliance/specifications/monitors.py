@@ -430,7 +430,6 @@ class Monitors:
                 self._trail.happened(
                     "monitor resumed",
                     f"the topics of {name} go on",
-                    severity=Severity.NOTICE,
                     category="monitor",
                     resource=name,
                     who=who,
@@ -546,7 +545,6 @@ class Monitors:
             self._trail.happened(
                 "specifications refused",
                 f"revision {self.revision} stays in force: {error.findings[0]}",
-                severity=Severity.WARNING,
                 findings=findings[:100],
                 who=who,
             )
@@ -596,7 +594,6 @@ class Monitors:
         self._trail.happened(
             "specifications loaded",
             f"revision {row.revision} of the specifications is in force: {note}",
-            severity=Severity.NOTICE,
             category="monitor",
             resource="",
             who=by or who,

@@ -51,7 +51,7 @@ class MonitorRecords:
                 tell(event)
         if lost:
             text = f"{lost} reports of monitors were lost while the relay had no control"
-            self.trail.happened("records lost", text, severity=Severity.ALARM, lost=lost)
+            self.trail.happened("records lost", text, lost=lost)
 
     def _record(self, event: MonitorEvent) -> None:
         name, severity = _EVENTS.get(event.kind, ("monitor log", Severity.INFO))

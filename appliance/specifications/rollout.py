@@ -288,7 +288,6 @@ class Rollout:
                 "monitors restarted",
                 f"a new relay process: {', '.join(began)} began in the initial state"
                 + (f"; {', '.join(held)} hold their topics until resumed" if held else ""),
-                severity=Severity.ALARM,
                 category="monitor",
                 resource="",
                 monitors=began,

@@ -8,6 +8,7 @@ import pytest
 
 from appliance.audit.budget import Budget
 from appliance.audit.ids import IdSource
+from appliance.audit.record import Severity
 from appliance.audit_trail import NOT_RECORDED, AuditTrail
 from appliance.shares.pool import Standing
 from appliance.shares.table import AUDIT_BYTES
@@ -68,6 +69,16 @@ def test_what_is_refused_to_a_stranger_says_so() -> None:
     one.happened("connection closed", "", host=STRANGER)
     assert [record.stranger for record in log.records] == [True, False, False, False]
     assert [record.detail.get("stranger", False) for record in log.records] == [True, False, False, False]
+
+
+def test_an_event_has_the_severity_of_the_registry() -> None:
+    """Unless its call says another; what the registry says nothing of is for information."""
+    log = Log()
+    one = trail(log, deny=True)
+    one.happened("tunnel refused", "no certificate")
+    one.happened("limit exceeded", "no room", severity=Severity.ALARM)
+    one.happened("reconciled", "")
+    assert [record.severity for record in log.records] == [Severity.WARNING, Severity.ALARM, Severity.INFO]
 
 
 def test_what_a_host_beyond_its_share_causes_is_counted() -> None:

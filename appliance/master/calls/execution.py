@@ -281,7 +281,6 @@ class Execution:
         self._trail.happened(
             "malformed",
             str(error),
-            severity=Severity.WARNING,
             decision="deny",
             host=caller.peer.text,
             caller_id=claimed,

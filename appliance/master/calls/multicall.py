@@ -10,7 +10,6 @@ import time
 from collections import deque
 from dataclasses import dataclass
 
-from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.master.calls.call import Attempt, Verb
 from appliance.master.calls.execution import Execution, Visit
@@ -120,7 +119,6 @@ class Multicall:
         record = self.trail.happened(
             event,
             why,
-            severity=Severity.WARNING,
             decision="deny",
             host=visit.caller.peer.text,
             category=Category.COMMAND.value,

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import structlog
 
-from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.master.caller import Caller
 from appliance.master.calls.call import Attempt, Table
@@ -104,7 +103,6 @@ class Pipeline:
         decision = self.trail.happened(
             "limit exceeded" if limit else "malformed",
             str(error),
-            severity=Severity.WARNING,
             decision="deny",
             host=caller.peer.text,
             category=Category.COMMAND.value,

@@ -135,7 +135,6 @@ class Carried:
             self._trail.happened(
                 "records lost",
                 f"{connections} connections through a relay ended unrecorded while it had no control",
-                severity=Severity.ALARM,
                 lost=connections,
             )
 
@@ -244,7 +243,6 @@ class Carried:
         self._trail.happened(
             "publication refused",
             message.reason,
-            severity=Severity.ALARM,
             decision="deny",
             caller_id=self._name(message.key),
             category="monitor",
