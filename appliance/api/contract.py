@@ -9,7 +9,6 @@ from fastapi.openapi.utils import get_openapi
 
 from appliance.api import moments
 from appliance.api.audit import RECORD
-from appliance.api.field_words import WORDS
 from appliance.api.problems import MEDIA_TYPE, Problem
 from appliance.api.routing import CONTRACT
 
@@ -33,6 +32,9 @@ _REFERENCE = CONTRACT.reference(Problem)
 # What an appliance was asked and what it answered, long texts and lists cut: by the kind of a body, or by the operation
 # where that has none. tests/integration/api/test_examples.py holds them against what comes.
 EXAMPLES: dict[str, Any] = json.loads(files(__package__).joinpath("examples.json").read_text("utf-8"))
+# What the contract says of fields whose structs leave it to the name: the same words wherever the name is the same. A
+# name that means something else in one kind has words of its own there (`Kind.name`). What a struct says itself stands.
+WORDS: dict[str, str] = json.loads(files(__package__).joinpath("field_words.json").read_text("utf-8"))
 
 
 def contract_of(app: FastAPI) -> dict[str, Any]:

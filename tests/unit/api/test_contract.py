@@ -8,8 +8,7 @@ import jsonschema_rs
 import pytest
 from fastapi import FastAPI
 
-from appliance.api.contract import EXAMPLES, is_described
-from appliance.api.field_words import WORDS
+from appliance.api.contract import EXAMPLES, WORDS, is_described
 
 _OF_CHANGES = {"/v1/policy", "/v1/hosts", "/v1/hosts/{name}", "/v1/monitors", "/v1/monitors/{name}"}
 _UNITS = ("seconds", "days")
