@@ -307,8 +307,7 @@ class RecorderRules:
 
     enabled: bool = key(default=False, description="whether anything is recorded")
     memory: Annotated[int, Read(lambda its: its.Field(ge=16 << 20), "ByteSize")] = key(
-        default=64 << 20,
-        description="of all relays together, for what they received last; it survives them",
+        default=64 << 20, description="of all relays together, for what they received last; it survives them"
     )
     before: WithinAnHour = key(default=60.0, description="seconds before what happened")
     after: WithinAnHour = key(default=10.0, description="seconds after it")
@@ -469,8 +468,7 @@ class Settings:
         default=Path("/var/lib/rosrv"), description="directory of everything that must survive a restart"
     )
     listen: Annotated[str, Read(lambda its: its.AfterValidator(_checked_address))] = key(
-        default="0.0.0.0:11311",
-        description="where nodes find their master",
+        default="0.0.0.0:11311", description="where nodes find their master"
     )
     rosmaster_port: int = key(
         # Not 11411, where rosserial's TCP server listens, and below the ports the kernel gives to clients.

@@ -239,9 +239,7 @@ def _add_proofs(router: Routes, services: Services, desk: Desk) -> None:
         return LogCheckpoints(await desk.read(signed_checkpoints, desk.path, after, limit))
 
     @router.get(
-        "/export",
-        responses=file("application/x-ndjson", "A record a line."),
-        response_class=Response,
+        "/export", responses=file("application/x-ndjson", "A record a line."), response_class=Response
     )
     async def export_audit(request: Request, bearer: Viewer, wanted: Wanted) -> Response:
         """All records that match, oldest first, one JSON object a line.
@@ -262,9 +260,7 @@ def _add_one(router: Routes, services: Services, desk: Desk) -> None:
 
     @router.get("/{record_id}", responses=_json(_ONE) | _UNKNOWN)
     async def audit_record(
-        bearer: Viewer,
-        record_id: OneRecord,
-        neighbours: Annotated[int, Query(ge=0, le=_MOST_NEIGHBOURS)] = 5,
+        bearer: Viewer, record_id: OneRecord, neighbours: Annotated[int, Query(ge=0, le=_MOST_NEIGHBOURS)] = 5
     ) -> JSONResponse:
         """One record (by id, or by sequence), and what the same host or caller did around it."""
         shown = await desk.record(record_id, neighbours)

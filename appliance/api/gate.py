@@ -108,10 +108,7 @@ class Gate:
         wait = rate.take(host, time.monotonic())
         if wait:
             raise ProblemError(
-                429,
-                "too-many-requests",
-                "too many requests of this host",
-                retry_after=int(wait) + 1,
+                429, "too-many-requests", "too many requests of this host", retry_after=int(wait) + 1
             )
         headers = Headers(scope=scope)
         self._check_host(headers)

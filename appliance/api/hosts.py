@@ -12,15 +12,7 @@ from typing import Annotated
 from fastapi import Path, Query, Response
 
 from appliance.api.access import Bearer
-from appliance.api.hosts_models import (
-    ENDPOINT,
-    HOST_NAME,
-    KitWishes,
-    NewHost,
-    NewKit,
-    PortsTold,
-    TokenWishes,
-)
+from appliance.api.hosts_models import ENDPOINT, HOST_NAME, KitWishes, NewHost, NewKit, PortsTold, TokenWishes
 from appliance.api.kits import Wishes, kit_of
 from appliance.api.moments import given
 from appliance.api.preconditions import IfMatch, etag, expected_revision
@@ -161,10 +153,7 @@ def _add_changes(router: Routes, services: Services) -> None:
 
     @router.put("/{name}/ports", operation_id="tell_host_ports", responses=_CHANGES | _UNKNOWN)
     async def ports(
-        name: OneHost,
-        told: Annotated[PortsTold, body(PortsTold)],
-        bearer: Operator,
-        if_match: IfMatch = None,
+        name: OneHost, told: Annotated[PortsTold, body(PortsTold)], bearer: Operator, if_match: IfMatch = None
     ) -> Tagged[answers.PortsSeen]:
         """Tell whether the ROS ports of a host are closed, as `rosrv protect --check` saw it from outside."""
         checked = given(told.checked) / 1e9 if isinstance(told.checked, str) else told.checked

@@ -122,8 +122,7 @@ class Replaced(msgspec.Struct, frozen=True, kw_only=True):
         list[str], told("monitors that began anew because another relay process has them now")
     ] = []
     began: Annotated[
-        list[str],
-        told("all monitors that are in their initial state by this change, new ones among them"),
+        list[str], told("all monitors that are in their initial state by this change, new ones among them")
     ] = []
     kept: Annotated[
         list[str], told("files that a reload left in force although the folder does not have them")

@@ -8,15 +8,7 @@ from fastapi import Query
 
 from appliance.api.access import Bearer
 from appliance.api.judgement import explanation, judge_text
-from appliance.api.policy_models import (
-    Decided,
-    Explained,
-    LostRule,
-    OneRevision,
-    Question,
-    RuleText,
-    Text,
-)
+from appliance.api.policy_models import Decided, Explained, LostRule, OneRevision, Question, RuleText, Text
 from appliance.api.roles import Viewer, add_look, ask
 from appliance.api.routing import Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services

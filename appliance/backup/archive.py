@@ -18,14 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Self
 
-from appliance.backup.contents import (
-    AUDIT_LOG,
-    KEPT_PARTS,
-    MOST_FILES,
-    BackupError,
-    belongs,
-    trouble_with,
-)
+from appliance.backup.contents import AUDIT_LOG, KEPT_PARTS, MOST_FILES, BackupError, belongs, trouble_with
 
 _PIECE = 1 << 20
 

@@ -24,13 +24,7 @@ from appliance.cli.target import Appliance, speaks
 from appliance.cli.topic import lines_of
 from appliance.recorder.bag_reader import Place
 from appliance.recorder.mcap import as_mcap
-from appliance.recorder.timeline import (
-    MOST_COLUMNS,
-    MOST_NEIGHBOURS,
-    NEIGHBOURS,
-    messages_around,
-    timeline,
-)
+from appliance.recorder.timeline import MOST_COLUMNS, MOST_NEIGHBOURS, NEIGHBOURS, messages_around, timeline
 
 if TYPE_CHECKING:
     from appliance.cli.rest.orders import RestWay
@@ -142,8 +136,7 @@ def messages(
         ),
     ] = None,
     topic: Annotated[
-        list[str] | None,
-        typer.Option(help="Of this topic alone (repeat for more)", show_default=False),
+        list[str] | None, typer.Option(help="Of this topic alone (repeat for more)", show_default=False)
     ] = None,
     neighbours: Annotated[
         int, typer.Option(min=1, max=MOST_NEIGHBOURS, help="How many before it, and after")

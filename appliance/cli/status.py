@@ -26,8 +26,7 @@ _RED, _YELLOW, _GREEN = "bold red", "yellow", "green"
 
 @speaks
 def status(
-    appliance: Appliance,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object")] = False,
+    appliance: Appliance, as_json: Annotated[bool, typer.Option("--json", help="One JSON object")] = False
 ) -> None:
     """Show the running appliance: processes, isolation, policy, graph, audit log.
 

@@ -22,12 +22,7 @@ from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import CheckedPorts
 from appliance.hosts.hosts import Hosts
 from appliance.hosts.self_service import SelfService
-from appliance.hosts.table import (
-    HostForbiddenError,
-    HostRefusedError,
-    HostsChangedError,
-    UnknownHostError,
-)
+from appliance.hosts.table import HostForbiddenError, HostRefusedError, HostsChangedError, UnknownHostError
 from appliance.master.reach.topic_looks import TooManyLooksError
 from appliance.specifications.files import SpecificationsRefusedError
 from appliance.specifications.monitors import Monitors, MonitorsChangedError, UnknownMonitorError

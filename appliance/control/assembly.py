@@ -152,11 +152,7 @@ class Parts:
         self._watchlist = Watchlist()
         seconds = settings.limits.node_call_seconds
         self._nodes = NodeApi(self.registry, timeout=seconds, limits=self._limits)
-        self.delivery = Delivery(
-            self._nodes,
-            troubled=self._watchlist.could_not_tell,
-            standing=base.standing,
-        )
+        self.delivery = Delivery(self._nodes, troubled=self._watchlist.could_not_tell, standing=base.standing)
         self._allocation = Allocation(settings.relays, lambda text: base.store.save_setting(ALLOCATION, text))
         self.relay = RelayControl(
             self.registry,
@@ -252,9 +248,7 @@ class Parts:
         """The specifications, and what is published in their name."""
         base, settings = self._base, self._base.settings
         told = rosout.Rosout(
-            settings.publish_as,
-            self.relay.publish,
-            lambda name: self.monitors.checked.monitors.get(name, ""),
+            settings.publish_as, self.relay.publish, lambda name: self.monitors.checked.monitors.get(name, "")
         )
         self.publisher = OwnPublisher(
             self.registry,

@@ -143,11 +143,7 @@ class _Control:
         # Before the policy, which names them: their addresses count once clear text is kept out.
         self._table = HostTable(store, self._settings.ipsec.pool, Declared(self._settings.hosts))
         self._tunnels = Tunnels(
-            self._table,
-            trail,
-            self._authority,
-            listen=self._settings.listen_address,
-            say=self._lifeline.say,
+            self._table, trail, self._authority, listen=self._settings.listen_address, say=self._lifeline.say
         )
         await self._tunnels.start()
         policies = Policies(

@@ -8,13 +8,7 @@ from typing import Any, TypeVar
 
 from appliance.audit_trail import AuditTrail
 from appliance.channel import admin, messages
-from appliance.channel.answers.recordings import (
-    Recording,
-    RecordingBegun,
-    Recordings,
-    Trigger,
-    TriggerKind,
-)
+from appliance.channel.answers.recordings import Recording, RecordingBegun, Recordings, Trigger, TriggerKind
 from appliance.channel.answers.status import RecorderState
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link

@@ -34,10 +34,7 @@ class SpareMemory:
     """
 
     def __init__(
-        self,
-        *,
-        size: Callable[[], int] = resident,
-        give_back: Callable[[], None] = give_back,
+        self, *, size: Callable[[], int] = resident, give_back: Callable[[], None] = give_back
     ) -> None:
         self._size = size
         self._give_back = give_back

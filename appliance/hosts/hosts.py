@@ -147,11 +147,7 @@ class Hosts:
                 seconds=request.token_seconds,
                 address=promised,
                 days=request.days,
-                kit={
-                    "endpoint": found.endpoint,
-                    "ports": request.ports,
-                    "open": ",".join(request.open),
-                },
+                kit={"endpoint": found.endpoint, "ports": request.ports, "open": ",".join(request.open)},
                 who=who,
             )
             self._table.changed()

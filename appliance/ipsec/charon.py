@@ -13,12 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from vici import Session
-from vici.exception import (
-    CommandException,
-    DeserializationException,
-    EventUnknownException,
-    SessionException,
-)
+from vici.exception import CommandException, DeserializationException, EventUnknownException, SessionException
 
 from appliance.channel.messages import TunnelHost, TunnelSeen, TunnelsStated
 from appliance.ipsec.strongswan import connection, connection_name, host_of, pool, proposals_of

@@ -56,10 +56,7 @@ def policy_orders(listed: str, own: str) -> list[str]:
 
 
 def _orders(own: str) -> list[str]:
-    return [
-        *policy_orders(_ip("xfrm", "policy"), own),
-        *state_orders(_ip("xfrm", "state", "list", "nokeys")),
-    ]
+    return [*policy_orders(_ip("xfrm", "policy"), own), *state_orders(_ip("xfrm", "state", "list", "nokeys"))]
 
 
 def _ip(*arguments: str, text: str = "") -> str:

@@ -174,10 +174,7 @@ class Isolation:
         link = self.settings.link
         return tuple(
             f"{chain} drops what is forwarded by default: let interface {link} pass in it, both ways"
-            for chain in (
-                *self._backend.foreign_forward_drops(),
-                *iptables.foreign_forward_drops(self._host),
-            )
+            for chain in (*self._backend.foreign_forward_drops(), *iptables.foreign_forward_drops(self._host))
         )
 
     def translations(self) -> tuple[str, ...]:

@@ -28,12 +28,7 @@ from appliance.audit.search import Follower, export, search
 from appliance.channel import messages
 from appliance.channel.answers.recordings import Trigger
 from appliance.config import RecorderRules
-from appliance.recorder.recording import (
-    MOST_TRIGGERS,
-    Progress,
-    RecordingInProgress,
-    load_progress,
-)
+from appliance.recorder.recording import MOST_TRIGGERS, Progress, RecordingInProgress, load_progress
 from appliance.recorder.shelf import MOST_LENT, Shelf
 from appliance.recorder.triggers import HourlyLimit, trigger_of
 

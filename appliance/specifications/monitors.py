@@ -39,12 +39,7 @@ from appliance.channel.answers.monitors import Replaced, Switched
 from appliance.fingerprints import fingerprint_of_all
 from appliance.rosmop.sharing import sharing
 from appliance.specifications.allocation import Allocation
-from appliance.specifications.files import (
-    Checked,
-    Sources,
-    SpecificationsRefusedError,
-    check,
-)
+from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError, check
 from appliance.specifications.folder import SpecificationFolder
 from appliance.specifications.records import MonitorRecords
 from appliance.specifications.relays import Relays
@@ -402,12 +397,7 @@ class Monitors:
 
     def _say_switched(self, name: str, word: str, who: str, text: str) -> None:
         self._trail.happened(
-            f"monitor {word}",
-            text,
-            severity=Severity.NOTICE,
-            category="monitor",
-            resource=name,
-            who=who,
+            f"monitor {word}", text, severity=Severity.NOTICE, category="monitor", resource=name, who=who
         )
 
     async def resume(self, request: admin.MonitorResume, who: str) -> Switched:

@@ -69,8 +69,7 @@ class KitWriter:
             typer.echo(f"rosrv: {body.warning}", err=True)
         if not body.rest_url:
             typer.echo(
-                f"rosrv: {body.name} cannot renew its certificate by itself: {body.rest_trouble}",
-                err=True,
+                f"rosrv: {body.name} cannot renew its certificate by itself: {body.rest_trouble}", err=True
             )
         if as_json:
             where = {"endpoint": wishes.endpoint, "endpoint_reason": reason}

@@ -172,11 +172,7 @@ def _seconds(within: str) -> float:
 
 
 def _write_kit(
-    running: Appliance,
-    order: HostAdd | HostRenew,
-    csr: Path | None,
-    wishes: Wishes,
-    out: Path | None,
+    running: Appliance, order: HostAdd | HostRenew, csr: Path | None, wishes: Wishes, out: Path | None
 ) -> None:
     with new_output(out, f"rosrv-{order.name}.tar.gz", as_json=running.as_json) as output:
         writer = KitWriter(output, csr=csr)

@@ -30,9 +30,5 @@ def say_loaded(body: Loaded) -> None:
 
 
 revisions, rollback, confirm = verbs_of(
-    "policy",
-    listed=PolicyRevisions(),
-    confirmation=PolicyConfirm(),
-    back=PolicyRollback,
-    say_done=say_loaded,
+    "policy", listed=PolicyRevisions(), confirmation=PolicyConfirm(), back=PolicyRollback, say_done=say_loaded
 )

@@ -38,8 +38,7 @@ def running(appliance: Appliance) -> Iterator[Found]:
         return
     status = answer.given()
     yield ok(
-        "appliance",
-        f"{status.version}, {len(status.processes)} processes, nodes find it at {status.master}",
+        "appliance", f"{status.version}, {len(status.processes)} processes, nodes find it at {status.master}"
     )
     yield from told("status", lambda: _status(status))
     yield from told("processes", lambda: _processes(status.processes))

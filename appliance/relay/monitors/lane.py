@@ -150,12 +150,7 @@ class Lane:
         began = time.thread_time() if counted else None
         try:
             walked = walker.walk(
-                passage.view,
-                passage.position,
-                passage.run,
-                passage.pieces,
-                passage.time,
-                prepared,
+                passage.view, passage.position, passage.run, passage.pieces, passage.time, prepared
             )
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, walker, passage.time)
