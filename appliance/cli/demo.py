@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from appliance.cli.output import refused
 from appliance.shipped import SHIPPED
 
 
@@ -29,8 +30,7 @@ def demo(
     Example: rosrv demo --hold --picture drive.svg
     """
     if not (SHIPPED / "examples").is_dir():
-        typer.echo(f"rosrv demo: the simulated robot is not in {SHIPPED}: install rosrv anew", err=True)
-        raise typer.Exit(1)
+        raise refused([f"rosrv demo: the simulated robot is not in {SHIPPED}: install rosrv anew"])
     sys.path.insert(0, str(SHIPPED))
     demonstration = importlib.import_module("examples.landshark.demonstration")
     raise typer.Exit(demonstration.demonstrate(hold=hold, picture=picture, as_json=as_json))

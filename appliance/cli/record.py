@@ -213,10 +213,7 @@ def fetch(
     finally:
         part.unlink(missing_ok=True)
     if not whole:
-        typer.echo(
-            f"rosrv: the bag of {body.id} is not the one that was recorded: its hash is another", err=True
-        )
-        raise typer.Exit(1)
+        raise refused([f"rosrv: the bag of {body.id} is not the one that was recorded: its hash is another"])
     if appliance.as_json:
         say_json({"file": str(target), "sha256": body.sha256, "format": "mcap" if mcap else "bag"})
     else:
@@ -325,8 +322,7 @@ def _convert(bag: Path, target: Path) -> None:
             made.unlink()
             if not isinstance(error, ValueError):
                 raise
-            typer.echo(f"rosrv: it cannot be made MCAP, fetch the bag: {printable(str(error))}", err=True)
-            raise typer.Exit(1) from None
+            raise refused([f"rosrv: it cannot be made MCAP, fetch the bag: {error}"]) from None
 
 
 def _seconds(option: str, given: str | None) -> float | None:

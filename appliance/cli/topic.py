@@ -10,7 +10,7 @@ from appliance.api.moments import in_full
 from appliance.channel import admin
 from appliance.channel.answers.graph import Topic, TopicMessage
 from appliance.cli import completion
-from appliance.cli.output import printable, say, say_json, usage_error
+from appliance.cli.output import printable, refused, say, say_json, usage_error
 from appliance.cli.target import Appliance, speaks
 
 _AT_ONCE = 20  # messages of one look
@@ -46,8 +46,7 @@ def echo(
             _show(message, field, as_json=appliance.as_json)
         shown += len(body.messages)
         if not body.messages:
-            typer.echo(f"rosrv topic: no message of {printable(topic)} in {seconds:g} s", err=True)
-            raise typer.Exit(1)
+            raise refused([f"rosrv topic: no message of {topic} in {seconds:g} s"])
 
 
 @speaks

@@ -15,7 +15,7 @@ from typing import BinaryIO
 import typer
 
 from appliance.cli import output
-from appliance.cli.output import printable, say
+from appliance.cli.output import printable, refused, say
 
 STANDARD_OUTPUT = Path("-")
 usage_error = functools.partial(output.usage_error, verb="rosrv host")
@@ -44,8 +44,7 @@ class Output:
                 self._file.truncate()
             self._file.flush()
         except OSError as error:
-            typer.echo(f"rosrv: {printable(str(self.path))}: {error.strerror}; {lost}", err=True)
-            raise typer.Exit(1) from None
+            raise refused([f"rosrv: {self.path}: {error.strerror}; {lost}"]) from None
         self.written = True
 
     def say(self, line: str) -> None:

@@ -7,20 +7,21 @@ from typing import Annotated
 
 import typer
 
-from appliance.cli.output import say, say_json
+from appliance.cli.output import Json, refused, say, say_json, usage_error
+from appliance.cli.target import DEFAULT_STATE
 from appliance.specifications.monitors import forget_revision
 from appliance.store.database import StoreError
 from appliance.store.state import StateStore
 from appliance.supervisor.state import StateDirectory
 
-_STATE = "state.db"
+_STATE, _VERB = "state.db", "rosrv monitor"
 
 
 def reset(
     state: Annotated[
         Path, typer.Option(envvar="ROSRV_STATE", help="State directory of the appliance, which must not run")
-    ] = Path("/var/lib/rosrv"),
-    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output")] = False,
+    ] = DEFAULT_STATE,
+    as_json: Json = False,
 ) -> None:
     """Give up the specifications that were loaded by command: the next start takes those of the folder.
 
@@ -31,11 +32,7 @@ def reset(
     """
     home = state / "control"
     if not (home / _STATE).exists():
-        typer.echo(
-            f"rosrv monitor: there is no state of an appliance in {state} (name it with --state DIR)",
-            err=True,
-        )
-        raise typer.Exit(2)
+        raise usage_error(f"there is no state of an appliance in {state} (name it with --state DIR)", _VERB)
     directory = StateDirectory(state)
     try:
         revision = _forget(home)
@@ -53,7 +50,6 @@ def reset(
 
 def _forget(home: Path) -> int | None:
     owner = home.stat()
-
     troubles: list[str] = []
     try:
         store = StateStore(home, failed=troubles.append)
@@ -65,8 +61,7 @@ def _forget(home: Path) -> int | None:
             raise StoreError(troubles[-1])
         return revision
     except StoreError as error:
-        typer.echo(f"rosrv monitor: the state cannot be changed: {error}", err=True)
-        raise typer.Exit(1) from error
+        raise refused([f"{_VERB}: the state cannot be changed: {error}"]) from error
     finally:
         if os.geteuid() == 0:
             for path in home.glob("state.*"):

@@ -8,14 +8,13 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
 
-import typer
-
 from appliance.audit.moment import parse_moment
 from appliance.audit.output import rfc3339
 from appliance.channel import admin
 from appliance.channel.answers.recordings import Recording, Recordings
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.monitor.input import usage_error
+from appliance.cli.output import refused
 from appliance.cli.record import bag_of
 from appliance.cli.target import Appliance
 
@@ -108,8 +107,7 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
             pieces.append(Piece("memory" if row is lent else row.id, bags[row.id], part, row.why_not))
         if not pieces:
             text = f"nothing is recorded of {span}: {_there(known.recordings)}"
-            typer.echo(f"rosrv monitor: {text}; the memory has the last {known.before:g} s", err=True)
-            raise typer.Exit(1)
+            raise refused([f"rosrv monitor: {text}; the memory has the last {known.before:g} s"])
         yield pieces
 
 

@@ -13,7 +13,7 @@ from appliance.audit.database import LogUnreadableError
 from appliance.audit.moment import MomentError, parse_moment
 from appliance.audit.query import Filter, FilterError
 from appliance.cli.admin_socket import NotRunningError
-from appliance.cli.output import counted, printable, say_json
+from appliance.cli.output import counted, refused, say_json
 from appliance.cli.policy.input import Robot, networks_of, request_of, usage_error
 from appliance.cli.spans import Since
 from appliance.cli.target import Appliance, speaks
@@ -44,23 +44,19 @@ def learn_policy(
     if not learned.requests:
         begun = f" since {since}" if since is not None else ""
         hint = "run the robot with `audit-only = all` below [Options] first"
-        typer.echo(f"rosrv: no request that passed is in the audit log{begun}: {hint}", err=True)
-        raise typer.Exit(1)
+        raise refused([f"rosrv: no request that passed is in the audit log{begun}: {hint}"])
     _check(learned, robot)
     if output is not None:
         _write(output, learned.text)
     if as_json:
-        fields = {"requests": learned.requests, "left_out": learned.left_out, "text": learned.text}
-        say_json(fields)
+        say_json({"requests": learned.requests, "left_out": learned.left_out, "text": learned.text})
         return
     if output is None:
         sys.stdout.write(learned.text)
-    left_out = (
-        f"; {counted(learned.left_out, 'request')} left out that no rule can grant"
-        if learned.left_out
-        else ""
-    )
-    typer.echo(f"rosrv: learned from {counted(learned.requests, 'request')}{left_out}", err=True)
+    told = f"rosrv: learned from {counted(learned.requests, 'request')}"
+    if learned.left_out:
+        told += f"; {counted(learned.left_out, 'request')} left out that no rule can grant"
+    typer.echo(told, err=True)
 
 
 def _observations(appliance: Appliance, since: str | None) -> Iterator[Observation]:
@@ -84,12 +80,8 @@ def _check(learned: Learned, robot: list[str] | None) -> None:
     try:
         compile_policy(learned.text, file="learned", robot=networks_of(robot))
     except PolicyError as error:
-        for finding in error.findings:
-            typer.echo(printable(str(finding)), err=True)
-        typer.echo(
-            "rosrv: what was learned is no policy (see above): these names need a rule by hand", err=True
-        )
-        raise typer.Exit(1) from error
+        what = "rosrv: what was learned is no policy (see above): these names need a rule by hand"
+        raise refused([*error.findings, what]) from error
 
 
 def _write(output: Path, text: str) -> None:

@@ -9,12 +9,10 @@ Invariants:
 3. Nothing is followed elsewhere: no redirect, no proxy, no credentials from `.netrc`.
 """
 
-import ipaddress
 import json
 import ssl
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -22,6 +20,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from appliance.cli.admin_socket import SECONDS, NotRunningError
+from appliance.config import is_loopback
 from appliance.order_proof import HEADER, proof_of, reading_key, statement
 from appliance.store.tokens import parse_token
 
@@ -44,26 +43,19 @@ class ProblemError(Exception):
         self.lines = lines
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    url: str
-    secure: bool
-
-
 class RestClient:
     """Makes requests for the holder of a token; raises `NotRunningError` and `ProblemError`."""
 
     def __init__(self, url: str, token: str | None, authority: Path | None) -> None:
         """Raises ValueError when it is no place to send a token to."""
-        place = _place_of(url)
-        self.url = place.url
+        self.url, secure = _place_of(url)
         self._token = _checked_token(token)
-        if authority is not None and not place.secure:
+        if authority is not None and not secure:
             raise ValueError(f"--api-ca is for https, and {self.url} is clear text")
         self._client = httpx.Client(
-            base_url=place.url,
+            base_url=self.url,
             headers={"Authorization": f"Bearer {reading_key(self._token)}", "User-Agent": "rosrv"},
-            verify=_context(authority) if place.secure else False,
+            verify=_context(authority) if secure else False,
             timeout=httpx.Timeout(SECONDS, connect=_CONNECT_SECONDS),
             trust_env=False,
             follow_redirects=False,
@@ -193,7 +185,8 @@ def _stated(request: httpx.Request, challenge: str) -> bytes:
     )
 
 
-def _place_of(url: str) -> _Place:
+def _place_of(url: str) -> tuple[str, bool]:
+    """Scheme, host and port, and whether that is encrypted. Raises ValueError."""
     try:
         parts = urlsplit(url)
         host, _port = parts.hostname, parts.port
@@ -203,18 +196,9 @@ def _place_of(url: str) -> _Place:
         raise ValueError(f"--api {url!r} is no URL: write https://HOST:PORT, as `rosrv up` prints it")
     if parts.username is not None or parts.path.strip("/") or parts.query or parts.fragment:
         raise ValueError(f"--api {url!r}: write scheme, host and port only: {parts.scheme}://HOST:PORT")
-    if parts.scheme == "http" and not _is_loopback(host):
+    if parts.scheme == "http" and not is_loopback(host):
         raise ValueError(f"--api {url!r} would send the token in clear text: use https")
-    return _Place(f"{parts.scheme}://{parts.netloc}", parts.scheme == "https")
-
-
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    return f"{parts.scheme}://{parts.netloc}", parts.scheme == "https"
 
 
 def _checked_token(token: str | None) -> str:
