@@ -61,7 +61,7 @@ from appliance.master.upkeep.reminders import Reminders
 from appliance.policy import Policy
 from appliance.policy.model import Address
 from appliance.ros import log_message
-from appliance.rpc.bulk import bulk_turns
+from appliance.rpc.bulk import LargeWrites, bulk_turns
 from appliance.shares.pool import Pool
 from appliance.shares.table import PARAMETER_BYTES
 from appliance.specifications.allocation import Allocation
@@ -319,7 +319,7 @@ class Parts:
             parameters=parameters,
             redecide_for=lambda host, name: self.enactor.carry_out(self.revocation.redecide_for(host, name)),
             large=self._offload,
-            standing=base.standing,
+            large_writes=LargeWrites(self._offload, base.standing),
         )
         self.pipeline = Pipeline(
             execution,

@@ -75,7 +75,7 @@ class RecordingOrders:
                 f"before is 0 to {self._rules.longest:g} seconds, after more than 0 (recorder.longest)"
             )
         text = f"{who}: {request.note}" if request.note else who
-        begun = await self._record("order", request.note[:_LONGEST_NOTE], text, who, (before, after))
+        begun = await self._begin("order", request.note[:_LONGEST_NOTE], text, who, (before, after))
         return RecordingBegun(begun.id, begun.ends)
 
     async def called(self, call: messages.OwnServiceCalled) -> messages.OwnServiceAnswered:
@@ -91,12 +91,12 @@ class RecordingOrders:
                 "resource": call.service,
             }
             reason = f"by a call of {call.service}"
-            begun = await self._record("service", reason, text, call.caller_id, span, **caller)
+            begun = await self._begin("service", reason, text, call.caller_id, span, **caller)
         except (RecorderAwayError, UnknownThingError) as error:
             return messages.OwnServiceAnswered(call.number, False, str(error))
         return messages.OwnServiceAnswered(call.number, True, begun.id)
 
-    async def _record(
+    async def _begin(
         self, what: TriggerKind, reason: str, text: str, who: str, span: tuple[float, float], **caller: Any
     ) -> messages.RecordingBegun:
         """Have it recorded, of so many seconds before now and after, once it is on record who wants that."""

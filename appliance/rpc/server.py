@@ -19,7 +19,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import NamedTuple, cast
 
 import structlog
@@ -85,6 +85,7 @@ class NoAnswerError(Exception):
     """A handler raises it where the peer is to find its connection reset, as at a node that is gone."""
 
 
+@dataclass(eq=False)
 class HttpServer:
     """Serves one listening socket: each request goes to `handler`, whose bytes are the response body.
 
@@ -93,34 +94,23 @@ class HttpServer:
     the body, and the connection is closed. `troubled(peer, reason)` hears of every limit that was hit.
     """
 
-    def __init__(
-        self,
-        sock: socket.socket,
-        handler: Handler,
-        *,
-        at_once: AtOnce = not_at_once,
-        limits: HttpLimits,
-        visitors: Visitors[Address],
-        turns: Turns,
-        refuse: Callable[[Peer], Refusal | None] = lambda peer: None,  # noqa: ARG005 - names the parameter
-        troubled: Callable[[Peer, str], None] = lambda peer, reason: None,  # noqa: ARG005 - same
-    ) -> None:
-        self.socket = sock
-        self.handler = handler
-        self.at_once = at_once
-        self.limits = limits
-        self.visitors = visitors
-        self.turns = turns
-        self.refuse = refuse
-        self.troubled = troubled
-        self.connections: set[_Connection] = set()
-        self._server: asyncio.Server | None = None
+    sock: socket.socket
+    handler: Handler
+    _: KW_ONLY
+    at_once: AtOnce = not_at_once
+    limits: HttpLimits
+    visitors: Visitors[Address]
+    turns: Turns
+    refuse: Callable[[Peer], Refusal | None] = lambda peer: None  # noqa: ARG005 - names the parameter
+    troubled: Callable[[Peer, str], None] = lambda peer, reason: None  # noqa: ARG005 - same
+    connections: "set[_Connection]" = field(default_factory=set, init=False)
+    _server: asyncio.Server | None = field(default=None, init=False)
 
     async def start(self) -> None:
         """Begin to accept."""
         loop = asyncio.get_running_loop()
-        self.socket.setblocking(False)
-        self._server = await loop.create_server(lambda: _Connection(self), sock=self.socket, backlog=1024)
+        self.sock.setblocking(False)
+        self._server = await loop.create_server(lambda: _Connection(self), sock=self.sock, backlog=1024)
 
     def close(self) -> None:
         """Stop accepting and cut what is connected; the listening socket is closed with it."""

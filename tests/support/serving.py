@@ -19,7 +19,7 @@ from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy import Policy
 from appliance.ros.xmlrpc import Limits
-from appliance.rpc.bulk import bulk_turns
+from appliance.rpc.bulk import LargeWrites, bulk_turns
 from appliance.rpc.server import Handler, HttpRequest
 from appliance.shares.pool import Standing
 
@@ -59,7 +59,7 @@ def serving(
         parameters=parameters,
         redecide_for=redecide_for,
         large=offload,
-        standing=lambda _host: Standing.REGISTERED,
+        large_writes=LargeWrites(offload, lambda _host: Standing.REGISTERED),
     )
     pipeline = Pipeline(
         execution,

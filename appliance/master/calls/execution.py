@@ -14,6 +14,7 @@ What goes wrong on the way is an answer of the right shape for the caller, and a
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import structlog
@@ -37,7 +38,6 @@ from appliance.ros.errors import EncodingError, PeerError, ProtocolError
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import Bulk, LargeWrites, weigh
 from appliance.rpc.client import CallFailedError
-from appliance.shares.pool import Standing
 
 _log = structlog.get_logger()
 _REGISTERS = (Verb.REGISTER, Verb.UNREGISTER)
@@ -52,38 +52,25 @@ class Visit(NamedTuple):
     bulk: Bulk
 
 
+@dataclass(frozen=True, kw_only=True)
 class Execution:
     """Carries calls out. What brings a value of `large` bytes or more to ROSMaster waits for others that do.
 
     `redecide_for(host, caller_id)` takes back what the policy in force does not allow one caller.
     """
 
-    def __init__(
-        self,
-        *,
-        gate: Gate,
-        policy: Callable[[], Policy],
-        trail: AuditTrail,
-        registry: Registry,
-        enactor: Enactor,
-        liveness: Liveness,
-        parameters: ParameterCalls,
-        redecide_for: Callable[[Address, str], None],
-        large: int,
-        standing: Callable[[Address], Standing],
-    ) -> None:
-        self._gate = gate
-        self._policy = policy
-        self._trail = trail
-        self._registry = registry
-        self._enactor = enactor
-        self._liveness = liveness
-        self._parameters = parameters
-        self._redecide_for = redecide_for
-        self._large = large
-        self._claims = Claims()
-        self._writes = WriteTurns()
-        self._large_writes = LargeWrites(large, standing)
+    gate: Gate
+    policy: Callable[[], Policy]
+    trail: AuditTrail
+    registry: Registry
+    enactor: Enactor
+    liveness: Liveness
+    parameters: ParameterCalls
+    redecide_for: Callable[[Address, str], None]
+    large: int
+    large_writes: LargeWrites
+    _claims: Claims = field(default_factory=Claims, init=False)
+    _writes: WriteTurns = field(default_factory=WriteTurns, init=False)
 
     async def understand(self, visit: Visit, method: str, params: Sequence[Value]) -> Attempt | Answer:
         """The call with its canonical arguments, nothing decided yet; the answer when there is none."""
@@ -91,7 +78,7 @@ class Execution:
             return self._unknown(visit.caller, method, params)
         call = visit.table[method].call
         try:
-            if visit.bulk.large and weigh(list(params), self._large) >= self._large:
+            if visit.bulk.large and weigh(list(params), self.large) >= self.large:
                 return await asyncio.to_thread(call.attempt, visit.caller, params)
             return call.attempt(visit.caller, params)
         except PeerError as error:
@@ -99,13 +86,13 @@ class Execution:
 
     async def answer(self, visit: Visit, attempt: Attempt) -> Value:
         """Decide one call and carry it out."""
-        if self._parameters.weight_of_answer(attempt) >= self._large:
+        if self.parameters.weight_of_answer(attempt) >= self.large:
             await visit.bulk.take()
         call, probe = attempt.call, None
         registers, writes = call.verb in _REGISTERS, call.verb is Verb.WRITE
         outcome = self._decide(attempt)
         if isinstance(outcome, Contest):  # of two that register
-            probe = await self._liveness.probe(outcome.holder)
+            probe = await self.liveness.probe(outcome.holder)
         elif not outcome.allowed or not (registers or writes):
             return await self._carry_out(visit, attempt, outcome)
         elif writes:
@@ -129,7 +116,7 @@ class Execution:
 
         No call of the run reads what one before it writes, so reads are carried out first.
         """
-        if sum(map(self._parameters.weight_of_answer, run)) >= self._large:
+        if sum(map(self.parameters.weight_of_answer, run)) >= self.large:
             await visit.bulk.take()
         looks = [self._settled(attempt) for attempt in run]
         writing = [
@@ -155,22 +142,22 @@ class Execution:
         """
         keys = [attempt.resource for attempt in attempts if attempt.call.kind is Kind.PARAMETER]
         host, values = attempts[0].caller.peer.host, [attempt.value for attempt in attempts]
-        async with self._writes.alone(keys) as later, self._large_writes.turn(host, values) as large:
+        async with self._writes.alone(keys) as later, self.large_writes.turn(host, values) as large:
             yield later or large
 
     async def _carry_out(self, visit: Visit, attempt: Attempt, decision: Decision) -> Value:
-        policy, verb = self._policy(), attempt.call.verb
+        policy, verb = self.policy(), attempt.call.verb
         denied = self._recorded(attempt, decision)
         if denied is not None and verb is Verb.UNREGISTER:
-            self._enactor.carry_out(given_up(self._registry, attempt))
-        obstacle = await self._obstacle() if self._trail.strict else None
+            self.enactor.carry_out(given_up(self.registry, attempt))
+        obstacle = await self._obstacle() if self.trail.strict else None
         if obstacle is not None:
             return [0, obstacle, attempt.call.denial]
         if denied is not None:
             return denied
         answer = await self._perform(visit, attempt)
-        if verb in {Verb.REGISTER, Verb.CONNECT} and self._policy() is not policy:
-            self._redecide_for(attempt.caller.peer.host, attempt.caller.caller_id)
+        if verb in {Verb.REGISTER, Verb.CONNECT} and self.policy() is not policy:
+            self.redecide_for(attempt.caller.peer.host, attempt.caller.caller_id)
         return answer
 
     async def _carry_out_run(
@@ -179,7 +166,7 @@ class Execution:
         answers: list[Value] = [
             self._recorded(attempt, decision) for attempt, decision in zip(run, decisions, strict=True)
         ]
-        obstacle = await self._obstacle() if self._trail.strict else None
+        obstacle = await self._obstacle() if self.trail.strict else None
         writes: list[int] = []
         for place, (attempt, denied) in enumerate(zip(run, answers, strict=True)):
             if denied is not None:
@@ -190,7 +177,7 @@ class Execution:
                 writes.append(place)
             else:
                 answers[place] = await self._perform(visit, attempt)
-        outcomes = await self._parameters.write(
+        outcomes = await self.parameters.write(
             [Write(run[place].caller, run[place].resource, run[place].value) for place in writes]
         )
         for place, outcome in zip(writes, outcomes, strict=True):
@@ -201,10 +188,10 @@ class Execution:
 
     def _decide(self, attempt: Attempt) -> Decision | Contest:
         caller = attempt.caller
-        obstacle = self._trail.obstacle or ("" if caller.own else self._trail.shut_out(caller.peer.text))
+        obstacle = self.trail.obstacle or ("" if caller.own else self.trail.shut_out(caller.peer.text))
         if obstacle:
             return Decision(False, None, obstacle)
-        return self._gate.decide(attempt, self._parameters.mirror.tree)
+        return self.gate.decide(attempt, self.parameters.mirror.tree)
 
     def _settled(self, attempt: Attempt, probe: Probe | None = None) -> Decision:
         """The decision, with what is known of the node that holds the name."""
@@ -214,7 +201,7 @@ class Execution:
     def _recorded(self, attempt: Attempt, decision: Decision) -> Answer | None:
         """Record a decision; the answer of a denial, None for what is allowed."""
         request, call = attempt.request, attempt.call
-        record = self._trail.decided(
+        record = self.trail.decided(
             attempt.caller.asker,
             call.name,
             request.category.value,
@@ -227,12 +214,12 @@ class Execution:
 
     async def _obstacle(self) -> str | None:
         """What a caller is told when its record must be on disk before the answer, and cannot be."""
-        if await self._trail.durable() is None:
+        if await self.trail.durable() is None:
             return None
         return f"denied: {NOT_RECORDED}"
 
     def _told(self, decision: Decision, record: str) -> str:
-        return denial_text(decision, record, self._policy().tell)
+        return denial_text(decision, record, self.policy().tell)
 
     # --- perform, and what can go wrong ---
 
@@ -248,7 +235,7 @@ class Execution:
         caller, call = attempt.caller, attempt.call
         match error:
             case NoPortError() | LimitReachedError():
-                record = self._trail.happened(
+                record = self.trail.happened(
                     "limit exceeded",
                     str(error),
                     severity=Severity.ALARM,
@@ -274,11 +261,11 @@ class Execution:
     def _unknown(self, caller: Caller, method: str, params: Sequence[Value]) -> Answer:
         caller = caller.as_named(claimed_name(params))
         decision = Decision(False, None, f"{method[:200]!r} is not a call that is served here")
-        record = self._trail.decided(caller.asker, method, Category.COMMAND.value, method[:200], decision)
+        record = self.trail.decided(caller.asker, method, Category.COMMAND.value, method[:200], decision)
         return [0, self._told(decision, record), 0]
 
     def _malformed(self, call: Call[object], caller: Caller, claimed: str, error: PeerError) -> Answer:
-        self._trail.happened(
+        self.trail.happened(
             "malformed",
             str(error),
             decision="deny",
