@@ -18,10 +18,10 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.audit.chain import Checkpoint, parse_checkpoint
 from appliance.audit.database import LogUnreadableError, reading
 from appliance.audit.findings import Elsewhere, Kind, LogFinding
 from appliance.audit.signatures import signature_is_right
+from appliance.sealed_texts import Checkpoint, parse_checkpoint
 
 SYSLOG_ELEMENT = "rosrvCheckpoint@32473"
 _LONGEST_LINE = 65_536

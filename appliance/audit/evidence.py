@@ -12,12 +12,13 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.audit.chain import NO_CHECKPOINT, content_hash, genesis, link
+from appliance.audit.chain import content_hash, genesis, link
 from appliance.audit.copies import SignedCheckpoint
 from appliance.audit.database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.output import Entry, as_json
 from appliance.audit.query import Filter
 from appliance.audit.search import search
+from appliance.sealed_texts import NO_CHECKPOINT
 
 _Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
 

@@ -18,12 +18,13 @@ from typing import Annotated, NamedTuple
 import msgspec
 
 from appliance.audit import database
-from appliance.audit.chain import NO_CHECKPOINT, Removal, StoredColumns, follows, genesis
+from appliance.audit.chain import StoredColumns, follows, genesis
 from appliance.audit.checkpoints import CheckpointAudit, Remembered, checkpoint_rows, read_remembered
 from appliance.audit.copies import CopiesAudit, SignedCheckpoint
 from appliance.audit.database import reading
 from appliance.audit.findings import Elsewhere, Kind, LogFinding, Verification
 from appliance.audit.signatures import pinned_key_path, read_public_key, signature_is_right
+from appliance.sealed_texts import NO_CHECKPOINT, Removal
 
 _WINDOW = 64
 _TOLD_EVERY = 5000

@@ -17,21 +17,13 @@ from typing import NamedTuple
 import msgspec
 
 from appliance.audit import database
-from appliance.audit.chain import (
-    NO_CHECKPOINT,
-    Checkpoint,
-    StoredColumns,
-    checkpoint_hash,
-    follows,
-    genesis,
-    parse_checkpoint,
-    record_hash,
-)
+from appliance.audit.chain import StoredColumns, follows, genesis, record_hash
 from appliance.audit.columns import to_columns
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.kinds import FoldState
 from appliance.audit.record import Record
 from appliance.audit.retention import as_kept
+from appliance.sealed_texts import NO_CHECKPOINT, Checkpoint, checkpoint_hash, parse_checkpoint
 
 # Rows of one INSERT. The GIL is released and retaken once per statement, not once per row: next to a busy
 # event loop every retake may wait a whole switch interval (5 ms), so a row per statement is 200 rows a

@@ -14,51 +14,28 @@ Invariants:
 
 import hashlib
 import os
-import re
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
+from appliance.sealed_texts import Checkpoint, parse_checkpoint
 from appliance.whole_files import write_whole
 
 MOST_LOGS = 64
 _HASH = 32
 _NUMBER = 8
-_CHECKPOINT = re.compile(
-    rb"rosrv audit checkpoint [12]\nlog ([0-9a-f]{32})\nnumber (\d{1,18})\nsequence (\d{1,18})\n"
-    rb"hash ([0-9a-f]{64})\ntime (\d{1,19})\nprevious ([0-9a-f]{64})\n(?:removed (\d{1,18})\n)?"
-)
 
 
 class CheckpointRefusedError(Exception):
     """A checkpoint that must not be signed; the message says why."""
 
 
-class CheckpointText(NamedTuple):
-    """What a checkpoint says; `time` is control's. `removed` is None where it does not say how many are removed."""
-
-    log: str
-    number: int
-    sequence: int
-    hash: str
-    time: int
-    previous: bytes
-    removed: int | None
-    digest: bytes
-
-
-def read_checkpoint(text: bytes) -> CheckpointText:
+def read_checkpoint(text: bytes) -> Checkpoint:
     """Raises `CheckpointRefusedError` for anything that is not exactly one."""
-    match = _CHECKPOINT.fullmatch(text)
-    if match is None or text.startswith(b"rosrv audit checkpoint 2\n") is not (match[7] is not None):
-        raise CheckpointRefusedError("what was to be signed is not an audit checkpoint")
-    log, number, sequence, digest, moment, previous = (group.decode() for group in match.groups()[:6])
-    removed = None if match[7] is None else int(match[7])
-    whole = hashlib.sha256(text).digest()
-    return CheckpointText(
-        log, int(number), int(sequence), digest, int(moment), bytes.fromhex(previous), removed, whole
-    )
+    try:
+        return parse_checkpoint(text)
+    except ValueError:
+        raise CheckpointRefusedError("what was to be signed is not an audit checkpoint") from None
 
 
 class SignedCheckpoints:
@@ -77,7 +54,7 @@ class SignedCheckpoints:
             self._may_be_removed(wanted)
             number, now = wanted.number.to_bytes(_NUMBER, "big"), self._clock().to_bytes(_NUMBER, "big")
             write_whole(self._path(wanted.log, "times"), number + now, 0o600)
-            write_whole(path, number + wanted.digest, 0o600)
+            write_whole(path, number + _digest(wanted), 0o600)
             return
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         try:
@@ -85,19 +62,19 @@ class SignedCheckpoints:
             if not _is_known(descriptor, wanted, first, count):
                 self._may_be_removed(wanted)
                 self._note_time(wanted, first)
-                os.pwrite(descriptor, wanted.digest, _NUMBER + count * _HASH)
+                os.pwrite(descriptor, _digest(wanted), _NUMBER + count * _HASH)
                 os.fsync(descriptor)
         finally:
             os.close(descriptor)
 
-    def signed_at(self, checkpoint: CheckpointText) -> int | None:
+    def signed_at(self, checkpoint: Checkpoint) -> int | None:
         """When this checkpoint was signed; None if it was not. Before times were kept: what it says itself."""
         path = self._path(checkpoint.log, "signed")
         if not path.exists():
             return None
         memory = path.read_bytes()
         place = _NUMBER + (checkpoint.number - int.from_bytes(memory[:_NUMBER], "big")) * _HASH
-        if place < _NUMBER or memory[place : place + _HASH] != checkpoint.digest:
+        if place < _NUMBER or memory[place : place + _HASH] != _digest(checkpoint):
             return None
         times = self._path(checkpoint.log, "times")
         kept = times.read_bytes() if times.exists() else b""
@@ -114,7 +91,7 @@ class SignedCheckpoints:
         """The removal of the records up to this one was approved."""
         write_whole(self._path(log, "removed"), sequence.to_bytes(_NUMBER, "big"), 0o600)
 
-    def _may_be_removed(self, wanted: CheckpointText) -> None:
+    def _may_be_removed(self, wanted: Checkpoint) -> None:
         approved = self.removed(wanted.log)
         if wanted.removed is None:
             if approved is not None:
@@ -132,7 +109,7 @@ class SignedCheckpoints:
         elif approved is None:
             self.remember_removed(wanted.log, 0)
 
-    def _note_time(self, wanted: CheckpointText, first: int) -> None:
+    def _note_time(self, wanted: Checkpoint, first: int) -> None:
         path = self._path(wanted.log, "times")
         if not path.exists():
             write_whole(path, wanted.number.to_bytes(_NUMBER, "big"), 0o600)
@@ -159,6 +136,10 @@ class SignedCheckpoints:
         return self._directory / f"{log}.{what}"
 
 
+def _digest(checkpoint: Checkpoint) -> bytes:
+    return hashlib.sha256(checkpoint.text()).digest()
+
+
 def _extent(descriptor: int) -> tuple[int, int]:
     """The number of the first checkpoint remembered, and how many there are."""
     first = int.from_bytes(os.pread(descriptor, _NUMBER, 0), "big")
@@ -166,16 +147,16 @@ def _extent(descriptor: int) -> tuple[int, int]:
     return first, (os.fstat(descriptor).st_size - _NUMBER) // _HASH
 
 
-def _is_known(descriptor: int, wanted: CheckpointText, first: int, count: int) -> bool:
+def _is_known(descriptor: int, wanted: Checkpoint, first: int, count: int) -> bool:
     """Whether exactly this one was approved before; raises if it does not follow the last."""
     index = wanted.number - first
     if index < 0 or index > count:
         raise CheckpointRefusedError(f"checkpoint {wanted.number} does not follow number {first + count - 1}")
     if index < count:
-        if os.pread(descriptor, _HASH, _NUMBER + index * _HASH) != wanted.digest:
+        if os.pread(descriptor, _HASH, _NUMBER + index * _HASH) != _digest(wanted):
             raise CheckpointRefusedError(f"another checkpoint {wanted.number} of this log was signed before")
         return True
-    if os.pread(descriptor, _HASH, _NUMBER + (count - 1) * _HASH) != wanted.previous:
+    if os.pread(descriptor, _HASH, _NUMBER + (count - 1) * _HASH) != bytes.fromhex(wanted.previous):
         raise CheckpointRefusedError(
             f"checkpoint {wanted.number} does not carry the hash of the one signed before it"
         )

@@ -13,7 +13,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.ipsec.checkpoints import CheckpointText, SignedCheckpoints, read_checkpoint
+from appliance.ipsec.checkpoints import SignedCheckpoints, read_checkpoint
+from appliance.sealed_texts import Checkpoint, Removal, checkpoint_hash
 
 LARGEST_RECORD = 64 << 10
 """Bytes of a record with the longest details; no log has larger ones on average."""
@@ -56,23 +57,21 @@ class Removals:
         if not why:
             raise RemovalRefusedError(self._words(upto))
         self._signed.remember_removed(upto.log, max(upto.sequence, self._signed.removed(upto.log) or 0))
-        return (
-            f"rosrv audit removal 1\nlog {upto.log}\ncheckpoint {upto.number}\nsequence {upto.sequence}\n"
-            f"hash {upto.hash}\nsealed {upto.digest.hex()}\nlimit {why}\n"
-        ).encode()
+        sealed = checkpoint_hash(checkpoint)
+        return Removal(upto.log, upto.number, upto.sequence, upto.hash, sealed, why).text()
 
     def _by_age(self, signed_at: int) -> str:
         days = self._kept.days
         old = days is not None and self._clock() - signed_at >= int(days * _DAY)
         return f"{days} days" if old else ""
 
-    def _by_size(self, upto: CheckpointText, last: CheckpointText) -> str:
+    def _by_size(self, upto: Checkpoint, last: Checkpoint) -> str:
         size = self._kept.size
         if size is None or last.log != upto.log or self._signed.signed_at(last) is None:
             return ""
         return f"{size} bytes" if (last.sequence - upto.sequence) * LARGEST_RECORD >= size else ""
 
-    def _words(self, upto: CheckpointText) -> str:
+    def _words(self, upto: Checkpoint) -> str:
         if self._kept.days is None and self._kept.size is None:
             return "records are kept for ever: neither audit.retention_days nor audit.retention_bytes is set"
         return (

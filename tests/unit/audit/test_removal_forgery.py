@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.audit.chain import Removal
 from appliance.audit.copies import signed_checkpoints
 from appliance.audit.findings import Kind, Verification
 from appliance.audit.log import AuditLog
@@ -19,6 +18,7 @@ from appliance.audit.retention import Retention
 from appliance.audit.search import export, search
 from appliance.audit.verify import verify
 from appliance.audit.writer import ChainWriter, RemovedRange
+from appliance.sealed_texts import Removal
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import await_removal, make_old

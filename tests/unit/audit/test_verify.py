@@ -14,12 +14,13 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
-from appliance.audit.chain import genesis, parse_checkpoint, record_hash
+from appliance.audit.chain import genesis, record_hash
 from appliance.audit.checkpoints import Remembered, read_remembered
 from appliance.audit.database import COLUMNS, LogUnreadableError
 from appliance.audit.findings import Kind
 from appliance.audit.signatures import KeyUnreadableError, read_public_key
 from appliance.audit.verify import verify
+from appliance.sealed_texts import parse_checkpoint
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog
 

@@ -51,6 +51,10 @@ def test_asked_again(tmp_path: Path) -> None:
         (b"", "not an audit checkpoint"),
         (b"rosrv audit checkpoint 1\n", "not an audit checkpoint"),
         (checkpoint(2) + b"x", "not an audit checkpoint"),
+        (
+            checkpoint(2, digest(checkpoint(1))).replace(b"number 2", b"number 02"),
+            "not an audit checkpoint",
+        ),
         (checkpoint(2, log="../../../../etc/passwd"), "not an audit checkpoint"),
         (b"\0" * 100_000, "not an audit checkpoint"),
     ],

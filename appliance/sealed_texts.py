@@ -1,0 +1,90 @@
+"""What the signer signs of the audit log, and who reads it again: checkpoints, and removals of old records. No I/O.
+
+Invariants:
+1. A checkpoint names the log, its own number, the sequence, the hash at that sequence, the time, the hash of the
+   checkpoint before it, and up to which record the log's beginning is removed. Checkpoints of version 1 do not say what
+   is removed.
+2. A removal names the checkpoint up to which records go and the limit of the settings that it follows from.
+3. There is one text of each: what is written otherwise, by a zero in front of a number, is none.
+"""
+
+import hashlib
+import re
+from typing import NamedTuple
+
+NO_CHECKPOINT = "0" * 64  # stands for the hash of the one before the first
+
+
+class Checkpoint(NamedTuple):
+    """The state of the chain at one moment; `time` in nanoseconds since the epoch, hashes in hexadecimal."""
+
+    log: str
+    number: int
+    sequence: int
+    hash: str
+    time: int
+    previous: str
+    removed: int | None = None
+
+    def text(self) -> bytes:
+        """What is signed."""
+        version, removed = (1, "") if self.removed is None else (2, f"removed {self.removed}\n")
+        return (
+            f"rosrv audit checkpoint {version}\nlog {self.log}\nnumber {self.number}\nsequence {self.sequence}\n"
+            f"hash {self.hash}\ntime {self.time}\nprevious {self.previous}\n{removed}"
+        ).encode()
+
+
+_CHECKPOINT = re.compile(
+    rb"rosrv audit checkpoint [12]\nlog ([0-9a-f]{32})\nnumber (\d{1,18})\nsequence (\d{1,18})\n"
+    rb"hash ([0-9a-f]{64})\ntime (\d{1,19})\nprevious ([0-9a-f]{64})\n(?:removed (\d{1,18})\n)?"
+)
+
+
+def parse_checkpoint(text: bytes) -> Checkpoint:
+    """Read a checkpoint's text. Raises `ValueError` for anything that is not exactly one."""
+    match = _CHECKPOINT.fullmatch(text)
+    if match is not None:
+        log, number, sequence, digest, time, previous = (group.decode() for group in match.groups()[:6])
+        removed = None if match[7] is None else int(match[7])
+        found = Checkpoint(log, int(number), int(sequence), digest, int(time), previous, removed)
+        if found.text() == text:
+            return found
+    raise ValueError("not the text of an audit checkpoint")
+
+
+def checkpoint_hash(text: bytes) -> str:
+    """The hash that the next checkpoint carries as `previous`."""
+    return hashlib.sha256(text).hexdigest()
+
+
+class Removal(NamedTuple):
+    """The removal of all records up to a checkpoint: its number, sequence, the hash there, and its own hash.
+
+    `limit` is the setting that it follows from, as the signer writes it.
+    """
+
+    log: str
+    checkpoint: int
+    sequence: int
+    hash: str
+    sealed: str
+    limit: str
+
+    def text(self) -> bytes:
+        """What is signed."""
+        return (
+            f"rosrv audit removal 1\nlog {self.log}\ncheckpoint {self.checkpoint}\nsequence {self.sequence}\n"
+            f"hash {self.hash}\nsealed {self.sealed}\nlimit {self.limit}\n"
+        ).encode()
+
+
+_LIMIT = re.compile(rb"\nlimit ([0-9][0-9.e+-]{0,31} (?:days|bytes))\n\Z")
+
+
+def limit_of_removal(text: bytes) -> str:
+    """The limit in a removal's text. Raises `ValueError` where there is none."""
+    match = _LIMIT.search(text)
+    if match is None:
+        raise ValueError("not the text of a removal")
+    return match[1].decode()
