@@ -51,10 +51,10 @@ def measures_of(parts: Parts, status: Status, hosts: list[Host], queued_deliveri
         relayed=relayed,
         delayed=delayed,
         monitors=[(*labels, count) for labels, count in done.items()],
-        margins=list(islice(_margins(parts.monitors.rows), MOST_MARGINS)),
+        margins=list(islice(_margins(parts.monitors.rollout.rows), MOST_MARGINS)),
         slices={
             name: (row.slices, row.slice_limit)
-            for name, row in parts.monitors.rows.items()
+            for name, row in parts.monitors.rollout.rows.items()
             if row.slice_limit
         },
         drop_at=_at(records.at, "drop"),

@@ -14,14 +14,14 @@ def monitors_of(monitors: Monitors, rv_state: list[object], *, texts: bool) -> a
     return answers.Monitors(
         revision=monitors.revision,
         tag=monitors.tag,
-        who=monitors.who,
-        note=monitors.note,
-        loaded=monitors.loaded,
+        who=monitors.in_force.who,
+        note=monitors.in_force.note,
+        loaded=monitors.in_force.loaded,
         confirm_by=monitors.confirm_by,
         folder=str(monitors.folder) if monitors.folder is not None else None,
         differs_from_folder=monitors.differs_from_folder,
         warnings=list(monitors.checked.warnings),
-        refused=monitors.refused,
+        refused=monitors.rollout.refused,
         site_keys=list(monitors.site_keys),
         rv_state=msgspec.convert(rv_state, answers.RvState),
         monitors=states_of(monitors),
@@ -39,8 +39,8 @@ def monitors_status(monitors: Monitors) -> MonitorsState:
         enabled=sum(row.enabled for row in rows),
         held=[row.name for row in rows if row.held],
         failing=[row.name for row in rows if row.failing and not row.trial],
-        refused=monitors.refused,
-        who=monitors.who,
+        refused=monitors.rollout.refused,
+        who=monitors.in_force.who,
         differs_from_folder=monitors.differs_from_folder,
         confirm_by=monitors.confirm_by,
         trials=[row.name for row in rows if row.trial],
@@ -53,14 +53,14 @@ def states_of(monitors: Monitors) -> list[answers.MonitorState]:
 
 
 def _state(monitors: Monitors, name: str) -> answers.MonitorState:
-    row, checked = monitors.rows.get(name), monitors.checked
+    row, checked = monitors.rollout.rows.get(name), monitors.checked
     drops, changes = (row.drops, row.changes) if row is not None else (0, 0)
     tried = row is not None and row.trial
     return answers.MonitorState(
         name=name,
         file=checked.monitors[name],
-        enabled=monitors.enabled(name),
-        held=name in monitors.held,
+        enabled=monitors.switches.enabled(name),
+        held=name in monitors.rollout.held,
         failing=row is not None and row.failing,
         topics=sorted(checked.topics[name]),
         services=sorted(checked.services[name]),
@@ -70,7 +70,7 @@ def _state(monitors: Monitors, name: str) -> answers.MonitorState:
         changes=0 if tried else changes,
         faults=row.faults if row is not None else 0,
         certificates=checked.certificates.get(name, []),
-        trial=monitors.on_trial(name),
+        trial=monitors.switches.on_trial(name),
         would_drop=drops if tried else 0,
         would_change=changes if tried else 0,
         missed=row.missed if row is not None else 0,

@@ -1,23 +1,21 @@
-"""The specifications in force and the switches of their monitors: loading, revisions, what the relay is told.
+"""The specifications in force: loading, switching, going back, and what operators are answered.
 
-The folder is the baseline and only read; what is loaded, replaced or removed while the robot runs is a revision in
-the store and survives a restart. New specifications are compiled before anything changes; bad ones change nothing
-and say everything that is wrong with them. The relay compiles them again and has the last word.
+Larger than most files because each order is a few lines, and all of them change the same few things, one at a time.
 
-Switches survive restarts, too: a monitor that nobody has switched is enabled or not as `--enable` says. A switch goes
-with its monitor: another that is loaded later under the same name is as if nobody had switched it.
+Invariants:
 
-A monitor is enabled, disabled or on trial. Those that share variables are on trial together (apart from disabled ones):
-one that is loaded joins those that are, and no load and no switch takes one that is in force along.
-
-A reload takes what the folder has, and leaves what the folder does not have in force unless it is told to remove that:
-nobody's protection ends because a file is not where it was.
-
-Every change can be made on trial (`store/revisions.py`), and every revision is kept with the switches that it had last:
-a rollback to it brings its monitors back as they were.
-
-What operators have seen has a tag, which is another after every revision, switch and resumption, and never comes back:
-a change that is meant for another tag than the present one is refused.
+1. The folder is the baseline and only read; what is loaded, replaced or removed while the robot runs is a revision in
+   the store (`revisions.py`) and survives a restart, as the switches (`switches.py`) do.
+2. New specifications are compiled before anything changes; bad ones change nothing and say everything that is wrong
+   with them. The relay compiles them again and has the last word.
+3. What is loaded joins monitors on trial that it shares variables with; no load and no switch takes one that is in
+   force along.
+4. A reload takes what the folder has, and leaves what the folder does not have in force unless it is told to remove
+   that: nobody's protection ends because a file is not where it was.
+5. Every change can be made on trial (`store/revisions.py`), and every revision is kept with the switches that it had
+   last: a rollback to it brings its monitors back as they were.
+6. What operators have seen has a tag, which is another after every revision, switch and resumption, and never comes
+   back: a change that is meant for another tag than the present one is refused.
 """
 
 import asyncio
@@ -26,7 +24,7 @@ import json
 import time
 from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 import structlog
@@ -37,18 +35,27 @@ from appliance.channel import admin, messages
 from appliance.channel.answers import monitors as answers
 from appliance.channel.answers.monitors import Replaced, Switched
 from appliance.fingerprints import fingerprint_of_all
-from appliance.rosmop.sharing import sharing
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError, check
 from appliance.specifications.folder import SpecificationFolder
 from appliance.specifications.records import MonitorRecords
 from appliance.specifications.relays import Relays
+from appliance.specifications.revisions import (
+    DISK,
+    NOTHING,
+    Kept,
+    check_kept,
+    described,
+    kept_in,
+    sources_of,
+    text_of,
+)
 from appliance.specifications.rollout import TRIAL, Revision, Rollout, Switch
+from appliance.specifications.switches import Switches, require_whole
 from appliance.store.revisions import Trial, UnknownRevisionError, wanted
 from appliance.store.state import MonitorRevisionRow, StateStore
 
 _log = structlog.get_logger()
-_DISK = "disk"
 _SWITCHES = "monitor switches"
 _ACTS = "monitor acts"
 ALLOCATION = "relays"
@@ -71,12 +78,6 @@ class MonitorsChangedError(Exception):
             " look at them first"
         )
         self.tag = tag
-
-
-class Kept(Sources, frozen=True):
-    """A revision as it is in the store; `switches` are those of its monitors when it was replaced."""
-
-    switches: dict[str, Switch] = {}  # noqa: RUF012  each struct gets one of its own
 
 
 class Monitors:
@@ -104,23 +105,17 @@ class Monitors:
     ) -> None:
         self.folder = folder
         self._folder = SpecificationFolder(folder)
-        self._enable = enable
         self.site_keys = site_keys
         self._store = store
         self._trail = trail
-        self._rollout = Rollout(allocation, trail, on_fault, self._states_of, relays, slices=slices)
-        self._switches: dict[str, Switch] = {}
-        self._states: dict[str, Switch] = {}  # of those in force
+        self.switches = Switches(enable)
+        self.rollout = Rollout(allocation, trail, on_fault, self.switches.states_of, relays, slices=slices)
         self._acts = 0  # switches and resumptions, ever
         self._one_change = asyncio.Lock()
         self._trial = Trial(store, "confirm monitors", self._go_back, (SpecificationsRefusedError,))
-        self._row = MonitorRevisionRow(
-            0, "{}", 0.0, _DISK, ""
-        )  # in force; of none that is kept until there is one
-        self.revision = 0
+        self.in_force = NOTHING  # until `start`
         self.sources = Sources()
         self.checked = Checked()
-        self.who, self.note, self.loaded = _DISK, "", 0.0
         self.records = MonitorRecords(trail, lambda topic, data: self.checked.fields(topic, data), told)  # noqa: PLW0108 - of whatever is in force then
         self._published = published
 
@@ -133,14 +128,13 @@ class Monitors:
         unless an operator's own revision was in force when it stopped.
         """
         settings = self._store.settings()
-        self._switches = json.loads(settings.get(_SWITCHES, "{}"))
+        self.switches.said = json.loads(settings.get(_SWITCHES, "{}"))
         self._acts = int(settings.get(_ACTS, "0"))
         last = self._store.monitor_revision()
         if last is not None:
-            self._row = last
-        if last is not None and (restarted or last.who != _DISK):
-            sources = sources_of(last)
-            self._enforce(sources, _check_kept(sources, last, self.site_keys), last)
+            self.in_force = last
+        if last is not None and (restarted or last.who != DISK):
+            self._enforce(sources_of(last), check_kept(last, self.site_keys), last)
             self._trial.resume()
         else:
             sources = self._folder.read()
@@ -151,11 +145,11 @@ class Monitors:
             else:
                 self._trial.end()
                 if sources.files or last is not None:
-                    self._keep(sources, checked, who=_DISK, note="read at start")
+                    self._keep(sources, checked, who=DISK, note="read at start")
         now = Revision(self.revision, self.sources, self.checked)
-        self._rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
-        unknown = sorted(self._named() - self.checked.monitors.keys())
-        if unknown and self.who == _DISK and not restarted:
+        self.rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
+        unknown = sorted(self.switches.named - self.checked.monitors.keys())
+        if unknown and self.in_force.who == DISK and not restarted:
             raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
         if unknown:  # it was removed while the robot ran
             _log.warning("--enable names monitors that are not loaded", monitors=unknown)
@@ -168,19 +162,9 @@ class Monitors:
         return f"{self.revision}.{self._acts}"
 
     @property
-    def refused(self) -> list[str]:
-        """Why a relay does not take what is in force; empty when all do."""
-        return self._rollout.refused
-
-    @property
-    def held(self) -> set[str]:
-        """The monitors that hold their topics."""
-        return self._rollout.held
-
-    @property
-    def rows(self) -> Mapping[str, messages.MonitorRow]:
-        """State and counters of the monitors."""
-        return self._rollout.rows
+    def revision(self) -> int:
+        """The number of what is in force; 0 for nothing."""
+        return self.in_force.revision
 
     @property
     def differs_from_folder(self) -> bool:
@@ -191,14 +175,6 @@ class Monitors:
     def confirm_by(self) -> float | None:
         """When what is in force goes back by itself unless confirmed, in seconds since the epoch."""
         return self._trial.confirm_by
-
-    def enabled(self, name: str) -> bool:
-        """Whether what a monitor does is done."""
-        return self._states.get(name) is True
-
-    def on_trial(self, name: str) -> bool:
-        """Whether a monitor is given copies, and what it would do is only told."""
-        return self._states.get(name) == TRIAL
 
     def names(self) -> list[str]:
         """All monitors, in the order in which they see messages."""
@@ -215,20 +191,22 @@ class Monitors:
     async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
         """All kept revisions, the newest first."""
         rows = await self._kept_rows()
-        return answers.MonitorRevisionList([answers.MonitorRevision(**self._described(row)) for row in rows])
+        return answers.MonitorRevisionList(
+            [answers.MonitorRevision(**described(row, self.revision)) for row in rows]
+        )
 
     async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
         """A revision with its texts. Raises `UnknownMonitorError`."""
         for row in await self._kept_rows():
             if row.revision == request.revision:
                 return answers.RevisionTexts(
-                    **self._described(row), **msgspec.structs.asdict(sources_of(row))
+                    **described(row, self.revision), **msgspec.structs.asdict(sources_of(row))
                 )
         raise UnknownMonitorError(f"there is no revision {request.revision} of the specifications")
 
-    def statement(self, relay: int = 0) -> messages.SpecificationsStated:
+    def statement(self, relay: int) -> messages.SpecificationsStated:
         """What a relay is told before anything else."""
-        return self._rollout.statement(relay)
+        return self.rollout.statement(relay)
 
     # --- changing ---
 
@@ -248,7 +226,7 @@ class Monitors:
         async with self._changing(request.expected):
             new = Sources(request.files, request.definitions, request.signatures)
             sources = self.sources.with_files(new)
-            if self._row.who != _DISK and sources == self.sources:  # the same texts twice are one revision
+            if self.in_force.who != DISK and sources == self.sources:  # the same texts twice are one revision
                 return self._replaced(self.revision, ([], [], []))
             return await self._change(sources, who, who, request.note or "loaded", request.confirm_within)
 
@@ -277,7 +255,7 @@ class Monitors:
             kept = [] if request.prune else sorted(self.sources.files.keys() - sources.files.keys())
             if kept:
                 sources = self.sources.with_files(sources)
-            keeper = who if kept else _DISK  # else the next start would read the folder, and nothing else
+            keeper = who if kept else DISK  # else the next start would read the folder, and nothing else
             within = request.confirm_within
             return await self._change(sources, keeper, who, "reloaded from disk", within, kept=kept)
 
@@ -311,13 +289,13 @@ class Monitors:
         A monitor that comes back is switched as it was when it went. Raises `SpecificationsRefusedError`.
         """
         async with self._changing(request.expected):
-            row = MonitorRevisionRow(0, "{}", 0.0, _DISK, "")
+            row = NOTHING
             if request.revision != 0:
                 try:
                     row = wanted(await self._kept_rows(), request.revision, self.revision)
                 except UnknownRevisionError as error:
                     raise SpecificationsRefusedError([str(error)]) from error
-            note, switches = f"rolled back to revision {row.revision}", _kept(row).switches
+            note, switches = f"rolled back to revision {row.revision}", kept_in(row).switches
             return await self._change(sources_of(row), who, who, note, switches=switches)
 
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
@@ -344,7 +322,7 @@ class Monitors:
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
-            tried = [name for name in request.names if request.enabled and self.on_trial(name)]
+            tried = [name for name in request.names if request.enabled and self.switches.on_trial(name)]
             if tried:
                 text = f"{', '.join(tried)} is on trial: rosrv monitor promote brings it into force"
                 raise SpecificationsRefusedError([text])
@@ -357,42 +335,41 @@ class Monitors:
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
-            disabled = [name for name in request.names if self._states[name] is False]
+            disabled = [name for name in request.names if self.switches.states[name] is False]
             if disabled and not request.trial:
                 text = f"{', '.join(disabled)} is disabled, not on trial: rosrv monitor enable"
                 raise SpecificationsRefusedError([text])
             names = await self._switch(request.names, TRIAL if request.trial else True, who)
-            return self._switched(names, self._rollout.began(names))
+            return self._switched(names, self.rollout.began(names))
 
     def _switched(self, names: list[str], began: Sequence[str] = ()) -> Switched:
         return Switched(names, self.revision, self.tag, [*began])
 
     async def _switch(self, names: list[str], to: Switch, who: str) -> list[str]:
-        changed = [name for name in dict.fromkeys(names) if self._states[name] != to]
+        switches = self.switches
+        changed = [name for name in dict.fromkeys(names) if switches.states[name] != to]
         if not changed:
             return changed
-        before, after = self._switches, self._switches | dict.fromkeys(changed, to)
-        torn = self._torn(self._states | dict.fromkeys(changed, to), self.checked)
-        if torn:
-            raise SpecificationsRefusedError([torn])
-        retried = to == TRIAL or any(self.on_trial(name) for name in changed)
+        before, others = switches.said, dict.fromkeys(changed, to)
+        require_whole(switches.states | others, self.checked)
+        retried = to == TRIAL or any(map(switches.on_trial, changed))
         await self._count()
-        self._switches = after
+        switches.said = before | others
         if retried:
             try:
-                await self._rollout.take(Revision(self.revision, self.sources, self.checked))
+                await self.rollout.take(Revision(self.revision, self.sources, self.checked))
             except SpecificationsRefusedError:
-                self._switches = before
+                switches.said = before
                 raise
         word = "on trial" if to == TRIAL else "enabled" if to else "disabled"
         for name in changed:
-            self._states[name] = to
+            switches.states[name] = to
             if not retried:
-                self._rollout.tell(name, messages.MonitorSwitched(name, to is True))
+                self.rollout.tell(name, messages.MonitorSwitched(name, to is True))
             self._say_switched(name, word, who, f"{name} is {word}")
-        self._store.save_setting(_SWITCHES, json.dumps(self._switches))
+        self._store.save_setting(_SWITCHES, json.dumps(switches.said))
         await self._store.settled()
-        await self._rollout.carried_out()
+        await self.rollout.carried_out()
         return changed
 
     def _say_switched(self, name: str, word: str, who: str, text: str) -> None:
@@ -408,15 +385,15 @@ class Monitors:
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
-            held = [name for name in dict.fromkeys(request.names) if name in self.held]
+            held = [name for name in dict.fromkeys(request.names) if name in self.rollout.held]
             if held:
                 await self._count()
             away = []
             for name in held:
-                if not self._rollout.tell(name, messages.MonitorResumed(name)):
+                if not self.rollout.tell(name, messages.MonitorResumed(name)):
                     away.append(name)
                     continue
-                self._rollout.resumed(name)
+                self.rollout.resumed(name)
                 self._trail.happened(
                     "monitor resumed",
                     f"the topics of {name} go on",
@@ -429,7 +406,7 @@ class Monitors:
                     f"{', '.join(away)} not resumed: the relay process is away; resume when it is there again"
                 )
                 raise SpecificationsRefusedError([text])
-            await self._rollout.carried_out()
+            await self.rollout.carried_out()
             return self._switched(held)
 
     # --- what the relay says ---
@@ -439,52 +416,17 @@ class Monitors:
         if isinstance(message, messages.MonitorsReported):
             self.records.reported(message.events, message.lost)
         else:
-            self._rollout.received(message, relay)
+            self.rollout.received(message, relay)
 
     def relay_lost(self, relay: int) -> None:
         """A relay is gone."""
-        self._rollout.lost(relay)
+        self.rollout.lost(relay)
 
     # --- inside ---
 
     async def _kept_rows(self) -> list[MonitorRevisionRow]:
         await self._store.settled()
         return await asyncio.to_thread(self._store.monitor_revisions)
-
-    def _described(self, row: MonitorRevisionRow) -> dict[str, Any]:
-        """The fields of `MonitorRevision`."""
-        known = {name: getattr(row, name) for name in ("revision", "loaded", "who", "note")}
-        return known | {"in_force": row.revision == self.revision, "names": list(sources_of(row).files)}
-
-    def _states_of(self, checked: Checked) -> dict[str, Switch]:
-        """What these monitors are, or would be; what shares variables with a monitor on trial is on trial, too."""
-        named = self._named()
-        states: dict[str, Switch] = {
-            name: self._switches.get(name, self._enable == "all" or name in named)
-            for name in checked.monitors
-        }
-        if TRIAL in states.values():
-            for group in sharing(checked.uses):
-                if any(states[name] == TRIAL for name in group):
-                    states |= {name: TRIAL for name in group if states[name] is True}
-        return states
-
-    def _torn(self, states: Mapping[str, Switch], checked: Checked) -> str:
-        """Why monitors cannot be so: which are in force and share variables with some that are on trial."""
-        for group in sharing(checked.uses):
-            tried = sorted(name for name in group if states[name] == TRIAL)
-            others = sorted(name for name in group if states[name] is True)
-            if tried and others:
-                return (
-                    f"{', '.join(tried)} on trial and {', '.join(others)} in force do not go together,"
-                    " because they share variables: name them all"
-                )
-        return ""
-
-    def _named(self) -> set[str]:
-        return (
-            set() if self._enable in {"all", "none"} else {name.strip() for name in self._enable.split(",")}
-        )
 
     def _unknown(self, names: list[str]) -> str:
         known = ", ".join(self.checked.monitors) or "none is loaded"
@@ -516,20 +458,18 @@ class Monitors:
         switches: Mapping[str, Switch] = {},
     ) -> Replaced:
         """`switches` are for monitors that are not in force yet."""
-        before, previous, switched = self.revision, self.sources, self._switches
-        self._switches = {
+        before, previous, switched = self.revision, self.sources, self.switches.said
+        self.switches.said = {
             **{monitor: to for monitor, to in switches.items() if monitor not in self.checked.monitors},
             **switched,
         }
         try:
             checked = await asyncio.to_thread(check, sources, self.site_keys)
-            in_force = {name: True for name in checked.monitors if self.enabled(name)}
-            torn = self._torn(self._states_of(checked) | in_force, checked)
-            if torn:
-                raise SpecificationsRefusedError([torn])
-            moved = await self._rollout.take(Revision(before + 1, sources, checked))
+            in_force = {name: True for name in checked.monitors if self.switches.enabled(name)}
+            require_whole(self.switches.states_of(checked) | in_force, checked)
+            moved = await self.rollout.take(Revision(before + 1, sources, checked))
         except SpecificationsRefusedError as error:
-            self._switches = switched
+            self.switches.said = switched
             hint = [f"not of the folder, and kept: {', '.join(kept)} (prune removes them)"] if kept else []
             findings = error.findings + hint
             self._trail.happened(
@@ -539,14 +479,14 @@ class Monitors:
                 who=who,
             )
             raise SpecificationsRefusedError(findings) from error
-        began = self._rollout.began(checked.monitors)
+        began = self.rollout.began(checked.monitors)
         self._trial.announce(before, confirm_within)
         self._keep(sources, checked, who=keeper, note=note, by=who, began=began)
         self._trial.changed(before, confirm_within)
         await self._store.settled()
-        await self._rollout.all_taken()
+        await self.rollout.all_taken()
         self._published()
-        began = self._rollout.began(checked.monitors)  # by those that have it only now, too
+        began = self.rollout.began(checked.monitors)  # by those that have it only now, too
         return self._replaced(before, sources.difference(previous), moved, began, kept)
 
     def _replaced(
@@ -573,11 +513,11 @@ class Monitors:
         by: str | None = None,
         began: Sequence[str] = (),
     ) -> None:
-        last, before = self._row, sources_of(self._row)
+        last, before = self.in_force, sources_of(self.in_force)
         if last.revision:
-            ended = Kept(before.files, before.definitions, before.signatures, self._switches)
-            self._store.save_monitor_revision(last._replace(sources=_text(ended)))
-        row = MonitorRevisionRow(last.revision + 1, _text(sources), time.time(), who, note)
+            ended = Kept(before.files, before.definitions, before.signatures, self.switches.said)
+            self._store.save_monitor_revision(last._replace(sources=text_of(ended)))
+        row = MonitorRevisionRow(last.revision + 1, text_of(sources), time.time(), who, note)
         self._store.save_monitor_revision(row)
         self._enforce(sources, checked, row)
         added, changed, removed = sources.difference(before)
@@ -600,52 +540,9 @@ class Monitors:
         )
 
     def _enforce(self, sources: Sources, checked: Checked, row: MonitorRevisionRow) -> None:
-        self.sources, self.checked, self.revision = sources, checked, row.revision
-        self._row, self.who, self.note, self.loaded = row, row.who, row.note, row.loaded
-        self._switches = {name: to for name, to in self._switches.items() if name in checked.monitors}
-        self._states = self._states_of(checked)
-        for name, state in self._states.items():
-            if state == TRIAL and self._switches.get(name) != TRIAL:
-                self._switches[name] = TRIAL
-                text = f"{name} is on trial: it shares variables with one that is"
-                self._say_switched(name, TRIAL, row.who, text)
-        self._store.save_setting(_SWITCHES, json.dumps(self._switches))
-
-
-def forget_revision(store: StateStore, now: float) -> int | None:
-    """Have the next start take the folder; the revision that is given up, None if it was the folder's already.
-
-    For an appliance that does not run.
-    """
-    last = store.monitor_revision()
-    if last is None or last.who == _DISK:
-        return None
-    store.save_monitor_revision(
-        MonitorRevisionRow(last.revision + 1, "{}", now, _DISK, f"revision {last.revision} was given up")
-    )
-    return last.revision
-
-
-def _text(sources: Sources) -> str:
-    return msgspec.json.encode(sources).decode()
-
-
-def _kept(row: MonitorRevisionRow) -> Kept:
-    return msgspec.json.decode(row.sources, type=Kept)
-
-
-def sources_of(row: MonitorRevisionRow) -> Sources:
-    """What was in force."""
-    return msgspec.json.decode(row.sources, type=Sources)
-
-
-def _check_kept(sources: Sources, row: MonitorRevisionRow, site_keys: Sequence[str]) -> Checked:
-    """Compile what was in force. A newer version of the appliance may refuse it; then there is a way back."""
-    try:
-        return check(sources, site_keys)
-    except SpecificationsRefusedError as error:
-        way = (
-            f"this is revision {row.revision}, which {row.who} brought into force while the appliance ran."
-            " To give it up and start with the folder (--monitors): rosrv monitor reset --state DIR"
-        )
-        raise SpecificationsRefusedError([*error.findings, way]) from error
+        self.sources, self.checked, self.in_force = sources, checked, row
+        for name in self.switches.enforce(checked):
+            self._say_switched(
+                name, TRIAL, row.who, f"{name} is on trial: it shares variables with one that is"
+            )
+        self._store.save_setting(_SWITCHES, json.dumps(self.switches.said))

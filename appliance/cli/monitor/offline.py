@@ -9,7 +9,7 @@ import typer
 
 from appliance.cli.output import Json, refused, say, say_json, usage_error
 from appliance.cli.target import DEFAULT_STATE
-from appliance.specifications.monitors import forget_revision
+from appliance.specifications.revisions import forget_revision
 from appliance.store.database import StoreError
 from appliance.store.state import StateStore
 from appliance.supervisor.state import StateDirectory

@@ -27,7 +27,11 @@ class MonitorCalls:
 
     async def get_monitors(self, _caller: Caller) -> Answer:
         """`getMonitors(caller_id)` → `[[name, enabled], …]`."""
-        return [1, "Monitors", [[name, self.monitors.enabled(name)] for name in self.monitors.names()]]
+        return [
+            1,
+            "Monitors",
+            [[name, self.monitors.switches.enabled(name)] for name in self.monitors.names()],
+        ]
 
     async def monitor_control(self, caller: Caller, word: str, names: list[str]) -> Answer:
         """`monitorControl(caller_id, "enable"|"disable", [names])` → the names that were switched."""

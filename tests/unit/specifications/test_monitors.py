@@ -132,9 +132,13 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
     assert (replaced.revision, replaced.added, replaced.changed) == (2, ["b.rv"], [])
     assert replaced.began == ["b"]
     repeated = await again.load(admin.MonitorLoad({"b.rv": B}), "adam")
-    assert (repeated.revision, repeated.replaced, repeated.changed, again.who) == (2, 2, [], "eve")
+    assert (repeated.revision, repeated.replaced, repeated.changed, again.in_force.who) == (2, 2, [], "eve")
     restarted = desk.monitors()
-    assert (restarted.names(), restarted.who, restarted.differs_from_folder) == (["a", "b"], "eve", True)
+    assert (restarted.names(), restarted.in_force.who, restarted.differs_from_folder) == (
+        ["a", "b"],
+        "eve",
+        True,
+    )
     back = await restarted.reload(admin.MonitorReload(prune=True), "operator")
     assert (back.removed, restarted.names(), restarted.differs_from_folder) == (["b.rv"], ["a"], False)
     loaded = [fields for event, fields in desk.trail.heard if event == "specifications loaded"]
@@ -190,7 +194,7 @@ async def test_a_revision_comes_back_with_its_switches(desk: Desk) -> None:
     restarted = desk.monitors(enable="none", restarted=True)
     back = await restarted.roll_back(admin.MonitorRollback(None), "adam")
     assert (back.added, back.removed, back.revision) == (["b.rv"], [], 3)
-    assert {name: restarted.enabled(name) for name in restarted.names()} == {"a": False, "b": True}
+    assert {name: restarted.switches.enabled(name) for name in restarted.names()} == {"a": False, "b": True}
     rows = (await restarted.revisions(admin.MonitorRevisions())).revisions
     assert [(row.revision, row.who, row.note) for row in rows] == [
         (3, "adam", "rolled back to revision 1"),
@@ -212,7 +216,7 @@ async def test_a_refused_rollback_leaves_no_switch_behind(desk: Desk) -> None:
         await monitors.roll_back(admin.MonitorRollback(1), "eve")
     desk.findings = []
     await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
-    assert not monitors.enabled("b")
+    assert not monitors.switches.enabled("b")
 
 
 async def gone_back(monitors: Monitors, revision: int) -> None:
@@ -230,8 +234,11 @@ async def test_what_is_not_confirmed_goes_back(desk: Desk) -> None:
     gone = await monitors.remove(admin.MonitorRemove(["b"], confirm_within=0.0), "eve")
     assert gone.confirm_by is not None
     await gone_back(monitors, 3)
-    assert (monitors.names(), monitors.enabled("b"), monitors.confirm_by) == (["a", "b"], True, None)
-    assert (monitors.who, monitors.note) == ("not confirmed in time", "rolled back to revision 1")
+    assert (monitors.names(), monitors.switches.enabled("b"), monitors.confirm_by) == (["a", "b"], True, None)
+    assert (monitors.in_force.who, monitors.in_force.note) == (
+        "not confirmed in time",
+        "rolled back to revision 1",
+    )
     await monitors.remove(admin.MonitorRemove(["b"], confirm_within=300.0), "eve")
     await monitors.remove(admin.MonitorRemove(["a"], confirm_within=300.0), "eve")
     restarted = desk.monitors(enable="none", restarted=True)
@@ -315,12 +322,12 @@ async def test_a_switch_is_answered_when_the_relay_has_carried_it_out(desk: Desk
 async def test_switches_are_kept_and_recorded(desk: Desk) -> None:
     """Only what changes is told and recorded; `--enable` is for those that nobody has switched."""
     monitors = desk.monitors("none")
-    assert monitors.enabled("a") is False
+    assert monitors.switches.enabled("a") is False
     assert (await monitors.switch(admin.MonitorSwitch(["a", "a"], True), "eve")).names == ["a"]
     assert (await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")).names == []
     assert desk.sent == [messages.MonitorSwitched("a", True)]
-    assert desk.monitors("none").enabled("a") is True
-    assert monitors.statement().enabled == {"a": True}
+    assert desk.monitors("none").switches.enabled("a") is True
+    assert monitors.statement(0).enabled == {"a": True}
     with pytest.raises(UnknownMonitorError, match="there are: a"):
         await monitors.switch(admin.MonitorSwitch(["nobody"], True), "eve")
     with pytest.raises(SpecificationsRefusedError, match="--enable"):
@@ -342,18 +349,18 @@ async def test_a_relay_that_follows_another_is_an_alarm_and_holds(desk: Desk) ->
     """The first relay of an appliance is not; nor is a control that finds its relay as it was."""
     (desk.folder / "b.rv").write_text(B)
     monitors = desk.monitors()
-    assert monitors.statement().restarted is False
+    assert monitors.statement(0).restarted is False
     monitors.received(messages.SpecificationsTaken(1, ["a", "b"], []))
     assert "monitors restarted" not in [event for event, _ in desk.trail.heard]
-    assert monitors.statement().restarted is True
+    assert monitors.statement(0).restarted is True
     monitors.received(messages.SpecificationsTaken(1, ["a", "b"], ["b"]))
     assert [fields["held"] for event, fields in desk.trail.heard if event == "monitors restarted"] == [["b"]]
-    assert monitors.held == {"b"}
+    assert monitors.rollout.held == {"b"}
     assert (await monitors.resume(admin.MonitorResume(["a", "b"]), "eve")).names == ["b"]
     assert desk.sent[-1] == messages.MonitorResumed("b")
     await desk.store.settled()
     control = desk.monitors(restarted=True)
-    assert control.statement().restarted is True
+    assert control.statement(0).restarted is True
     control.received(messages.SpecificationsTaken(1, [], []))
     assert [event for event, _ in desk.trail.heard].count("monitors restarted") == 1
 
@@ -397,7 +404,7 @@ async def test_a_change_that_is_meant_for_other_monitors_is_refused(desk: Desk) 
             with pytest.raises(MonitorsChangedError, match="look at them first") as caught:
                 await change()
             assert caught.value.tag == monitors.tag
-    assert (monitors.revision, monitors.enabled("a")) == (2, False)
+    assert (monitors.revision, monitors.switches.enabled("a")) == (2, False)
 
 
 async def test_a_switch_goes_with_its_monitor(desk: Desk) -> None:
@@ -405,11 +412,11 @@ async def test_a_switch_goes_with_its_monitor(desk: Desk) -> None:
     monitors = desk.monitors()
     await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")
     await monitors.load(admin.MonitorLoad({"a.rv": A.replace("{", "{ int n;", 1)}), "eve")
-    assert not monitors.enabled("a")
+    assert not monitors.switches.enabled("a")
     await monitors.remove(admin.MonitorRemove(["a"]), "eve")
     await monitors.load(admin.MonitorLoad({"a.rv": A}), "eve")
-    assert monitors.enabled("a")
-    assert desk.monitors(restarted=True).enabled("a")
+    assert monitors.switches.enabled("a")
+    assert desk.monitors(restarted=True).switches.enabled("a")
 
 
 async def test_a_monitor_is_not_resumed_while_its_relay_is_away(desk: Desk) -> None:
@@ -421,7 +428,7 @@ async def test_a_monitor_is_not_resumed_while_its_relay_is_away(desk: Desk) -> N
     with pytest.raises(SpecificationsRefusedError, match="b not resumed: the relay process is away"):
         await monitors.resume(admin.MonitorResume(["b"]), "eve")
     assert "monitor resumed" not in [event for event, _ in desk.trail.heard]
-    assert monitors.held == {"b"}
+    assert monitors.rollout.held == {"b"}
 
 
 async def test_of_two_changes_for_the_same_monitors_one_is_made(desk: Desk) -> None:
@@ -437,7 +444,7 @@ async def test_of_two_changes_for_the_same_monitors_one_is_made(desk: Desk) -> N
         return_exceptions=True,
     )
     assert [isinstance(one, MonitorsChangedError) for one in done] == [False, True, True]
-    assert monitors.enabled("a")
+    assert monitors.switches.enabled("a")
     assert messages.MonitorResumed("b") not in desk.sent
 
 
@@ -552,19 +559,19 @@ async def test_a_trial_is_told_kept_and_promoted(desk: Desk) -> None:
     monitors = desk.monitors()
     assert (await monitors.trial(admin.MonitorTrial(["a"], True), "eve")).names == ["a"]
     assert (await monitors.trial(admin.MonitorTrial(["a"], True), "eve")).names == []
-    assert (monitors.enabled("a"), monitors.on_trial("a")) == (False, True)
+    assert (monitors.switches.enabled("a"), monitors.switches.on_trial("a")) == (False, True)
     stated = desk.sent[-1]
     assert isinstance(stated, messages.SpecificationsStated)
     assert (stated.enabled, stated.trials, stated.revision) == ({"a": True}, ("a",), 1)
     for restarted in (False, True):
         again = desk.monitors(restarted=restarted)
-        assert again.on_trial("a")
-        assert again.statement().trials == ("a",)
+        assert again.switches.on_trial("a")
+        assert again.statement(0).trials == ("a",)
     with pytest.raises(SpecificationsRefusedError, match="rosrv monitor promote"):
         await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")
     assert (await monitors.trial(admin.MonitorTrial(["a"], False), "adam")).names == ["a"]
-    assert monitors.enabled("a")
-    assert monitors.statement().trials == ()
+    assert monitors.switches.enabled("a")
+    assert monitors.statement(0).trials == ()
     assert (await monitors.trial(admin.MonitorTrial(["a"], False), "adam")).names == []
     await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")
     with pytest.raises(SpecificationsRefusedError, match="a is disabled, not on trial"):
@@ -578,15 +585,15 @@ async def test_a_trial_that_is_disabled_is_over(desk: Desk) -> None:
     monitors = desk.monitors()
     await monitors.trial(admin.MonitorTrial(["a"], True), "eve")
     assert (await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")).names == ["a"]
-    assert (monitors.enabled("a"), monitors.on_trial("a")) == (False, False)
-    assert monitors.statement().trials == ()
-    assert monitors.statement().enabled == {"a": False}
+    assert (monitors.switches.enabled("a"), monitors.switches.on_trial("a")) == (False, False)
+    assert monitors.statement(0).trials == ()
+    assert monitors.statement(0).enabled == {"a": False}
     await monitors.trial(admin.MonitorTrial(["a"], True), "eve")
     await monitors.remove(admin.MonitorRemove(["a"]), "eve")
     await monitors.load(admin.MonitorLoad({"a.rv": A}), "eve")
-    assert monitors.enabled("a")
+    assert monitors.switches.enabled("a")
     await monitors.roll_back(admin.MonitorRollback(1), "eve")
-    assert monitors.enabled("a")
+    assert monitors.switches.enabled("a")
 
 
 async def test_a_relay_that_does_not_take_a_trial_leaves_everything(desk: Desk) -> None:
@@ -596,9 +603,9 @@ async def test_a_relay_that_does_not_take_a_trial_leaves_everything(desk: Desk) 
     with pytest.raises(SpecificationsRefusedError, match="no"):
         await monitors.trial(admin.MonitorTrial(["a"], True), "eve")
     desk.findings = []
-    assert monitors.enabled("a")
-    assert monitors.statement().trials == ()
-    assert desk.monitors(restarted=True).enabled("a")
+    assert monitors.switches.enabled("a")
+    assert monitors.statement(0).trials == ()
+    assert desk.monitors(restarted=True).switches.enabled("a")
 
 
 USER = "u() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
@@ -614,15 +621,15 @@ async def test_what_shares_variables_is_on_trial_together(desk: Desk) -> None:
     with pytest.raises(SpecificationsRefusedError, match="share variables"):
         await monitors.trial(admin.MonitorTrial(["a"], False), "eve")
     await monitors.load(admin.MonitorLoad({"v.rv": USER.replace("u()", "v()")}), "eve")
-    assert monitors.statement().trials == ("a", "u", "v")
-    assert desk.monitors(restarted=True).on_trial("v")
+    assert monitors.statement(0).trials == ("a", "u", "v")
+    assert desk.monitors(restarted=True).switches.on_trial("v")
     await monitors.load(admin.MonitorLoad({"c.rv": C}), "eve")
     uses_both = C.replace("{ }", "{ shared = 2; }")
     with pytest.raises(SpecificationsRefusedError, match="a, u, v on trial and c in force"):
         await monitors.load(admin.MonitorLoad({"c.rv": uses_both}), "eve")
-    assert monitors.enabled("c")
+    assert monitors.switches.enabled("c")
     assert (await monitors.switch(admin.MonitorSwitch(["v"], False), "eve")).names == ["v"]
-    assert monitors.statement().trials == ("a", "u")
+    assert monitors.statement(0).trials == ("a", "u")
     assert (await monitors.trial(admin.MonitorTrial(["a", "u"], False), "eve")).names == ["a", "u"]
 
 
@@ -632,9 +639,9 @@ async def test_a_rollback_brings_a_trial_back(desk: Desk) -> None:
     await monitors.load(admin.MonitorLoad({"c.rv": C}), "eve")
     await monitors.trial(admin.MonitorTrial(["c"], True), "eve")
     await monitors.remove(admin.MonitorRemove(["c"]), "eve")
-    assert not monitors.on_trial("c")
+    assert not monitors.switches.on_trial("c")
     await monitors.roll_back(admin.MonitorRollback(2), "eve")
-    assert monitors.on_trial("c")
+    assert monitors.switches.on_trial("c")
 
 
 async def test_what_a_trial_would_have_done_is_no_drop(desk: Desk) -> None:
