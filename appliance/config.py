@@ -3,7 +3,7 @@
 `appliance.config_sources` reads the file, the environment and the flags into it; the supervisor writes
 the result to `run/config.json` in the state directory, from where the other processes load it: what was
 checked once they have without pydantic, which takes each of them a tenth of a second. A key is here because
-something reads it.
+something reads it. One file, for it is what an operator can say.
 """
 
 import dataclasses

@@ -1,7 +1,8 @@
 """The control process: lays the foundation, has the parts assembled, serves until told to stop.
 
 Order of a start: kept sockets come back, the store and the policy are read, the audit log opens, the registry is
-restored, the listeners serve, the first reconcile round makes ROSMaster whole, and only then `Ready` is said.
+restored, the listeners serve, the first reconcile round makes ROSMaster whole, and only then `Ready` is said. One file:
+what is started here hears the supervisor here, and is ended here.
 """
 
 import asyncio

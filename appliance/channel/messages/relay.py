@@ -1,6 +1,6 @@
 """The link control <-> relay. Control states what is wanted; the relay reports what it sees.
 
-`key` is the key of an incarnation.
+`key` is the key of an incarnation. One file, as each link has: who changes a message sees those that it goes with.
 """
 
 from typing import Any, ClassVar, Literal
