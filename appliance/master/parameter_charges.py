@@ -20,6 +20,7 @@ from appliance.policy.model import Address, address_of
 from appliance.ros.errors import ProtocolError
 from appliance.ros.parameter_tree import Tree, parts_of
 from appliance.ros.xmlrpc import Value
+from appliance.rpc.bulk import text_weight
 from appliance.shares.pool import Pool
 
 APPLIANCE: Address = address_of("127.0.0.1")
@@ -199,7 +200,7 @@ def measure(value: Value) -> tuple[int, int]:
         if kinds <= _NUMBERS:
             return weight + _VALUE * len(level), depth
         if kinds == {str}:
-            return weight + _TEXT * len(level) + sum(map(len, cast(list[str], level))), depth
+            return weight + _TEXT * len(level) + text_weight("".join(cast(list[str], level))), depth
         below: list[Value] = []
         for inner in level:
             weight += _own_weight(inner, below)
@@ -211,7 +212,7 @@ def measure(value: Value) -> tuple[int, int]:
 def _own_weight(value: Value, below: list[Value]) -> int:
     """What a value takes without what is in it, which is added to those `below`."""
     if isinstance(value, str):
-        return _TEXT + len(value)
+        return _TEXT + text_weight(value)
     if isinstance(value, bytes):
         return _TEXT + len(value) * 4 // 3
     if isinstance(value, list):
@@ -219,7 +220,7 @@ def _own_weight(value: Value, below: list[Value]) -> int:
         return _ARRAY
     if isinstance(value, dict):
         below += value.values()
-        return _STRUCT + NAME_WEIGHT * len(value) + sum(map(len, value))
+        return _STRUCT + NAME_WEIGHT * len(value) + text_weight("".join(value))
     if value is None:
         raise ProtocolError("a value has <nil/> in it, which neither ROSMaster nor roscpp can send")
     return _VALUE
@@ -227,4 +228,4 @@ def _own_weight(value: Value, below: list[Value]) -> int:
 
 def member_weight(name: str, value: Value) -> int:
     """About how many bytes a member of a namespace takes, with its name."""
-    return NAME_WEIGHT + len(name) + measure(value)[0]
+    return NAME_WEIGHT + text_weight(name) + measure(value)[0]

@@ -20,6 +20,7 @@ from appliance.policy.model import Address
 from appliance.ros.errors import ProtocolError
 from appliance.ros.parameter_tree import Tree, parts_of, standing_at
 from appliance.ros.xmlrpc import Value
+from appliance.rpc.bulk import text_weight
 from appliance.shares.pool import Pool
 
 
@@ -183,5 +184,5 @@ def _with_namespaces(key: str, first: int, weight: int) -> int:
     if not first:
         return weight
     *namespaces, name = parts_of(key)[first - 1 :]
-    whole = NAME_WEIGHT + len(name) + weight
+    whole = NAME_WEIGHT + text_weight(name) + weight
     return whole + sum(member_weight(part, {}) for part in namespaces) if namespaces else whole

@@ -76,6 +76,14 @@ class LargeWrites:
             self._turns.leave(host)
 
 
+def text_weight(text: str) -> int:
+    """About how many bytes a text takes on the wire, where `&`, `<` and `>` are written out."""
+    if text.isascii() and not ("&" in text or "<" in text or ">" in text):
+        return len(text)
+    size = len(text.encode("utf-8", "surrogatepass"))
+    return size + 4 * text.count("&") + 3 * (text.count("<") + text.count(">"))
+
+
 def weigh(value: Value, enough: int) -> int:
     """About how many bytes a value takes on the wire; counting ends when it is `enough`."""
     total = 0
@@ -85,15 +93,17 @@ def weigh(value: Value, enough: int) -> int:
         kind = type(value_)
         if kind is int:
             total += _VALUE
-        elif kind is str or kind is bytes:
-            total += _TEXT + len(value_)  # type: ignore[arg-type]  # it is one of the two
+        elif kind is str:
+            total += _TEXT + text_weight(value_)  # type: ignore[arg-type]  # it is one
+        elif kind is bytes:
+            total += _TEXT + len(value_)  # type: ignore[arg-type]  # it is one
         elif kind is list:
             total += _ARRAY
             waiting += value_  # type: ignore[arg-type]  # it is one
         elif isinstance(value_, dict):
             total += _STRUCT
             for name in value_:
-                total += _MEMBER + len(name)
+                total += _MEMBER + text_weight(name)
                 if total >= enough:
                     return total
             waiting += value_.values()

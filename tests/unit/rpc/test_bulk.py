@@ -16,9 +16,9 @@ from appliance.shares.pool import Standing
 
 HOSTS = [ipaddress.ip_address(f"10.0.0.{number}") for number in range(1, 5)]
 VALUES: st.SearchStrategy[Value] = st.recursive(
-    st.one_of(st.booleans(), st.integers(-9, 9), st.floats(), st.text("xy", max_size=30)),
+    st.one_of(st.booleans(), st.integers(-9, 9), st.floats(), st.text("x<&>\u00e9", max_size=30)),
     lambda inner: st.one_of(
-        st.lists(inner, max_size=5), st.dictionaries(st.text("ab", max_size=5), inner, max_size=5)
+        st.lists(inner, max_size=5), st.dictionaries(st.text("a&", max_size=5), inner, max_size=5)
     ),
     max_leaves=30,
 )
@@ -84,10 +84,14 @@ def test_counting_ends_when_it_is_enough() -> None:
     assert weigh(datetime.datetime(2025, 1, 1), 10) > 0  # noqa: DTZ001 - XML-RPC has no time zones
 
 
-def test_weight_is_about_what_is_written() -> None:
-    """Within a factor of two of the bytes on the wire."""
-    value: Value = {"a": [1, 2.5, "text", {"b": True}] * 100, "c": "x" * 5000}
-    assert 0.5 < weigh(value, 1 << 30) / len(build_response(value)) < 2
+@pytest.mark.parametrize("letter", ["x", "&", "<", ">", "\u00e9", "\U00010348"], ids=ascii)
+def test_weight_is_about_what_is_written(letter: str) -> None:
+    """Within a factor of two of the bytes on the wire: else parameters within their bounds could not be told."""
+    value: Value = {"a": [1, 2.5, "text", {"b": True}] * 100, "c": letter * 5000, letter * 5000: 1}
+    texts: list[Value] = [letter * 5000] * 9
+    for one in (value, texts):
+        assert 0.5 < weigh(one, 1 << 30) / len(build_response(one)) < 2
+        assert measure(one)[0] == weigh(one, 1 << 30)
 
 
 def test_large_values_of_a_host_go_one_at_a_time() -> None:
