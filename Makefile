@@ -17,7 +17,7 @@ FETCHING := tests/system/vm tests/system/test_examples.py tests/system/test_gene
 NAMESPACES := $(filter-out $(CONTAINERS) $(FETCHING),$(wildcard tests/system/test_*.py) $(patsubst %/.,%,$(wildcard tests/system/[a-z]*/.)))
 PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples' tests/unit)
 
-.PHONY: help setup demo check static unit test test-system system-machine system-containers system-namespaces test-package prove wheel package image site release bench clean
+.PHONY: help setup demo check static unit test units nodes test-system system-machine system-containers system-namespaces test-package prove wheel package image site release bench clean
 
 help: ## list the targets
 	@sed -nE 's/^([a-z-]+):.*## (.*)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
@@ -46,11 +46,17 @@ build/collected:
 	touch $@
 
 unit: build/collected
-	$(PYTEST) tests/unit $(addprefix --ignore=,$(LONG_UNIT)) -n auto --quiet
+	$(PYTEST) tests/unit $(addprefix --ignore=,$(LONG_UNIT)) -n logical --quiet
 
-test: check ## check, the long unit tests, and those with real ROS nodes (root: they make network namespaces)
-	$(PYTEST) tests/proofs/test_insertion.py tests/integration $(LONG_UNIT) -n auto --dist loadfile --no-loadscope-reorder \
-	    --quiet --durations=10
+test: setup ## check, the long unit tests, and those with real ROS nodes (root: they make network namespaces)
+	$(MAKE) --jobs=3 --output-sync=target static units nodes
+
+# Tests with real nodes wait half of their time: what computes has the processors then, and after them, for it is nice.
+units: build/collected
+	nice $(PYTEST) tests/proofs/test_insertion.py tests/unit -n logical --dist loadfile --quiet --durations=10
+
+nodes: build/collected
+	$(PYTEST) tests/integration -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10
 
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system

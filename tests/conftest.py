@@ -123,8 +123,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)  # of pytest-xdist
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """`-n auto`: twice as many as there are cores, for all wait much."""
-    return 2 * len(os.sched_getaffinity(0))
+    """`-n auto`: twice as many as there are cores, for all wait much; `-n logical`: one more, for few wait."""
+    cores = len(os.sched_getaffinity(0))
+    return cores + 1 if config.option.numprocesses == "logical" else 2 * cores
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
