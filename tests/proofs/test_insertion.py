@@ -10,7 +10,7 @@ import pytest
 from tests.support.spin import Bounds, search
 
 BOUNDS = [
-    Bounds(loads=2, crashes=1),
+    Bounds(loads=2),
     Bounds(policies=2, crashes=1),
     Bounds(loads=1, crashes=1, refusing=True),
     Bounds(publishers=2, crashes=1, sending=False),

@@ -8,6 +8,7 @@ from tests.support.spin import Bounds, search
 
 BOUNDS = [
     Bounds(loads=1, policies=1, crashes=1),
+    Bounds(loads=2, crashes=1),
     Bounds(loads=2, policies=1),
     Bounds(loads=1, policies=1, crashes=1, sending=False),
     Bounds(subscribers=2, loads=1),
