@@ -86,9 +86,16 @@ class FakeNodes:
             return [one for one in self._calls if one.method != "getPid"]
 
     def wait_until(self, wanted: Callable[[], bool], *, timeout: float = LIMIT) -> bool:
-        """Whether `wanted()` came true, looked at whenever a call arrives."""
+        """Whether `wanted()` came true, looked at whenever a call arrives; false when none came for `timeout` seconds.
+
+        Looks whether a node is there come for ever, and are no such call.
+        """
         with self._changed:
-            return self._changed.wait_for(wanted, timeout)
+            while not wanted():
+                before = len(self.all_calls())
+                if not self._changed.wait_for(lambda: len(self.all_calls()) > before, timeout):  # noqa: B023  it is called here
+                    return False
+            return True
 
     def forget(self) -> None:
         """Forget the calls so far."""

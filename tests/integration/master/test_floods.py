@@ -261,7 +261,7 @@ def test_names_asked_for(calm: Field) -> None:
                 server.lookupNode(f"/asker_{number}_{turn}_{inner}", f"/nobody_{number}_{turn}_{inner}")
 
     with Flood(calm, 4, act):
-        calm.unharmed(200)
+        calm.unharmed(50)
         assert bystander(calm) < allowed(SLOW)
 
 
