@@ -3,7 +3,8 @@
 A message on a topic of no monitor; the reference specification of the design (reads two fields, writes one, steps
 one state machine); the same with ten monitors on other topics; a string that grows; a copy of the whole message;
 the reference in the module, many at once and alone; a state machine with a timeout; a handler and a line of output with
-each message; a string that is kept, and a message that is published; and loading, with the module and without.
+each message; a string and the last ten numbers that are kept; a message that is published; and loading, with the
+module and without.
 Times are processor time, the median of the rounds, in microseconds for a message.
 """
 
@@ -48,6 +49,10 @@ SAID = """said() { event e(double x) /cmd geometry_msgs/TwistStamped '{twist:{li
 KEPT = """kept() { std::string last; int n = 0;
     event e(std::string f) /cmd geometry_msgs/TwistStamped '{header.frame_id:f}' {
         if (f != last) { n++; } last = f; } }"""
+WINDOW = """window() { std::vector<double> window; double mean = 0;
+    event e(double x) /cmd geometry_msgs/TwistStamped '{twist:{linear:{x:x}}}' {
+        window.push_back(x); if (window.size() > 10) { window.erase(window.begin()); }
+        mean = std::accumulate(window.begin(), window.end(), 0.0) / window.size(); } }"""
 PUBLISHED = """published() { std_msgs::Float64 m; event e(double x) /cmd geometry_msgs/TwistStamped
     '{twist:{linear:{x:x}}}' { m.data = x; PUBLISH(/out, std_msgs/Float64, m); } }"""
 WHOLE = "whole() { geometry_msgs::TwistStamped v; event e() /cmd geometry_msgs/TwistStamped '{}' { v = MESSAGE; } }"
@@ -114,6 +119,7 @@ def main() -> None:
     for name, text in (
         ("a string grows", GROWING),
         ("a string is kept, engine", KEPT),
+        ("a window of ten, engine", WINDOW),
         ("a message is published", PUBLISHED),
         ("a copy of all", WHOLE),
     ):
@@ -133,6 +139,7 @@ def main() -> None:
     print(f"{'a tfsm, engine':32} {row:8.2f} µs")
     print(f"{'a tfsm, 64 together':32} {batched(64, COMMAND, WATCHED):8.3f} µs")
     print(f"{'a string is kept, 64 together':32} {batched(64, COMMAND, KEPT):8.3f} µs")
+    print(f"{'a window of ten, 64 together':32} {batched(64, COMMAND, WINDOW):8.3f} µs")
     print(f"{'a handler each, 64 together':32} {batched(64, COMMAND, HANDLED):8.3f} µs")
     print(f"{'a line each, 64 together':32} {batched(64, COMMAND, SAID):8.3f} µs")
     scans = monitors(SCAN)

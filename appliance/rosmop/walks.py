@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 from appliance.rosmop.compile.program import groups
 from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, SOONER, TOLD, Feed, FeedModule, module_of
-from appliance.rosmop.ir.layout import POSITION, SURE, UNDO, Cells
+from appliance.rosmop.ir.layout import POSITION, ROOM, SURE, UNDO, Cells
 from appliance.rosmop.ir.output import HEAD
 from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
 from appliance.rosmop.ir.values import Values, struct_code
@@ -118,6 +118,10 @@ class Home:
             "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in cells.variables.values())
         )
         self._texts = [(self._names.index(name), buffer) for name, buffer in cells.texts.items()]
+        self._vectors = [
+            (self._names.index(name), buffer, _element_code(cells.variables[name][1]))
+            for name, buffer in cells.vectors.items()
+        ]
         self._generation = cells.generation
         self._source, self._until = cells.source, cells.until
         self._clocks = [(running[number], address) for number, address in cells.clocks.items()]
@@ -141,6 +145,8 @@ class Home:
             _LENGTH.pack_into(self._memory, self._generation, 0)
             for place, buffer in self._texts:
                 values[place] = self._entered(values[place], buffer)
+        for place, buffer, code in self._vectors:
+            values[place] = self._entered_vector(values[place], buffer, code)
         self._cells.pack_into(self._memory, self._base, *states, *values)
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
@@ -157,6 +163,14 @@ class Home:
             return BEYOND << 32
         self._memory[buffer : buffer + len(text)] = text
         return buffer | len(text) << 32
+
+    def _entered_vector(self, elements: Sequence[Any], buffer: int, code: str) -> int:
+        """The same of a vector, with the number of its elements."""
+        packed = struct.Struct(f"<{len(elements)}{code}")
+        if packed.size > ROOM:
+            return BEYOND << 32
+        packed.pack_into(self._memory, buffer, *elements)
+        return buffer | len(elements) << 32
 
     def hasten(self) -> None:
         """A deadline is earlier than what was due."""
@@ -183,12 +197,20 @@ class Home:
             name = self._names[place]
             at, size = found[name] & _ADDRESS, found[name] >> 32
             found[name] = self._namespace[name] if size == BEYOND else bytes(self._memory[at : at + size])
+        for place, _, code in self._vectors:
+            name = self._names[place]
+            at, count = found[name] & _ADDRESS, found[name] >> 32
+            found[name] = (
+                self._namespace[name]
+                if count == BEYOND
+                else [*struct.unpack_from(f"<{count}{code}", self._memory, at)]
+            )
         self._namespace.update(found)
 
 
 def _cell(kind: Type) -> str:
     """The `struct` code of a variable in the module's memory, 8 bytes."""
-    if isinstance(kind, kinds.String):
+    if isinstance(kind, kinds.String | kinds.Vector):
         return "Q"
     if isinstance(kind, kinds.Bool):
         return "?7x"
@@ -196,6 +218,12 @@ def _cell(kind: Type) -> str:
         return "i4x" if kind.signed else "I4x"
     code = struct_code(kind) or ""
     return "q" if len(code) == 2 else "f4x" if code == "f" else code
+
+
+def _element_code(kind: Type) -> str:
+    """The `struct` code of the elements of a vector that is kept."""
+    assert isinstance(kind, kinds.Vector)  # noqa: S101  a variable that has a place for elements
+    return struct_code(kind.element) or ""
 
 
 class Walker:

@@ -4,8 +4,7 @@ An event binds a parameter of the specification by one of its own with that name
 one that gives the values that it binds, for which nothing else of the message is read.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 
 from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.compile.scope import Shared, SpecificationNames
@@ -113,19 +112,8 @@ def acts(function: form.Function, shared: Shared) -> bool:
         return True
     return any(
         isinstance(node, _ACTS) or (isinstance(node, form.WriteBack) and bool(node.writes))
-        for node in _nodes(function.body)
+        for node in form.nodes(function.body)
     )
-
-
-def _nodes(root: object) -> Iterator[object]:
-    waiting = [root]
-    while waiting:
-        node = waiting.pop()
-        if isinstance(node, tuple):
-            waiting += node
-        elif is_dataclass(node):
-            yield node
-            waiting += [getattr(node, field.name) for field in fields(node)]
 
 
 def unsliceable(compiled: CompiledProperty) -> str | None:

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.assembly import PAGE, assembled
-from appliance.rosmop.ir.layout import NOW, POSITION, SAID, SURE, UNDO, Cells, NotScalarError
+from appliance.rosmop.ir.layout import NOW, POSITION, ROOM, SAID, SURE, UNDO, Cells, NotScalarError
 from appliance.rosmop.ir.module import CHANGED, DROPPED, HAPPENED, RESET, Writer, Written
 from appliance.rosmop.ir.output import Line
 from appliance.rosmop.ir.parts import ELSEWHERE
@@ -114,6 +114,8 @@ class FeedModule:
     lines: Sequence[Line]
     strings: Mapping[bytes, int]
     """Where constant strings stand."""
+    rooms: Sequence[range]
+    """Where vectors stand that are kept or made."""
     said: int
     """Where lines of output are noted, by their places among the `lines`."""
 
@@ -170,6 +172,7 @@ def module_of(
         writer.budgets,
         writer.lines,
         {raw: writer.constants[raw] for raw in writer.strings},
+        writer.rooms,
         writer.said,
     )
 
@@ -243,7 +246,10 @@ class _Walk:
             {name for written in functions for name in written.assigned}.difference(cells.noted)
         )
         self._settles = not set(cells.kept).isdisjoint(assigned)
-        self._undo = tuple((cells.variables[name][0], writer.take(8)) for name in assigned)
+        kept = [
+            cells.vectors[name] + 2 * ROOM if name in cells.vectors else writer.take(8) for name in assigned
+        ]
+        self._undo = tuple((cells.variables[name][0], at) for name, at in zip(assigned, kept, strict=True))
         self._log = writer.take(16 * sum(written.writes for written in self._written))
         properties = {
             advance.property for event in events for advance in event.advances if advance.property is not None

@@ -18,8 +18,8 @@ something long; what exceeds them is a fault.
 """
 
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from types import UnionType
 from typing import Any, get_args
 
@@ -701,6 +701,18 @@ class Component:
     properties: int
     topics: tuple[tuple[str, tuple[Event, ...]], ...]
     noted: tuple[str, ...] = ()
+
+
+def nodes(root: object) -> Iterator[object]:
+    """Everything that a part of the form is made of, and it."""
+    waiting = [root]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, tuple):
+            waiting += node
+        elif is_dataclass(node):
+            yield node
+            waiting += [getattr(node, field.name) for field in fields(node)]
 
 
 def methods_of(walker: type, nodes: UnionType) -> Mapping[type[Any], Callable[..., Any]]:

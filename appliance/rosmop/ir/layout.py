@@ -1,6 +1,7 @@
 """What stands where in the memory of a module, and how large the values of a type are there.
 
-A variable of the set stands at its address, in 8 bytes: a number, or of a string where it is and how long (`texts.py`).
+A variable of the set stands at its address, in 8 bytes: a number, or of a string (`texts.py`) or vector (`vectors.py`)
+where it is and how long.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,13 @@ messages before; and what is given out begins.
 
 LINES = 64 << 10
 """Bytes for lines of output; a message whose line has no room is left."""
+
+
+ROOM = 8 << 10
+"""Bytes of a vector that a variable keeps, or that is made."""
+
+MAX_ROOMS = 16 << 20
+"""Bytes that all vectors of a set may take."""
 
 
 class NotScalarError(Exception):
@@ -68,6 +76,10 @@ class Cells:
     generation: int = 0
     settle: int = 0
     """The number of the function that puts them there."""
+    vectors: dict[str, int] = field(default_factory=dict)
+    """Where the elements of a vector may be, by the variable that holds it: the first of two places of `ROOM` bytes.
+    Behind them stands what the variable was before the message at hand.
+    """
 
     @property
     def kept(self) -> Sequence[str]:
@@ -76,7 +88,7 @@ class Cells:
 
     def address(self, name: str, kind: Type) -> int:
         """Where a variable stands."""
-        if not isinstance(kind, kinds.String):
+        if not isinstance(kind, kinds.String | kinds.Vector):
             machine_type(kind)
         place = self.base + 8 * (self.properties + len(self.variables))
         return self.variables.setdefault(name, (place, kind))[0]
@@ -98,6 +110,8 @@ class Layout:
         """Where bytes stand from the beginning."""
         self.strings: set[bytes] = set()
         """Those of them that are strings."""
+        self.rooms: list[range] = []
+        """Where vectors stand."""
         self.lines: list[Line] = []
         self._used = FIRST
         self.said = self.take(LINES)
@@ -144,6 +158,14 @@ class Layout:
         """The address of so many bytes of memory."""
         at = self._used
         self._used += -(-size // 8) * 8
+        return at
+
+    def room(self, size: int) -> int:
+        """The address of memory for a vector. Raises `NotScalarError` if all have too much."""
+        if size + sum(map(len, self.rooms)) > MAX_ROOMS:
+            raise NotScalarError("many vectors")
+        at = self.take(size)
+        self.rooms.append(range(at, at + size))
         return at
 
     def constant(self, raw: bytes) -> int:

@@ -1,16 +1,18 @@
 """A part of the form as WebAssembly: numbers, conditions, loops, what stands in the message, numbers put there, drops.
 
 Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
-has a fixed size (`places.py`); strings are kept (`texts.py`).
+has a fixed size (`places.py`); strings are kept (`texts.py`), vectors of numbers are kept, made and changed
+(`vectors.py`).
 
 `Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
 
 - An event, and the handler of a verdict, takes where the message is in the memory and its size (i32, i32), and returns
   bits (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`, `RESET`.
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
-  it is taken back. Within what it calls it is a trap. Beyond are strings and vectors that are made or changed,
-  vectors and messages that are kept, what is published, recursion, `sin` and its like. An event of which no message can
-  come past such a place has no module: `NotScalarError` names what is beyond.
+  it is taken back. Within what it calls it is a trap. Beyond are strings and messages that are made or changed,
+  messages that are kept, vectors of anything but numbers, of more than `ROOM` bytes, of the message that are changed,
+  handed back or by reference, or compared, what is published, recursion, `sin` and its like. An event of which no
+  message can come past such a place has no module: `NotScalarError` names what is beyond.
 - A line of output is noted behind those before, where `SAID` points, and the message at hand stands at `POSITION`
   (`output.py`).
 - Before a field is written, what stood there is noted in the log (address, size, bytes; 16 bytes each) that `UNDO`
@@ -39,8 +41,9 @@ from appliance.rosmop.ir.layout import (
     machine_type,
 )
 from appliance.rosmop.ir.output import BYTES, HEAD, Line, is_text
-from appliance.rosmop.ir.texts import Texts, mismatch, settling
+from appliance.rosmop.ir.texts import mismatch, settling
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
+from appliance.rosmop.ir.vectors import OF_VECTORS, Vectors, made_in
 from appliance.rosmop.ir.wasm import (
     COMPARE,
     DROP,
@@ -137,7 +140,7 @@ class Writer(Layout):
         return written
 
 
-class _Body(Texts):
+class _Body(Vectors):
     """Writes one function."""
 
     def __init__(
@@ -152,6 +155,7 @@ class _Body(Texts):
         super().__init__(writer, parameters, context, answers=answers)
         self._writer = writer
         self._function = function
+        self._made = made_in(function.body, writer.shared)
         self._result = result
         self._is_handler = answers and function.happens is None  # type: ignore[union-attr]  # has looked
         self._types = tuple(parameters.values())
@@ -181,7 +185,7 @@ class _Body(Texts):
             self._types,
             self._result,
             unsigned(len(whole)) + whole,
-            frozenset(self._assigned),
+            frozenset(self._assigned.intersection(self._writer.shared)),
             self._writes,
             self._drops,
             self._brief,
@@ -248,7 +252,8 @@ class _Body(Texts):
             each = self._loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
         following = self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
         code = first + place + self._set(at) + count + self._set(left, I64)
-        return code + self._times(left, each + following, node.body)
+        with self._apart(node.values):
+            return code + self._times(left, each + following, node.body)
 
     def _break(self, _node: form.Break) -> bytes:
         return b"\x0c" + unsigned(self._depth - self._loops[-1] + 1)
@@ -394,10 +399,8 @@ class _Body(Texts):
     def _assigned_to(self, node: form.Assign) -> bytes:
         if isinstance(node.type, kinds.String):
             return self._assigned_text(node)
-        if isinstance(node.type, kinds.Vector) and node.name not in self._writer.shared:
-            code, place, count = self._elements(node.value)
-            code += place + self._set(f"place of {node.name}")
-            return code + count + self._set(f"count of {node.name}", I64)
+        if isinstance(node.type, kinds.Vector):
+            return self._assigned_vector(node)
         if isinstance(node.type, kinds.Record) and node.name not in self._writer.shared:
             return b"".join(self._place(node.value)) + self._set(f"place of {node.name}")
         machine, value = machine_type(node.type), self._value(node.value)
@@ -462,8 +465,10 @@ class _Body(Texts):
         number = len(self._locals)
         total, each = (f"{what} {number}" for what in ("sum", "summand"))
         at, left, last = (f"{what} {number}" for what in ("element", "left", "last"))
-        code += self._value(node.start) + self._set(total, machine_type(node.type))
-        code += self._value(node.first) + self._set(left, I64) + self._value(node.last) + self._set(last, I64)
+        with self._apart(node.vector):
+            code += self._value(node.start) + self._set(total, machine_type(node.type))
+            code += self._value(node.first) + self._set(left, I64)
+            code += self._value(node.last) + self._set(last, I64)
         outside = self._get(left, I64) + self._get(last, I64) + b"\x56" + self._get(last, I64) + count
         code += self._when(outside + b"\x56\x72", self._elsewhere)
         code += place + self._get(left, I64) + b"\xa7" + constant(I32, size) + b"\x6c\x6a" + self._set(at)
@@ -485,12 +490,21 @@ class _Body(Texts):
         special = _SPECIAL.get(node.function)
         if special is not None:
             return special(self, node)
+        of_vectors = OF_VECTORS.get(node.function)
+        if of_vectors is not None:
+            return of_vectors(self, node)
         argument = node.arguments[0]
         if node.function in _OF_COUNTS:
             first, _, count = self._elements(argument)
             return first + count + _OF_COUNTS[node.function]
         if node.function in _QUESTIONS:
             return self._question(argument, _QUESTIONS[node.function])
+        if (
+            isinstance(node.type, kinds.Index)
+            and isinstance(argument, form.Call)
+            and argument.function != "l_len"
+        ):
+            raise NotScalarError("a sum of more than two that must not wrap")
         opcode = _OPCODES.get((node.function, machine_type(argument.type)))
         if opcode is not None:
             return b"".join(map(self._value, node.arguments)) + opcode
@@ -506,18 +520,19 @@ class _Body(Texts):
         function = self._writer.functions[node.function]
         parameters: dict[str, int] = {}
         code = b""
-        for name, argument in zip(function.parameters, node.arguments, strict=True):
-            if isinstance(argument.type, kinds.String | kinds.Vector):
-                parameters |= {f"place of {name}": I32, f"count of {name}": I64}
-                code += b"".join(self._elements(argument))
-            elif isinstance(argument.type, kinds.Record):
-                parameters[f"place of {name}"] = I32
-                code += b"".join(self._place(argument))
-            else:
-                parameters[name] = machine_type(argument.type)
-                code += self._value(argument)
-        called = self._writer.function(function, parameters, result, function.context)
-        self._assigned |= called.assigned
+        with self._apart(*node.arguments):
+            for name, argument in zip(function.parameters, node.arguments, strict=True):
+                if isinstance(argument.type, kinds.String | kinds.Vector):
+                    parameters |= {f"place of {name}": I32, f"count of {name}": I64}
+                    code += b"".join(self._elements(argument))
+                elif isinstance(argument.type, kinds.Record):
+                    parameters[f"place of {name}"] = I32
+                    code += b"".join(self._place(argument))
+                else:
+                    parameters[name] = machine_type(argument.type)
+                    code += self._value(argument)
+            called = self._writer.function(function, parameters, result, function.context)
+            self._assigned |= called.assigned
         self._brief = self._brief and called.brief
         self._says = self._says or called.says
         return code + b"\x10" + unsigned(called.number)

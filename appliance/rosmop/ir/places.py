@@ -4,6 +4,9 @@ In a local variable is the address, and how many elements there are. Of an array
 that says where each begins.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.arithmetic import Arithmetic
 from appliance.rosmop.ir.layout import NotScalarError, machine_type
@@ -158,12 +161,25 @@ class Places(Arithmetic):
             raise NotScalarError(str(node.type))
         return b"", self._get(f"place of {node.name}")
 
+    @contextmanager
+    def _apart(self, *looked_at: form.Expression) -> Iterator[None]:
+        """What is written here does not change the vectors that are looked at; raises `NotScalarError` if it does."""
+        names = {root_of(node) for node in looked_at if isinstance(node.type, kinds.Vector)}
+        before, self._assigned = self._assigned, set()
+        try:
+            yield
+            if not names.isdisjoint(self._assigned):
+                raise NotScalarError("a vector that changes while it is looked at")
+        finally:
+            self._assigned |= before
+
     def _address_of(self, node: form.Call) -> bytes:
         """The address of an element."""
         values, index = node.arguments
         _, size = self._layout.element(values.type)
         first, place, count = self._elements(values)
-        code = first + self._value(index) + self._set("index", I64)
+        with self._apart(values):
+            code = first + self._value(index) + self._set("index", I64)
         past = self._get("index", I64) + count + b"\x5a"
         code += self._when(past, self._elsewhere)
         return code + place + self._get("index", I64) + b"\xa7" + constant(I32, size) + b"\x6c\x6a"
@@ -176,3 +192,17 @@ class Places(Arithmetic):
         machine_type(node.type)
         first, place = self._place(node.base)
         return first + self._loaded(place, self._layout.offset(node.base.type, node.number), node.type)
+
+
+def root_of(node: form.Expression) -> str:
+    """The variable that a value is, is in, or is copied from; none where that is not plain."""
+    while not isinstance(node, form.Read | form.Assign):
+        if isinstance(node, form.Copy):
+            node = node.value
+        elif isinstance(node, form.Item):
+            node = node.base
+        elif isinstance(node, form.Call) and node.function == "l_element":
+            node = node.arguments[0]
+        else:
+            return ""
+    return node.name

@@ -65,15 +65,15 @@ class Texts(Places):
         if isinstance(node, form.Read) and node.name in self._layout.shared:
             at = self._layout.shared[node.name].address(node.name, node.type)
             code = self._cell(0x28, at) + self._cell(0x35, at + 4)
-            return self._noted(code, bounded=False)
+            return self._noted(code, MOST_KEPT)
         return super()._elements(node)
 
-    def _noted(self, span: bytes, *, bounded: bool = True) -> tuple[bytes, bytes, bytes]:
-        """Address and length from the stack in local variables; left if it is not `bounded` and too long to be kept."""
+    def _noted(self, span: bytes, most: int | None = None) -> tuple[bytes, bytes, bytes]:
+        """Address and length from the stack in local variables; left if it is longer than `most`."""
         place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
         code = span + self._set(count, I64) + self._set(place)
-        if not bounded:
-            code += self._when(self._get(count, I64) + constant(I64, MOST_KEPT) + b"\x56", self._elsewhere)
+        if most is not None:
+            code += self._when(self._get(count, I64) + constant(I64, most) + b"\x56", self._elsewhere)
         return code, self._get(place), self._get(count, I64)
 
     def _chosen(self, node: form.Conditional) -> tuple[bytes, bytes, bytes]:
@@ -98,7 +98,7 @@ class Texts(Places):
             code = first + place + count + self._set(f"count of {node.name}", I64)
             return code + self._set(f"place of {node.name}")
         at = cells.address(node.name, node.type)
-        code, place, count = self._noted(first + place + count, bounded=False)
+        code, place, count = self._noted(first + place + count, MOST_KEPT)
         self._assigned.add(node.name)
         return code + self._cell(0x36, at, place) + self._cell(0x36, at + 4, count + b"\xa7")
 

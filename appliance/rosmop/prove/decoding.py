@@ -76,7 +76,7 @@ _TRUNCATING = MappingProxyType(dict(enumerate(_TRUNCATED.split())))
 _NUMBERED = MappingProxyType({0x0C: "br", 0x0D: "br_if", 0x10: "call", 0x20: "local.get", 0x21: "local.set"})
 _BLOCKS = MappingProxyType({0x02: "block", 0x03: "loop", 0x04: "if"})
 _ELSE, _END = 0x05, 0x0B
-_COPY = 10  # behind 0xFC
+_COPY, _FILL = 10, 11  # behind 0xFC
 _FLOATS = MappingProxyType(
     {0x43: ("f32.const", struct.Struct("<f")), 0x44: ("f64.const", struct.Struct("<d"))}
 )
@@ -145,6 +145,8 @@ class _Reader:
             return Instruction(_TRUNCATING[number])
         if number == _COPY:
             return Instruction("memory.copy", tuple(self.take(2)))
+        if number == _FILL:
+            return Instruction("memory.fill", tuple(self.take(1)))
         raise UnknownInstructionError(f"the instruction {code:#04x}")
 
 

@@ -6,7 +6,7 @@ function leaves the message to Python (which then judges it anew), or
 - the form neither faults nor publishes anything,
 - both say the same of whether the event happened, dropped the message, changed it,
 - and the bytes of the message, the variables and what is left of the budget are the same. (What lines of output say is
-  not compared, and an event that looks at a string that is kept, or changes one, is not proved.)
+  not compared, and an event that looks at a string or vector that is kept, or changes or makes one, is not proved.)
 
 Where it leaves the message, the walk takes back what it has done: each variable that it has written stands among those
 that are taken back, and each byte in the log (`module_terms.py`).
@@ -106,9 +106,10 @@ class Validation:
         self._clock = clock
         self._patience = patience
         self.codes = functions_of(module.code)
-        kept = [own.variables[name][0] for own in module.cells for name in own.kept]
+        kept = [own.variables[name][0] for own in module.cells for name in (*own.kept, *own.vectors)]
         self._strings = [range(at, at + 8) for at in kept]
         self._strings += [range(at, at + len(raw)) for raw, at in module.strings.items()]
+        self._strings += module.rooms
 
     def finding(self, topic: str, event: str, function: str, place: int) -> Finding:
         """What is known of the event that is at this place among those of a topic."""
@@ -198,7 +199,7 @@ class Validation:
         variables: dict[str, Term] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
-                if isinstance(kind, kinds.String):
+                if isinstance(kind, kinds.String | kinds.Vector):
                     continue
                 variables[name] = cells[address] = _variable(name, kind)
                 if isinstance(kind, kinds.Time | kinds.Duration):

@@ -286,7 +286,7 @@ class Execution:
         known = z3.is_bv_value(number)
         place = int(number.as_long()) + offset if known else -1
         if any(place in string for string in self._strings) or (self._strings and not known):
-            raise NotProvedError("uses a string that is kept, or a constant one")
+            raise NotProvedError("uses a constant string, or a string or vector that is kept or made")
         if not known:
             raise DiffersError("it looks at an address that is nowhere in the message")
         return place

@@ -598,7 +598,8 @@ def test_what_happened_and_what_was_dropped_is_counted() -> None:
         ('ROS_INFO("each");', True),
         ('std::string s = "x" + std::to_string(count);', False),
         ("n = down(3);", False),
-        ("v.push_back(1);", False),
+        ("v.push_back(1);", True),
+        ("std::sort(v.begin(), v.end());", False),
         ("n = cos(count);", False),
     ],
 )

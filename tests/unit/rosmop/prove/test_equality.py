@@ -90,7 +90,7 @@ UNPROVED = {
     "not loop-free": event("for (int i = 0; i < x; i++) { x += i; }", "int x", "count:x"),
     "uses seconds": event("d = t.toSec();", "ros::Time t", "when:t", "double d = 0;"),
     "uses the instruction f64.copysign": event("y = copysign(y, 1.0);", "double y", "x:y"),
-    "uses a string that is kept, or a constant one": event(
+    "uses a constant string, or a string or vector that is kept or made": event(
         'if (x) { last = "x"; }', "int x", "count:x", "std::string last;"
     ),
     IN_PYTHON: event("y = sin(y);", "double y", "x:y"),
@@ -101,6 +101,19 @@ UNPROVED = {
 def test_what_is_not_proved_says_why(answer: str) -> None:
     """Nothing is called equal that was not shown to be."""
     assert answers(UNPROVED[answer]) == {"s.e": answer}
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "v.push_back(x);", "v.clear();", "x = v.size();", "if (x) { v[0] = 3; }", "f[1] = x;",
+        "std::vector<int> t(5); x = t[0];", "std::vector<int> t; t.push_back(x);", "auto t = v; t[0] = 1;",
+    ],
+)  # fmt: skip
+def test_vectors_that_are_kept_or_made_are_not_proved(body: str) -> None:
+    """None is called equal, and none is said to differ."""
+    (answer,) = answers(event(body, "int x", "count:x", "std::vector<int> v; int f[3];")).values()
+    assert answer.startswith("uses ")
 
 
 def test_without_time_nothing_is_proved() -> None:
