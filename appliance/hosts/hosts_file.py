@@ -10,20 +10,25 @@ A file that cannot be understood changes nothing: what was read before holds, an
 """
 
 import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from ipaddress import IPv4Address
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
-import msgspec
 import yaml
-from msgspec import Meta, Struct
+
+from appliance.policy.findings import meant, quoted
 
 _LARGEST = 1 << 20
+_MOST_GROUPS = 32
+_MOST_MISTAKES = 5
+_NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
+_GROUP = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,62}")
 
 
 class DeclaredHostsError(Exception):
-    """The file cannot be understood; the text says where and why."""
+    """The file cannot be understood; the text says where, why, and what to write."""
 
 
 @dataclass(frozen=True)
@@ -68,49 +73,133 @@ class Declared:
         return host is None or host.wanted
 
 
-class _Host(Struct, forbid_unknown_fields=True):
-    name: Annotated[str, Meta(pattern=r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?\Z")]
-    address: IPv4Address | None = None
-    groups: Annotated[
-        list[Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,62}\Z")]], Meta(max_length=32)
-    ] = []
-    tunnel: bool = True
-
-
-class _File(Struct, forbid_unknown_fields=True):
-    hosts: list[_Host] = []
-
-
 def read_declared(path: Path) -> dict[str, DeclaredHost]:
     """The declared hosts by name; none when there is no file. Raises `DeclaredHostsError`."""
     try:
         text = path.read_text(encoding="utf-8")
-        if len(text) > _LARGEST:
-            raise DeclaredHostsError(f"{path}: longer than {_LARGEST} characters")
-        content = yaml.safe_load(text)
     except FileNotFoundError:
         return {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise DeclaredHostsError(f"{path}: the declared hosts cannot be read: {error}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise DeclaredHostsError(f"{path}: cannot be read: {reason}") from error
+    if len(text) > _LARGEST:
+        raise DeclaredHostsError(f"{path}: longer than {_LARGEST} characters")
+    reading = _Reading()
     try:
-        file = msgspec.convert(
-            {} if content is None else content, _File, dec_hook=lambda kind, value: kind(value)
-        )
-    except msgspec.ValidationError as error:
-        why, _at, place = str(error).partition(" - at `$")
-        where = re.sub(r"\W+", ".", place).strip(".") or "the file"
-        raise DeclaredHostsError(f"{path}: {where}: {why}") from error
-    found: dict[str, DeclaredHost] = {}
-    addresses: dict[str, str] = {}
-    for host in file.hosts:
-        if host.name in found:
-            raise DeclaredHostsError(f"{path}: {host.name} is declared twice")
-        address = str(host.address) if host.address else None
-        if address is not None:
-            if address in addresses:
-                raise DeclaredHostsError(
-                    f"{path}: {host.name} and {addresses[address]} have the same address"
+        reading.file(yaml.compose(text, Loader=yaml.SafeLoader))
+    except yaml.MarkedYAMLError as error:
+        place = _place(error.problem_mark) if error.problem_mark else "1:1"
+        raise DeclaredHostsError(f"{path}:{place}: is not YAML: {error.problem}") from error
+    except (yaml.YAMLError, RecursionError) as error:
+        reason = "nested too deep, or refers to itself" if isinstance(error, RecursionError) else str(error)
+        raise DeclaredHostsError(f"{path}: is not YAML: {' '.join(reason.split())}") from error
+    if reading.mistakes:
+        more = len(reading.mistakes) - _MOST_MISTAKES
+        told = [f"{path}:{mistake}" for mistake in reading.mistakes[:_MOST_MISTAKES]]
+        raise DeclaredHostsError("; ".join([*told, *([f"and {more} more"] if more > 0 else [])]))
+    return reading.found
+
+
+def _place(mark: yaml.Mark) -> str:
+    return f"{mark.line + 1}:{mark.column + 1}"
+
+
+def _name(value: object) -> str:
+    if isinstance(value, str) and _NAME.fullmatch(value):
+        return value
+    raise ValueError("a name is of letters, digits, `.`, `_` and `-`, at most 63: `name: ocu-1`")
+
+
+def _address(value: object) -> str | None:
+    try:
+        return None if value is None else str(IPv4Address(str(value)))
+    except ValueError:
+        raise ValueError("an IPv4 address is four numbers: `address: 10.113.11.20`") from None
+
+
+def _groups(value: object) -> tuple[str, ...]:
+    groups = value if isinstance(value, list) else [None]
+    if len(groups) <= _MOST_GROUPS and all(
+        isinstance(group, str) and _GROUP.fullmatch(group) for group in groups
+    ):
+        return tuple(dict.fromkeys(groups))
+    raise ValueError(f"groups are a list of at most {_MOST_GROUPS} names: `groups: [operators]`")
+
+
+def _tunnel(value: object) -> bool:
+    if isinstance(value, bool):
+        return value
+    raise ValueError("a tunnel is wanted or not: `tunnel: true` or `tunnel: false`")
+
+
+_KEYS: dict[str, Callable[[object], object]] = {
+    "name": _name,
+    "address": _address,
+    "groups": _groups,
+    "tunnel": _tunnel,
+}
+
+
+class _Reading:
+    """The hosts that were found in the file, and every mistake in it with its line and column."""
+
+    def __init__(self) -> None:
+        self.found: dict[str, DeclaredHost] = {}
+        self.mistakes: list[str] = []
+
+    def file(self, node: yaml.Node | None) -> None:
+        """Read the whole file."""
+        if node is None:
+            return
+        for _, value in self._pairs(node, ["hosts"], "`hosts:`, and under it `- name: ocu-1` for each host"):
+            if not isinstance(value, yaml.SequenceNode):
+                self._mistake(
+                    value, "hosts are a list: write `- name: ocu-1` for each, or `hosts: []` for none"
                 )
-            addresses[address] = host.name
-        found[host.name] = DeclaredHost(host.name, address, tuple(dict.fromkeys(host.groups)), host.tunnel)
-    return found
+                continue
+            for host in value.value:
+                self._host(host)
+
+    def _host(self, node: yaml.Node) -> None:
+        values: dict[str, Any] = {}
+        mistakes = len(self.mistakes)
+        for key, value in self._pairs(node, list(_KEYS), "`- name: ocu-1` for a host"):
+            given = yaml.constructor.SafeConstructor().construct_object(value, deep=True)
+            try:
+                values[key] = _KEYS[key](given)
+            except ValueError as error:
+                self._mistake(value, f"{key} is {quoted(str(given))}; {error}")
+        if len(self.mistakes) > mistakes:
+            return
+        if "name" not in values:
+            self._mistake(node, "this host has no name: write `name: ocu-1`")
+            return
+        host = DeclaredHost(
+            values["name"], values.get("address"), values.get("groups", ()), values.get("tunnel", True)
+        )
+        if host.name in self.found:
+            self._mistake(node, f"{host.name} is declared twice; leave one of them out")
+            return
+        for other in self.found.values():
+            if host.address is not None and other.address == host.address:
+                self._mistake(node, f"{host.name} and {other.name} have the same address; give one another")
+        self.found[host.name] = host
+
+    def _pairs(self, node: yaml.Node, known: list[str], form: str) -> Iterator[tuple[str, yaml.Node]]:
+        if not isinstance(node, yaml.MappingNode):
+            self._mistake(node, f"write {form}")
+            return
+        seen: set[str] = set()
+        for key, value in node.value:
+            name = str(key.value)
+            if name not in known:
+                hint = meant(name, known) or f"; known here: {', '.join(known)}"
+                self._mistake(key, f"unknown key {quoted(name)}{hint}")
+            elif name in seen:
+                self._mistake(key, f"{name} is given a second time")
+            else:
+                yield name, value
+            seen.add(name)
+
+    def _mistake(self, node: yaml.Node, text: str) -> None:
+        self.mistakes.append(f"{_place(node.start_mark)}: {text}")

@@ -27,27 +27,37 @@ def test_no_file_and_an_empty_one_declare_nobody(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("hosts: [", "cannot be read"),
-        ("hosts:\n  - name: 'a b'\n", "hosts.0.name"),
-        ('hosts:\n  - name: "a\\n"\n', "hosts.0.name"),
-        ("hosts:\n  - name: a\n    address: 10.0.0\n", "hosts.0.address"),
-        ("hosts:\n  - name: a\n    group: b\n", "hosts.0: Object contains unknown field `group`"),
-        ("hosts:\n  - name: a\n  - name: a\n", "declared twice"),
-        ("- a\n", "the file"),
-        ("hosts:\n  - name: a\n    groups: ['b c']\n", "hosts.0.groups.0"),
-        ("hosts:\n  - name: a\n    tunnel: perhaps\n", "hosts.0.tunnel"),
+        ("hosts: [", ":1:9: is not YAML: expected the node content"),
+        ("hosts:\n  - name: 'a b'\n", ':2:11: name is "a b"; a name is of letters, digits, `.`, `_` and `-`'),
+        ('hosts:\n  - name: "a\\n"\n', ':2:11: name is "a\\n"; a name is'),
+        ("hosts:\n  - address: 10.113.11.5\n", ":2:5: this host has no name: write `name: ocu-1`"),
+        ("hosts:\n  - a\n", ":2:5: write `- name: ocu-1` for a host"),
+        ("hosts:\n  - name: a\n    address: 10.0.0\n", ':3:14: address is "10.0.0"; an IPv4 address is four numbers'),
+        ("hosts:\n  - name: a\n    adress: 10.0.0.1\n", ':3:5: unknown key "adress"; did you mean address?'),
+        ("hosts:\n  - name: a\n    xyz: b\n", ':3:5: unknown key "xyz"; known here: name, address, groups, tunnel'),
+        ("hosts:\n  - name: a\n    name: b\n", ":3:5: name is given a second time"),
+        ("hosts:\n  - name: a\n  - name: a\n", ":3:5: a is declared twice"),
+        ("- a\n", ":1:1: write `hosts:`, and under it `- name: ocu-1` for each host"),
+        ("host: []\n", ':1:1: unknown key "host"; did you mean hosts?'),
+        ("hosts: 5\n", ":1:8: hosts are a list: write `- name: ocu-1` for each"),
+        ("hosts:\n  - name: a\n    groups: ['b c']\n", ":3:13: groups is \"['b c']\"; groups are a list"),
+        ("hosts:\n  - name: a\n    tunnel: perhaps\n", ':3:13: tunnel is "perhaps"; a tunnel is wanted or not'),
+        ("hosts:\n  - {name: a, x: 1}\n  - {name: 'b c'}\n", ":3:12: name"),
+        ("hosts:\n" + "  - {x: 1}\n" * 9, "known here: name, address, groups, tunnel; and 4 more"),
+        ("hosts: &a\n  - {name: *a}\n", "is not YAML: found unconstructable recursive node"),
         (
             "hosts:\n  - {name: a, address: 10.113.11.5}\n  - {name: b, address: 10.113.11.5}\n",
-            "b and a have the same address",
+            ":3:5: b and a have the same address",
         ),
         ("x" * (1 << 20 | 1), "longer than"),
-        ("[" * 5000, "cannot be read"),
+        ("[" * 5000, "is not YAML: nested too deep"),
+        (b"hosts: \xff\n", "cannot be read: it is not UTF-8 text"),
     ],
-)
-def test_mistakes_are_named(tmp_path: Path, text: str, said: str) -> None:
-    """The message says which file and where in it."""
+)  # fmt: skip
+def test_mistakes_are_named(tmp_path: Path, text: str | bytes, said: str) -> None:
+    """Every one, with its line and column and what to write instead; no word is the library's."""
     path = tmp_path / "hosts.yaml"
-    path.write_text(text)
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
     with pytest.raises(DeclaredHostsError, match=r"hosts\.yaml") as error:
         read_declared(path)
     assert said in str(error.value)
@@ -71,7 +81,7 @@ def test_a_file_that_went_bad_changes_nothing(tmp_path: Path) -> None:
     with pytest.raises(DeclaredHostsError):
         declared.reload()
     assert list(declared.hosts) == ["a"]
-    assert "hosts.yaml: hosts" in declared.error
+    assert "hosts.yaml:1:8: hosts are a list" in declared.error
     path.write_text("hosts: []\n")
     declared.reload()
     assert (declared.hosts, declared.error) == ({}, "")
