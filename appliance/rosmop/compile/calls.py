@@ -17,22 +17,12 @@ from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.syntax.foreign import instead
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.messages import nearest, shown
 from appliance.rosmop.types.resolve import named_type, record
 
 _MACRO = re.compile(r"ROS_(DEBUG|INFO|WARN|ERROR|FATAL)(_STREAM)?(_COND|_ONCE|_THROTTLE|_NAMED)?\Z")
-_REFUSED = {
-    "system": "there are no programs to start",
-    "fopen": "there are no files",
-    "malloc": "there are no pointers; use a `std::vector`",
-    "free": "there are no pointers",
-    "exit": "an action cannot end the program; write `return;`",
-    "sleep": "an action must not wait; use an event `every …`",
-    "usleep": "an action must not wait; use an event `every …`",
-    "rand": "verdicts are functions of what was received; there is no chance in them",
-    "time": "write `ros::Time::now()`",
-}
 
 
 def call(scope: Scope, node: tree.Call, value_of: ValueOf) -> Value:
@@ -90,10 +80,9 @@ def _unknown(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> Specifica
     name = "::".join(parts)
     if name in scope.names.misdeclared:
         return SpecificationError(())
-    if parts[-1] in _REFUSED:
-        return SpecificationError.at(
-            node.position, f"there is no function {shown(name)}: {_REFUSED[parts[-1]]}"
-        )
+    told = instead(parts)
+    if told is not None:
+        return SpecificationError.at(node.position, f"there is no function {shown(name)}; {told}")
     owners = [other.name for other in scope.shared.specifications if parts[0] in other.functions]
     if owners and len(parts) == 1:
         return SpecificationError.at(

@@ -220,9 +220,13 @@ def _assign(scope: Scope, node: tree.Assign) -> Value:
 
 def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, form.Expression]:
     """The target of an assignment, and the value it gets."""
-    if node.target == tree.Name(node.position, ("MESSAGE",)):
+    whole = node.target
+    while isinstance(whole, tree.Member | tree.Index):
+        whole = whole.base
+    if isinstance(whole, tree.Name) and whole.parts == ("MESSAGE",):
         raise SpecificationError.at(
-            node.position, "`MESSAGE` cannot be assigned; bind the fields you want to change"
+            node.position,
+            "`MESSAGE` cannot be assigned; bind the fields you want to change, `'{field:x}'`, and write `x = …;`",
         )
     target = value_of(scope, node.target)
     assignments.require_place(target, f"`{node.operator}`")

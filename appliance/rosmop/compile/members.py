@@ -11,6 +11,7 @@ from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.numbers import f32
 from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.syntax.foreign import instead
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.messages import PRIMITIVES, UnknownNameError, nearest, shown
 
@@ -56,9 +57,10 @@ def call(invocation: Invocation) -> Value:
     method = methods.get(invocation.name)
     if method is None:
         name = invocation.name
+        told = instead((name,))
+        hint = f"; {told}" if told else nearest(name, methods)
         raise SpecificationError.at(
-            invocation.position,
-            f"{invocation.base.type} has no function {shown(name)}{nearest(name, methods)}",
+            invocation.position, f"{invocation.base.type} has no function {shown(name)}{hint}"
         )
     return method(invocation)
 

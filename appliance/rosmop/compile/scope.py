@@ -13,6 +13,7 @@ from appliance.rosmop.ir.values import Values
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.syntax.foreign import instead
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import Messages, nearest, shown
@@ -245,7 +246,9 @@ class Scope:
             return SpecificationError(())
         known = [local for block in self._blocks for local in block]
         known += [*self.names.variables, *self.names.functions]
-        return SpecificationError.at(position, f"there is no {what} {shown(name)}{nearest(name, known)}")
+        told = instead(name.split("::"))
+        hint = f"; {told}" if told else nearest(name, known)
+        return SpecificationError.at(position, f"there is no {what} {shown(name)}{hint}")
 
     def published(self, topic: str, kind: str, position: Position) -> None:
         """Note that the topic is published."""

@@ -1,7 +1,10 @@
 """Says in words why a text is not of the grammar: what was found, what was expected, what to write instead."""
 
 import re
+import unicodedata
 from collections.abc import Set
+
+from appliance.rosmop.syntax.foreign import foreign
 
 FORBIDDEN = {
     "class": "types cannot be declared; use the message types and variables",
@@ -28,6 +31,21 @@ FORBIDDEN = {
     "sizeof": "sizes of types have no meaning here; write `.size()`",
     "decltype": "write the type itself, or `auto`",
     "wchar_t": "write `char` or `std::string`",
+    "namespace": "there are no namespaces; leave it out",
+    "public": "types cannot be declared; leave it out",
+    "private": "types cannot be declared; leave it out",
+    "protected": "types cannot be declared; leave it out",
+    "this": "write the variable by its name",
+    "register": "leave it out",
+    "mutable": "leave it out",
+    "explicit": "types cannot be declared; leave it out",
+    "noexcept": "there are no exceptions; leave it out",
+    "thread_local": "messages come one at a time; leave it out",
+    "alignas": "leave it out",
+    "xor": "write `!=`, or `^` for bits",
+    "bitand": "write `&`",
+    "bitor": "write `|`",
+    "compl": "write `~`",
     "and": "write `&&`",
     "or": "write `||`",
     "not": "write `!`",
@@ -75,17 +93,29 @@ _FOUND = re.compile(
     r'"(?:\\.|[^"\\\n])*"|[A-Za-z_]\w*|\d[\w.]*|->|::|<<=|>>=|[-+*/%&|^<>=!]=|\+\+|--|&&|\|\||<<|>>|.',
     re.DOTALL,
 )
-_CONTAINER = re.compile(
-    r"(?:std\s*::\s*)?\b(map|unordered_map|set|list|deque|queue|pair|array|tuple|shared_ptr|function)\s*<[^;{}]*\Z"
+_HEAD = frozenset({"EVERY", "SERVICE_PART", "WHEN", "DURATION"})
+_EVENT_FORM = "an event is `event name(int x) /topic package/Type '{field:x}' when (condition) { … }`"
+_FORMS = tuple(
+    (re.compile(behind), form)
+    for behind, form in (
+        (r"\bevent\s+\w+\s*\Z", _EVENT_FORM),
+        (
+            r"\bevent\s+\w+\s*\([^()]*\)[^;']*['\u2018\u2019\u00b4`]\{[^';]*\Z",
+            "a pattern is `'{field:x, list[0]:y, field:5}'`; a condition stands behind it: `when (x > 3)`",
+        ),
+        (r"@\s*\w+\s*\Z", "a handler is `@category { … }`"),
+        (r"\binit\s*\Z", "write `init() { … }`"),
+        (r"\b(?:if|while|switch|for|when)\s*\Z", "a condition stands in parentheses"),
+    )
 )
-_NEARLY_EVENT = re.compile(r"\b(\w+)\s+(\w+)\s*\([^()]*\)\s*\Z")
-_TRIGGERS = frozenset({"/", "service", "every"})
+"""What stands before the text that is refused, and the form of what this was to be."""
+_PIECE = re.compile(r'//[^\n]*|/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\\n])*"|\'\\?[^\n]\'|[{}]')
+_PLAIN = {"\u2212": "-", "\u2260": "!=", "\u2264": "<=", "\u2265": ">=", "\u00d7": "*", "\u00f7": "/", "\u2192": "->",
+          "\u2227": "&&", "\u2228": "||", "\u00ac": "!", "\u2019": "'", "\u2018": "'", "\u201e": '"'}  # fmt: skip
 _HINTS = {
-    "->": "there are no pointers; write `.`",
     "&": "there are no addresses; pass the variable itself",
-    "*": "there are no pointers but `char *`; use the value itself",
+    "*": "there are no pointers but `char *`; use the value itself (of an iterator: `for (auto& x : v) { … }`)",
     "@": "a handler belongs to a property: `logic: formula @category { … }`",
-    "[": "there are no lambda functions; declare a helper function",
     '"': "a string ends on the line it begins on",
 }
 _WORDS = {
@@ -139,34 +169,92 @@ def shown(text: str) -> str:
     return f"`{clean if len(clean) <= 40 else clean[:37] + '…'}`"
 
 
-def describe(text: str, offset: int, accepted: Set[str]) -> str:
-    """The message for text that cannot follow at `offset`, where a token of `accepted` could."""
+def describe(text: str, offset: int, accepted: Set[str]) -> tuple[int, str]:
+    """Where to say it, and the message for text that cannot follow at `offset`, where a token of `accepted` could."""
     if offset >= len(text):
-        piece, found, hint = "", "the end of the file", ""
-    else:
-        match = _FOUND.match(text, offset)
-        piece = match[0] if match else text[offset]
-        found = shown(piece)
-        hint = FORBIDDEN.get(piece, _HINTS.get(piece, ""))
+        return _at_end(text, accepted)
     if text.startswith("/*", offset):
-        return "this comment does not end; write `*/` behind it"
-    if piece == "[" and text[:offset].rstrip().endswith("]") and "SEMICOLON" in accepted:
-        hint = "there are no arrays of arrays; use a `std::vector` of vectors"
-    container = _CONTAINER.search(text, max(0, offset - 100), offset + 1)
-    if container is not None:
-        hint = f"there is no `{container[1]}`; use a `std::vector`"
-    nearly = _NEARLY_EVENT.search(text, max(0, offset - 200), offset)
-    if nearly is not None and {"SEMICOLON", "LBRACE"} <= accepted and piece in _TRIGGERS:
-        return f"found {shown(nearly[1])} where an event begins with `event`; write `event {nearly[2]}(…)`"
-    expected = _expected(accepted)
-    before = text[:offset].rstrip()
-    if "AT" in accepted and before.endswith(":"):
-        return f"found {found}, expected a formula; a property is `logic: formula @category {{ … }}`"
+        return offset, "this comment does not end; write `*/` behind it"
+    match = _FOUND.match(text, offset)
+    piece = match[0] if match else text[offset]
+    before = _code(text, offset)
     if "AT" in accepted and not before.endswith("}"):
-        return f"found {found} after the formula, expected a handler `@category {{ … }}`"
-    if "'" in found and "QUOTE" not in accepted and "STRING" in accepted:
-        hint = hint or "a character literal is one character; write a string in double quotes"
-    return f"found {found}, expected {expected}" + (f"; {hint}" if hint else "")
+        what = (
+            ", expected a formula; a property is" if before.endswith(":") else " after the formula, expected"
+        )
+        form = "`logic: formula @category { … }`" if before.endswith(":") else "a handler `@category { … }`"
+        return offset, f"found {shown(piece)}{what} {form}"
+    told = foreign(text, offset, len(_open_braces(text, offset)))
+    if told is not None:
+        return told[0], _refused(text, *told)
+    if "SEMICOLON" in accepted and "\n" in text[len(before) : offset] and before[-1:] not in "{};":
+        line = text.count("\n", 0, offset) + 1
+        return len(before), f"expected `;` behind this, found {shown(piece)} in line {line}"
+    hint = _hint(text[:offset], piece, accepted)
+    return offset, f"found {shown(piece)}, expected {_expected(accepted)}" + (f"; {hint}" if hint else "")
+
+
+def misplaced(text: str, offset: int, word: str) -> tuple[int, str]:
+    """Where to say it, and the message for a word at `offset` that is no name and of no meaning there."""
+    if word in FORBIDDEN:
+        return offset, f"`{word}` is not part of the language; {FORBIDDEN[word]}"
+    opened = _open_braces(text, offset)
+    told = foreign(text, offset, len(opened))
+    if told is not None:
+        return told[0], _refused(text, *told)
+    if not opened:
+        return (
+            offset,
+            f"`{word}` cannot stand outside of a specification, `name() {{ … }}`; move this into one",
+        )
+    return offset, f"`{word}` is a word of the language: it cannot stand here, and is no name"
+
+
+def _refused(text: str, begin: int, end: int, advice: str) -> str:
+    return f"{shown(' '.join(text[begin:end].split()))} is not part of the language; {advice}"
+
+
+def _hint(before: str, piece: str, accepted: Set[str]) -> str:
+    if _HEAD & accepted or accepted in ({"MESSAGE_TYPE"}, {"QUOTE"}):
+        return _EVENT_FORM
+    for behind, form in _FORMS:
+        if behind.search(before, max(0, len(before) - 200)):
+            return form
+    if not piece.isascii():
+        plain = _PLAIN.get(piece) or unicodedata.normalize("NFKC", piece)
+        name = f"this is U+{ord(piece[0]):04X}, {unicodedata.name(piece[0], 'a character without a name')}"
+        return f"{name}; " + (f"write `{plain}`" if plain.isascii() else "names are of letters of ASCII")
+    if piece == "'" and "QUOTE" not in accepted and "STRING" in accepted:
+        return "a character literal is one character; write a string in double quotes"
+    return FORBIDDEN.get(piece, _HINTS.get(piece, ""))
+
+
+def _open_braces(text: str, offset: int) -> list[int]:
+    """Where the braces stand that are open at `offset`."""
+    opened: list[int] = []
+    for piece in _PIECE.finditer(text, 0, offset):
+        if piece[0] == "{":
+            opened.append(piece.start())
+        elif piece[0] == "}":
+            del opened[-1:]
+    return opened
+
+
+def _code(text: str, offset: int) -> str:
+    """The text before `offset`, to the end of the last thing that is no comment."""
+    before = text[:offset].rstrip()
+    begin = before.rfind("\n") + 1
+    code = begin + len(before[begin:].partition("//")[0].rstrip())
+    return before if code == len(before) else _code(before, code)
+
+
+def _at_end(text: str, accepted: Set[str]) -> tuple[int, str]:
+    opened = _open_braces(text, len(text))
+    unclosed = ""
+    if opened:
+        line, column = text.count("\n", 0, opened[-1]) + 1, opened[-1] - text.rfind("\n", 0, opened[-1])
+        unclosed = f"; the `{{` at {line}:{column} has no `}}`"
+    return len(text), f"found the end of the file, expected {_expected(accepted)}{unclosed}"
 
 
 def _expected(accepted: Set[str]) -> str:

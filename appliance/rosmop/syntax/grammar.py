@@ -5,6 +5,8 @@ divisions elsewhere, and `event` or `service` are still names of variables insid
 know what a name is to tell a declaration from an expression, two names in a row are a declaration.
 """
 
+from appliance.rosmop.logics.catalogue import LOGICS
+
 _GAP = r"(?:\s|\/\/[^\n]*\n|\/\*(?:[^*]|\*(?!\/))*\*\/)"
 """What may stand between two tokens: blanks and comments. It matches in one way only, so nothing is tried twice."""
 
@@ -190,7 +192,7 @@ MESSAGE_TYPE.4: /[A-Za-z]\w*\/[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`{>\],&]|<
     | /[A-Za-z]\w*::[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`,]|<GAP>+(request|response)(?!\w))/
 DURATION: /(\d+(\.\d*)?|\.\d+)\s*[A-Za-z]*/
 QUOTE: /['\u2018\u2019\u00b4`]/
-FORMULA.9: /(?:[^@{}\/]|\/(?![\/*])|\/\/[^\n]*|\/\*(?:[^*]|\*(?!\/))*\*\/)+/
+FORMULA.9: /(?:(?!<NEXT>)[^@{}\/]|\/(?![\/*])|\/\/[^\n]*|\/\*(?:[^*]|\*(?!\/))*\*\/)+/
 AT: "@"
 NUMBER: /(0[xX][0-9A-Fa-f]+|(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?)[uUlLfF]*/
 STRING: /"(\\.|[^"\\\n])*"|“(\\.|[^”\\\n])*”/
@@ -213,4 +215,7 @@ PREAMBLE.10: /#(\\\r?\n|[^\n])*/
 %ignore PREAMBLE
 """
 
-GRAMMAR = _GRAMMAR.replace("<GAP>", _GAP).replace("<WORD>", _WORD)
+_NEXT = rf"(?<!\w)(?:(?i:{'|'.join(LOGICS)}|dl)\s*:(?!:)|(?:{_WORD}\s+)*event\s+[A-Za-z_]\w*\s*\()"
+"""Where a formula ends that no handler follows: another property, or an event."""
+
+GRAMMAR = _GRAMMAR.replace("<NEXT>", _NEXT).replace("<GAP>", _GAP).replace("<WORD>", _WORD)

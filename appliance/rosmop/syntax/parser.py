@@ -13,7 +13,7 @@ from lark.exceptions import UnexpectedInput, UnexpectedToken
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.builder import Builder, check
-from appliance.rosmop.syntax.complaints import FORBIDDEN, RESERVED, describe
+from appliance.rosmop.syntax.complaints import FORBIDDEN, RESERVED, describe, misplaced
 from appliance.rosmop.syntax.directives import check_directives
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.grammar import GRAMMAR
@@ -61,18 +61,15 @@ def _parse(text: str, file: str) -> Tree[Token]:
     try:
         return _parser().parse(text)
     except _ForbiddenWordError as error:
-        word = error.token
-        position = Position(file, word.line or 1, word.column or 1)
-        reason = FORBIDDEN.get(word)
-        text = f"is not part of the language; {reason}" if reason else "cannot stand here, and is no name"
-        raise SpecificationError.at(position, f"`{word}` {text}") from None
+        begin, message = misplaced(text, error.token.start_pos or 0, str(error.token))
+        raise SpecificationError.at(start_of(file, text, begin), message) from None
     except UnexpectedInput as error:
         at_end = isinstance(error, UnexpectedToken) and error.token.type == "$END"
         offset = len(text) if at_end or error.pos_in_stream is None else error.pos_in_stream
         if text[offset - 1 : offset + 1] == "->":
             offset -= 1
-        message = describe(text, offset, _accepted(error))
-        raise SpecificationError.at(start_of(file, text, offset), message) from None
+        begin, message = describe(text, offset, _accepted(error))
+        raise SpecificationError.at(start_of(file, text, begin), message) from None
 
 
 def start_of(file: str, text: str, offset: int) -> Position:

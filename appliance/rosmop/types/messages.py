@@ -127,7 +127,7 @@ def field_type(field: Field) -> Type:
 def nearest(name: str, known: Iterable[str]) -> str:
     """What else could have been meant, as the tail of a message; of very many names, among the first."""
     known = list(islice(known, _COMPARED))  # a file can have thousands of names, and of mistakes
-    near = difflib.get_close_matches(name[:100], known, 1, 0.5)
+    near = difflib.get_close_matches(name[:100], known, 1, 0.65)
     if near:
         return f"; did you mean `{near[0]}`?"
     if 0 < len(known) <= 12:

@@ -3,6 +3,7 @@
 from appliance.rosmop.positions import Position
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.syntax.foreign import instead
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import Messages, UnknownNameError, nearest
@@ -32,9 +33,6 @@ _CPP_NAMES = {  # of the types of fields, as .msg files name them
     "duration": "ros::Duration",
 }
 _SHORT_NAMES = {short: f"unsigned {short[1:]}" for short in ("uint", "ushort", "ulong")}  # of glibc
-_UNKNOWN_CONTAINERS = frozenset(
-    {"map", "set", "list", "deque", "pair", "array", "unordered_map", "queue", "tuple"}
-)
 
 
 def named_type(parts: tuple[str, ...]) -> Type | None:
@@ -85,25 +83,28 @@ def _built_in(name: tree.TypeName) -> Type | None:
 
 def _message(name: tree.TypeName, messages: Messages) -> Type:
     text = "::".join(name.name)
-    if name.name[0] == "std":
-        if name.name[-1] in _UNKNOWN_CONTAINERS:
-            raise SpecificationError.at(name.position, f"there is no `{text}`; use a `std::vector`")
-        raise SpecificationError.at(name.position, f"there is no type `{text}`")
     if text in _CPP_NAMES:
         raise SpecificationError.at(
             name.position,
             f"there is no type `{text}`; ROS's {text} is `{_CPP_NAMES[text]}` in C++: write that",
         )
-    if len(name.name) != 2:
-        if text in _SHORT_NAMES:
-            raise SpecificationError.at(
-                name.position, f"there is no type `{text}`; write `{_SHORT_NAMES[text]}`"
-            )
-        known = ["bool", "int", "double", "float", "char", "string", "size_t"]
-        hint = nearest(text, known) if len(name.name) == 1 and len(text) > 2 else ""
-        hint = hint if "did you mean" in hint else "; write a C++ type or a message type `package::Type`"
-        raise SpecificationError.at(name.position, f"there is no type `{text}`{hint}")
+    if text in _SHORT_NAMES:
+        raise SpecificationError.at(name.position, f"there is no type `{text}`; write `{_SHORT_NAMES[text]}`")
+    if len(name.name) != 2 or name.name[0] == "std":
+        raise SpecificationError.at(name.position, f"there is no type `{text}`{_meant(name.name, messages)}")
     return record(name.position, "/".join(name.name), messages)
+
+
+def _meant(parts: tuple[str, ...], messages: Messages) -> str:
+    """The tail of the refusal of a type that is none, nor of the form of a message type."""
+    told = instead(parts)
+    if told is not None:
+        return f"; {told}"
+    named = [known for known in messages.definitions.message_types if known.endswith(f"/{parts[-1]}")]
+    if named and len(parts) == 1:
+        return f"; did you mean `{named[0].replace('/', '::')}`?"
+    hint = nearest(parts[-1], ["bool", "int", "double", "float", "char", "string", "size_t"])
+    return hint if "did you mean" in hint else "; write a C++ type or a message type `package::Type`"
 
 
 def record(position: Position, name: str, messages: Messages) -> kinds.Record:
@@ -111,5 +112,7 @@ def record(position: Position, name: str, messages: Messages) -> kinds.Record:
     try:
         messages.definition(name)
     except UnknownNameError as error:
-        raise SpecificationError.at(position, str(error)) from None
+        told = instead(name.split("/")) if name not in messages.definitions.message_types else None
+        text = f"there is no `{name.replace('/', '::')}`; {told}" if told else str(error)
+        raise SpecificationError.at(position, text) from None
     return kinds.Record(name)

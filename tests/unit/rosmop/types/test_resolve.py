@@ -61,7 +61,7 @@ REFUSED = [
     ("uint8", "ROS's uint8 is `uint8_t` in C++"),
     ("time", "ROS's time is `ros::Time` in C++"),
     ("strin", "there is no type `strin`; did you mean `string`?"),
-    ("std map", "there is no `std::map`; use a `std::vector`"),
+    ("std deque", "there is no type `std::deque`; use a `std::vector`"),
     ("std foo", "there is no type `std::foo`"),
     ("geometry_msgs Twit", "did you mean `geometry_msgs/Twist`?"),
 ]
