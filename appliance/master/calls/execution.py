@@ -13,7 +13,7 @@ What goes wrong on the way is an answer of the right shape for the caller, and a
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -111,10 +111,13 @@ class Execution:
                 outcome = self._settled(attempt)
             return await self._carry_out(visit, attempt, outcome)
 
-    async def answer_run(self, visit: Visit, run: Sequence[Attempt]) -> list[Value]:
+    async def answer_run(
+        self, visit: Visit, run: Sequence[Attempt], recorded: asyncio.Event, before: Awaitable[object] | None
+    ) -> list[Value]:
         """Decide calls that read and write parameters one by one, and carry them out in their order.
 
-        No call of the run reads what one before it writes, so reads are carried out first.
+        No call of the run reads what one before it writes, so reads are carried out first. `recorded` is set when all
+        are decided; writes of the run `before`, which touch no key of this one, are carried out before its own.
         """
         if sum(map(self.parameters.weight_of_answer, run)) >= self.large:
             await visit.bulk.take()
@@ -125,14 +128,14 @@ class Execution:
             if look.allowed and attempt.call.verb is Verb.WRITE
         ]
         if not writing:
-            return await self._carry_out_run(visit, run, looks)
+            return await self._carry_out_run(visit, run, looks, recorded, before)
         async with self._turn(writing) as later:
             if later:
                 looks = [
                     self._settled(attempt) if look.allowed else look
                     for attempt, look in zip(run, looks, strict=True)
                 ]
-            return await self._carry_out_run(visit, run, looks)
+            return await self._carry_out_run(visit, run, looks, recorded, before)
 
     @contextlib.asynccontextmanager
     async def _turn(self, attempts: Sequence[Attempt]) -> AsyncIterator[bool]:
@@ -161,8 +164,14 @@ class Execution:
         return answer
 
     async def _carry_out_run(
-        self, visit: Visit, run: Sequence[Attempt], decisions: Sequence[Decision]
+        self,
+        visit: Visit,
+        run: Sequence[Attempt],
+        decisions: Sequence[Decision],
+        recorded: asyncio.Event,
+        before: Awaitable[object] | None,
     ) -> list[Value]:
+        policy = self.policy()
         answers: list[Value] = [
             self._recorded(attempt, decision) for attempt, decision in zip(run, decisions, strict=True)
         ]
@@ -177,9 +186,18 @@ class Execution:
                 writes.append(place)
             else:
                 answers[place] = await self._perform(visit, attempt)
-        outcomes = await self.parameters.write(
-            [Write(run[place].caller, run[place].resource, run[place].value) for place in writes]
-        )
+        recorded.set()
+        wanted = [run[place] for place in writes]
+        if before is not None:
+            await before
+        outcomes: Sequence[Value | Exception]
+        if not wanted or (self.policy() is policy and not self.trail.obstacle):
+            outcomes = await self.parameters.write(
+                [Write(one.caller, one.resource, one.value) for one in wanted]
+            )
+        else:  # what was decided ahead counts no more
+            looks = [self._settled(one) for one in wanted]
+            outcomes = await self._carry_out_run(visit, wanted, looks, recorded, None)
         for place, outcome in zip(writes, outcomes, strict=True):
             answers[place] = self._failed(run[place], outcome) if isinstance(outcome, Exception) else outcome
         return answers

@@ -2,13 +2,17 @@
 
 Roslaunch clears and sets parameters in one multicall, and the order is what counts. Calls that read and write
 parameters and follow each other are a *run*: each is decided and recorded by itself, they wait for the disk and for
-ROSMaster once. A read of what a run writes begins the next. Everything else waits for the part before it.
+ROSMaster once. A read of what a run writes begins the next. A run of writes is decided and recorded while ROSMaster
+carries out the one before, unless it touches what that writes; ROSMaster has it when that has ended. Everything else
+waits for the part before it.
 """
 
 import asyncio
 import time
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from appliance.audit_trail import AuditTrail
 from appliance.master.calls.call import Attempt, Verb
@@ -45,47 +49,63 @@ class Multicall:
             return [-1, why, 0]
         left: _Parts = deque(params[0])
         results: list[Value] = []
-        limit = room = self.parameters.mirror.bytes_limit
+        room = self.parameters.mirror.bytes_limit
         since = time.monotonic()  # not the loop's time, which stands still meanwhile
-        while left:
-            why = self.trail.owing(visit.caller.peer.text)
-            if room <= 0:
-                why = f"the answers to a multicall have more than {limit} bytes"
-            if why:
-                why = f"{why}; {len(left)} more parts are not carried out"
-                return results + [self._fault(visit, LIMIT_FAULT, "limit exceeded", why)] * len(left)
-            answers = await self._next(visit, left, room)
-            room -= await self._weigh(visit, answers)
-            results += answers
-            if time.monotonic() - since > _LONGEST_STRETCH:
-                await asyncio.sleep(0)
-                since = time.monotonic()
+        before: _UnderWay | None = None
+        async with asyncio.TaskGroup() as group:
+            while left and not (why := self._why_no_more(visit, room)):
+                answers: list[Value] = []
+                run = await self._run(visit, left, room) if _in_run(visit, left[0]) else None
+                if before is not None and (run is None or not run.goes_beside(before.run)):
+                    answers, before = await before.answers(), None
+                if run is None:
+                    answers.append(await self._one(visit, left.popleft()))
+                elif run.reads or not (left or before):
+                    done = self.execution.answer_run(visit, run.attempts, run.recorded, None)
+                    answers += run.answered(await done)
+                else:
+                    after = None if before is None else before.task
+                    task = self.execution.answer_run(visit, run.attempts, run.recorded, after)
+                    following = _UnderWay(run, group.create_task(task))
+                    await run.recorded.wait()
+                    answers += [] if before is None else await before.answers()
+                    before = following
+                room -= await self._weigh(visit, answers)
+                results += answers
+                if time.monotonic() - since > _LONGEST_STRETCH:
+                    await asyncio.sleep(0)
+                    since = time.monotonic()
+            results += [] if before is None else await before.answers()
+        if left:
+            why = f"{why}; {len(left)} more parts are not carried out"
+            return results + [self._fault(visit, LIMIT_FAULT, "limit exceeded", why)] * len(left)
         return results
 
-    async def _next(self, visit: Visit, left: "_Parts", room: int) -> list[Value]:
-        """The answers to the next parts, which are taken from those that are left: to a run, or to one part."""
-        if not _in_run(visit, left[0]):
-            return [await self._one(visit, left.popleft())]
-        answers: list[Value] = []
-        run: list[tuple[int, Attempt]] = []
-        written: list[str] = []
+    def _why_no_more(self, visit: Visit, room: int) -> str:
+        """Why no more parts are carried out; empty when they are."""
+        if room <= 0:
+            return f"the answers to a multicall have more than {self.parameters.mirror.bytes_limit} bytes"
+        return self.trail.owing(visit.caller.peer.text)
+
+    async def _run(self, visit: Visit, left: "_Parts", room: int) -> "_Run":
+        """The next parts, which are taken from those that are left, as they were understood."""
+        run = _Run()
         weight, most = 0, min(room, self.offload)
-        while left and len(answers) < _LONGEST_RUN and weight < most and _in_run(visit, left[0]):
+        while left and len(run.answers) < _LONGEST_RUN and weight < most and _in_run(visit, left[0]):
             attempt = await self._understand(visit, left[0])
             if isinstance(attempt, Attempt):
                 if attempt.call.verb is Verb.WRITE:
-                    written.append(attempt.resource)
-                elif touch([attempt.resource], written):
+                    run.written.append(attempt.resource)
+                elif touch([attempt.resource], run.written):
                     left[0] = attempt
                     break
-                run.append((len(answers), attempt))
+                else:
+                    run.reads = True
+                run.attempts.append(attempt)
                 weight += self.parameters.weight_of_answer(attempt)
             left.popleft()
-            answers.append(None if isinstance(attempt, Attempt) else attempt)
-        done = await self.execution.answer_run(visit, [attempt for _place, attempt in run])
-        for (place, _one), answer in zip(run, done, strict=True):
-            answers[place] = [answer]
-        return answers
+            run.answers.append(None if isinstance(attempt, Attempt) else attempt)
+        return run
 
     async def _one(self, visit: Visit, part: "Value | Attempt") -> Value:
         attempt = await self._understand(visit, part)
@@ -125,6 +145,37 @@ class Multicall:
             resource=MULTICALL,
         )
         return {"faultCode": code, "faultString": f"{why} [{record}]"}
+
+
+@dataclass(slots=True)
+class _Run:
+    """Parts that are carried out together: their answers (None: that of an attempt), and when all are recorded."""
+
+    answers: list[Value] = field(default_factory=list)
+    attempts: list[Attempt] = field(default_factory=list)
+    written: list[str] = field(default_factory=list)
+    reads: bool = False
+    recorded: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def goes_beside(self, before: "_Run") -> bool:
+        """Whether nothing that is decided or answered here depends on what ROSMaster makes of the run before."""
+        return not self.reads and not touch(self.written, before.written)
+
+    def answered(self, attempts: Iterable[Value]) -> list[Value]:
+        """All answers, with those of the attempts."""
+        given = iter(attempts)
+        return [[next(given)] if answer is None else answer for answer in self.answers]
+
+
+class _UnderWay(NamedTuple):
+    """A run that ROSMaster carries out."""
+
+    run: _Run
+    task: asyncio.Task[list[Value]]
+
+    async def answers(self) -> list[Value]:
+        """The answers, when all parts are carried out."""
+        return self.run.answered(await self.task)
 
 
 def _in_run(visit: Visit, part: "Value | Attempt") -> bool:

@@ -3,8 +3,10 @@
 import asyncio
 import copy
 import ipaddress
+import random
 import threading
 from collections.abc import Callable, Coroutine
+from functools import partial
 from typing import Any, cast
 
 import pytest
@@ -18,6 +20,7 @@ from appliance.metrics import Meter
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.xmlrpc import Value, build_call, parse_response
+from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import HttpRequest, Peer
 from tests.support.idle import idle
 from tests.support.parameters import mirror, put
@@ -47,7 +50,7 @@ write /arm/max = adm
 
 
 class Records:
-    """The trail: decisions as (call, resource, decision), events by name."""
+    """The trail: decisions as (call, key or resource, decision), events by name."""
 
     def __init__(self) -> None:
         self.strict = False
@@ -66,10 +69,10 @@ class Records:
         return self.debt
 
     def decided(
-        self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, **_more: Any
+        self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, **about: Any
     ) -> str:
         """As `AuditTrail`."""
-        self.decisions.append((method, resource, decision))
+        self.decisions.append((method, about.get("key", resource), decision))
         return "id"
 
     def happened(self, event: str, _reason: str, **_more: Any) -> str:
@@ -83,22 +86,24 @@ class Site:
 
     def __init__(self, rules: str = LIMITED, tree: Any = None, *, bytes_limit: int = 64 << 20) -> None:
         self.policy_text = POLICY + rules
-        policy = compile_policy(self.policy_text, file="test.ini")
+        self.policy = compile_policy(self.policy_text, file="test.ini")
         self.trail = Records()
         self.parameters = mirror(copy.deepcopy(tree or {}), whole=bytes_limit)
         self.there = mirror(copy.deepcopy(tree or {}))
         self.arrived: list[str] = []
         self.go = asyncio.Event()
         self.go.set()
+        self.faults: set[str] = set()  # keys that it answers with a fault
+        self.dies_at = ""  # a key whose request it does not outlive
         self.serve = serving(
-            policy=lambda: policy,
+            policy=lambda: self.policy,
             registry=Registry(),
             graph=idle(Graph),
             enactor=idle(Enactor),
             rosmaster=self,
             mirror=self.parameters,
             trail=self.trail,
-            rights=ParameterRights(lambda: policy, cast(Any, self.trail)),
+            rights=ParameterRights(lambda: self.policy, cast(Any, self.trail)),
             addresses=self,
             offload=OFFLOAD,
         )
@@ -119,7 +124,12 @@ class Site:
         """ROSMaster: several calls as one."""
         self.arrived += [f"{method} {params[1]}" for method, params in calls]
         await self.go.wait()
-        return [self._done(method, *params[1:]) for method, params in calls]
+        if self.dies_at in [params[1] for _method, params in calls]:
+            raise CallFailedError("the ROS Master did not come back")
+        return [
+            CallFailedError("a fault") if params[1] in self.faults else self._done(method, *params[1:])
+            for method, params in calls
+        ]
 
     def _done(self, method: str, key: str, *value: Any) -> Any:
         if method == "setParam":
@@ -131,7 +141,9 @@ class Site:
         node: Any = self.there.tree
         for part in key.split("/"):
             node = node.get(part) if part and isinstance(node, dict) else node
-        return [1, "there", copy.deepcopy(node)]
+        if method == "hasParam":
+            return [1, key, node is not None]
+        return [-1, "not there", 0] if node is None else [1, "there", copy.deepcopy(node)]
 
     async def ask(self, host: str, method: str, *params: Value) -> Any:
         """One call of a host, as it is answered."""
@@ -223,6 +235,130 @@ def test_parts_are_decided_and_answered_in_their_places() -> None:
         assert [resource.allowed for _, _, resource in site.trail.decisions] == [True, False, True, True]
 
     play(scene)
+
+
+def sets(*keys: str) -> list[Value]:
+    """Parts of a multicall that set these."""
+    return [part("setParam", key, 1) for key in keys]
+
+
+RUNS = [[f"/arm/{run}_{place}" for place in range(64)] for run in range(3)]
+
+
+def told(answers: list[Any]) -> list[int]:
+    """The code of each part's answer."""
+    return [one[0][0] for one in answers]
+
+
+async def held(site: Site, parts: list[Value]) -> "asyncio.Task[Any]":
+    """An operator's multicall whose first run is at ROSMaster, which waits for `site.go`."""
+    site.go.clear()
+    asked = asyncio.create_task(site.ask(OPERATOR, "system.multicall", parts))
+    await others()
+    return asked
+
+
+def test_a_run_of_writes_is_decided_while_the_one_before_is_carried_out() -> None:
+    """One run ahead, no more; ROSMaster has a run when the one before has ended, and all in the order of the parts."""
+
+    async def scene() -> None:
+        site = Site()
+        keys = [*RUNS[0], *RUNS[1], *RUNS[2]]
+        asked = await held(site, sets(*keys))
+        assert [resource for _, resource, _ in site.trail.decisions] == RUNS[0] + RUNS[1]
+        assert site.arrived == [f"setParam {key}" for key in RUNS[0]]
+        site.go.set()
+        assert told(await asked) == [1] * len(keys)
+        assert [resource for _, resource, _ in site.trail.decisions] == keys
+        assert site.arrived == [f"setParam {key}" for key in keys]
+        assert site.there.tree == site.parameters.tree
+
+    play(scene)
+
+
+@pytest.mark.parametrize(
+    "following",
+    [
+        part("setParam", "/arm/0_7/below", 1),
+        part("deleteParam", "/arm"),
+        part("hasParam", "/leg"),
+        part("searchParam", "/leg"),
+    ],
+    ids=["a write below", "a write above", "a read", "another call"],
+)
+def test_what_depends_on_the_run_before_waits_for_it(following: Value) -> None:
+    """It is decided and answered by what ROSMaster made of that."""
+
+    async def scene() -> None:
+        site = Site()
+        asked = await held(site, [*sets(*RUNS[0]), following, *sets(*RUNS[1])])
+        assert len(site.trail.decisions) == len(RUNS[0])
+        site.go.set()
+        assert len(await asked) == 2 * len(RUNS[0]) + 1
+        assert site.there.tree == site.parameters.tree
+
+    play(scene)
+
+
+def test_a_run_that_was_decided_ahead_is_decided_again_when_that_counts_no_more() -> None:
+    """A policy that came into force meanwhile, or a log that cannot be written any more, has its say."""
+
+    async def scene(change: Callable[[Site], None]) -> None:
+        site = Site()
+        asked = await held(site, sets(*RUNS[0], *RUNS[1]))
+        change(site)
+        site.go.set()
+        assert told(await asked) == [1] * 64 + [0] * 64
+        assert site.arrived == [f"setParam {key}" for key in RUNS[0]]
+        assert [one.allowed for _, _, one in site.trail.decisions] == [True] * 128 + [False] * 64
+
+    stricter = compile_policy(f"{POLICY}write default = adm\n", file="test.ini")
+    play(lambda: scene(lambda site: setattr(site, "policy", stricter)))
+    play(lambda: scene(lambda site: setattr(site.trail, "obstacle", "the log is full")))
+
+
+def test_what_fails_in_a_run_holds_up_no_other() -> None:
+    """A denial, a fault and a part that is none have their places; a ROSMaster that dies takes one run with it."""
+
+    async def scene() -> None:
+        site = Site()
+        site.faults, site.dies_at = {RUNS[0][5]}, RUNS[1][30]
+        keys = [*RUNS[0][:63], "/leg", *RUNS[1][:62], "bad key!?", "/leg", *RUNS[2]]
+        answers = told(await site.ask(OPERATOR, "system.multicall", sets(*keys)))
+        assert answers == [1] * 5 + [0] + [1] * 57 + [0] + [0] * 62 + [-1, 0] + [1] * 64
+        assert site.there.tree == {"arm": {key[5:]: 1 for key in RUNS[0][:63] + RUNS[2] if key != RUNS[0][5]}}
+        assert site.there.tree == site.parameters.tree
+        again = await site.ask(
+            OPERATOR, "system.multicall", sets(*RUNS[0], *RUNS[2])
+        )  # nobody's turn is left over
+        assert told(again).count(1) == 127
+
+    play(scene)
+
+
+def test_a_multicall_is_as_its_parts_one_by_one() -> None:
+    """Whatever is decided ahead: the answers, the decisions and their order, what ROSMaster has, and the mirror."""
+
+    async def scene(dice: random.Random) -> None:
+        keys = ["/arm", "/arm/a", "/arm/a/b", "/arm/max", "/leg", "/leg/x", *RUNS[0]]
+        likely = [1] * 6 + [2] * len(RUNS[0])
+        parts: list[Any] = []
+        for key in dice.choices(keys, likely, k=400):
+            calls: list[Any] = [
+                ("setParam", key, dice.choice([1, {"b": 1}, {"max": 2}])),
+                ("deleteParam", key),
+                ("hasParam", key),
+            ]
+            method, *params = dice.choices(calls, [40, 8, 1])[0]
+            parts.append(part(method, *params))
+        together, alone = Site(tree={"arm": {"max": 5}}), Site(tree={"arm": {"max": 5}})
+        answers = await together.ask(OPERATOR, "system.multicall", parts)
+        assert answers == [[await alone.ask(OPERATOR, one["methodName"], *one["params"])] for one in parts]
+        assert together.trail.decisions == alone.trail.decisions
+        assert together.there.tree == together.parameters.tree == alone.there.tree
+
+    for seed in range(20):
+        play(partial(scene, random.Random(seed)))  # noqa: S311  the same calls in every run
 
 
 def test_a_namespace_is_hidden_that_was_none_when_it_was_decided() -> None:
