@@ -213,23 +213,23 @@ class AuditLog:
         remove = partial(self._house.removal_approved, number, text, signature, public_key)
         self._put(partial(self._house.attempt, remove))
 
-    def removal_refused(self, number: int, reason: str) -> None:
-        """The signer does not sign a removal; it is asked again later."""
-        self._put(partial(self._house.remover.refused, number, reason))
+    def removal_refused(self, number: int, reason: str, *, early: bool = False) -> None:
+        """The signer does not sign a removal (`early`: not yet); it is asked again later."""
+        self._put(partial(self._house.remover.refused, number, reason, early=early))
 
     def request_signatures(self) -> None:
         """The signer is (back) in service: ask it for every checkpoint that is not signed yet."""
         self._put(partial(self._house.attempt, self._house.ask_signatures))
         self._put(self._house.remover.ask_again)
 
-    def close(self) -> str | None:
-        """Write what waits, make a last checkpoint and close; the reason when that did not succeed."""
+    def close(self, seconds: float = _CLOSE_SECONDS) -> str | None:
+        """Write what waits, make a last checkpoint and close; the reason when that did not succeed in time."""
         self._stopping.set()
         self._hurry.set()
         self._wake.set()
-        self._thread.join(_CLOSE_SECONDS)
+        self._thread.join(seconds)
         if self._thread.is_alive():
-            return f"{self.path}: still being written after {_CLOSE_SECONDS:g} s"
+            return f"{self.path}: still being written after {seconds:g} s"
         return self._unwritten
 
     def _put(self, item: Record | Repeated | Waiter | Callable[[], None]) -> None:

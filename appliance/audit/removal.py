@@ -101,12 +101,14 @@ class Remover:
         self._remove(writer, wanted, {"limit": limit, "signature": signature.hex(), "key": key.hex()})
         return True
 
-    def refused(self, number: int, reason: str) -> None:
-        """The signer does not sign this removal now."""
-        if self._wanted is not None and self._wanted.gone.last_checkpoint == number:
+    def refused(self, number: int, reason: str, *, early: bool = False) -> None:
+        """The signer does not sign this removal now; by age too `early`, which is no trouble: our clock is ahead."""
+        wanted = self._wanted
+        if wanted is not None and wanted.gone.last_checkpoint == number:
             self._wanted = None
             self._refused = time.monotonic() + _REFUSED_SECONDS
-            self.unremoved = f"old records are not removed: the signer refuses: {reason}"
+            waits = early and not wanted.by_size
+            self.unremoved = None if waits else f"old records are not removed: the signer refuses: {reason}"
 
     def _find(self, writer: ChainWriter, now: float) -> _Wanted | None:
         signed = self._signatures.has_signer
@@ -116,8 +118,10 @@ class Remover:
             return None if gone is None else _Wanted(gone, reason, by_size=True)
         if self._retention.days is None or now < self._aged:
             return None
-        before = self._retention.oldest_kept(self._clock())
-        gone = writer.removable(_AT_ONCE, signed=signed, before=before)
+        present = self._clock()
+        gone = writer.removable(
+            _AT_ONCE, signed=signed, between=(self._retention.oldest_kept(present), present)
+        )
         if gone is None:
             self._aged = now + _AGE_SECONDS
             return None

@@ -40,9 +40,9 @@ class Retention:
             return None
         return f"the log was larger than {self.size} bytes"
 
-    def oldest_kept(self, now: int) -> int | None:
-        """Records before this time (nanoseconds since the epoch) are too old; None when none is."""
-        return None if self.days is None else now - int(self.days * _DAY)
+    def oldest_kept(self, now: int) -> int:
+        """Records before this time (nanoseconds since the epoch) are too old."""
+        return 0 if self.days is None else now - int(self.days * _DAY)
 
 
 def as_kept(columns: StoredColumns, digest: bytes) -> Record:

@@ -43,6 +43,7 @@ def _insert(rows: int) -> str:
     return "INSERT INTO record VALUES " + ", ".join([_ROW] * rows)  # noqa: S608  only question marks
 
 
+_AHEAD_STEPS = 20  # so many checkpoints, in steps, that were made while the clock was ahead are looked past
 _INSERTS = {rows: _insert(rows) for rows in (_ROWS_PER_INSERT, 8, 1)}
 
 
@@ -223,21 +224,27 @@ class ChainWriter:
         (page_size,) = self._connection.execute("PRAGMA page_size").fetchone()
         return int((pages - free) * page_size)
 
-    def removable(self, step: int, *, signed: bool, before: int | None = None) -> RemovedRange | None:
-        """The oldest records: up to a (signed) checkpoint of before the time `before`, about `step` of them.
+    def removable(
+        self, step: int, *, signed: bool, between: tuple[int, int] | None = None
+    ) -> RemovedRange | None:
+        """The oldest records: up to a (signed) checkpoint, about `step` of them.
 
-        The last checkpoint stays, for the next one follows from it.
+        None `between` these times goes: of so long ago, and now. Those of later were made while the clock was ahead:
+        they go with what comes after them. The last checkpoint stays, for the next one follows from it.
         """
         first = self._first_sequence()
         condition = "AND signature IS NOT NULL" if signed else ""
         rows = self._connection.execute(
             "SELECT number, sequence, text FROM checkpoint WHERE sequence >= ? AND"  # noqa: S608  fixed text
             f" number < (SELECT max(number) FROM checkpoint) {condition} ORDER BY number LIMIT ?",
-            (first, step),
+            (first, step * _AHEAD_STEPS),
         )
         upto: tuple[int, int, bytes] | None = None
         for row in rows:
-            too_young = before is not None and parse_checkpoint(row[2]).time >= before
+            made = parse_checkpoint(row[2]).time
+            if between is not None and made > between[1]:
+                continue
+            too_young = between is not None and made >= between[0]
             if too_young or (upto is not None and row[1] >= first + step):
                 break
             upto = row

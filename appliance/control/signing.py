@@ -44,8 +44,8 @@ class Signing:
                 self._audit().refused(number, reason)
             case messages.RemovalApproved(number, text, signature, public_key):
                 self._audit().removal_approved(number, text, signature, public_key)
-            case messages.RemovalRefused(number, reason):
-                self._audit().removal_refused(number, reason)
+            case messages.RemovalRefused(number, reason, early):
+                self._audit().removal_refused(number, reason, early=early)
             case (
                 messages.AuthorityStated(number)
                 | messages.CertificateMade(number)

@@ -2,7 +2,7 @@
 
 Invariants:
 1. For each log the hashes of its signed checkpoints stand in `<log>.signed`, by number, and the moments of signing in
-   `<log>.times`, by the signer's own clock; they only ever grow.
+   `<log>.times`, by the clock of ages (`ages.py`); they only ever grow.
 2. A checkpoint is approved if it follows the last one (number and hash), or if it is exactly the one approved
    under its number before (control lost the answer). A log that is not known yet may begin with any number.
 3. A checkpoint says how many records are removed before it; it is approved if the signer approved that removal
@@ -14,7 +14,6 @@ Invariants:
 
 import hashlib
 import os
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,10 +37,18 @@ def read_checkpoint(text: bytes) -> Checkpoint:
         raise CheckpointRefusedError("what was to be signed is not an audit checkpoint") from None
 
 
+def newest_signing(directory: Path) -> int | None:
+    """When a checkpoint of any log was signed last; None where none was."""
+    times = (path.read_bytes() for path in directory.glob("*.times"))
+    return max(
+        (int.from_bytes(kept[-_NUMBER:], "big") for kept in times if len(kept) > _NUMBER), default=None
+    )
+
+
 class SignedCheckpoints:
     """The memory of one signer, in its directory; `clock` gives nanoseconds since the epoch."""
 
-    def __init__(self, directory: Path, clock: Callable[[], int] = time.time_ns) -> None:
+    def __init__(self, directory: Path, clock: Callable[[], int]) -> None:
         self._directory = directory
         self._clock = clock
 

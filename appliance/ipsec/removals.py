@@ -4,12 +4,11 @@ Who can write the log could otherwise take out what happened a moment ago and ha
 signer, which has the settings and its own memory, looks at neither the log nor what control says of it:
 
 1. Records are removed up to a checkpoint that the signer signed, no further.
-2. By age (`retention_days`): it signed that checkpoint so long ago, by its own clock.
+2. By age (`retention_days`): it signed that checkpoint so long ago, by the clock of ages (`ages.py`).
 3. By size (`retention_bytes`): so many records were sealed since that a log of them can have that size, at
    `LARGEST_RECORD` bytes each. The signer does not see how large they are, so this is a bound, not the size.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -23,7 +22,11 @@ _DAY = 86_400_000_000_000
 
 
 class RemovalRefusedError(Exception):
-    """A removal that does not follow from the settings; the message says why."""
+    """A removal that does not follow from the settings; the message says why. `early`: it will, as time passes."""
+
+    def __init__(self, reason: str, *, early: bool = False) -> None:
+        super().__init__(reason)
+        self.early = early
 
 
 @dataclass(frozen=True)
@@ -37,9 +40,7 @@ class Kept:
 class Removals:
     """Approves removals from logs, by the memory `signed` and the settings `kept`."""
 
-    def __init__(
-        self, signed: SignedCheckpoints, kept: Kept, clock: Callable[[], int] = time.time_ns
-    ) -> None:
+    def __init__(self, signed: SignedCheckpoints, kept: Kept, clock: Callable[[], int]) -> None:
         self._signed = signed
         self._kept = kept
         self._clock = clock
@@ -55,7 +56,7 @@ class Removals:
             raise RemovalRefusedError(f"checkpoint {upto.number} was not signed here")
         why = self._by_age(signed_at) or self._by_size(upto, last)
         if not why:
-            raise RemovalRefusedError(self._words(upto))
+            raise RemovalRefusedError(self._words(upto), early=self._kept.days is not None)
         self._signed.remember_removed(upto.log, max(upto.sequence, self._signed.removed(upto.log) or 0))
         sealed = checkpoint_hash(checkpoint)
         return Removal(upto.log, upto.number, upto.sequence, upto.hash, sealed, why).text()

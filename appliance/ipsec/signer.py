@@ -27,13 +27,14 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
+from appliance.ages import AgeClock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child import Child
 from appliance.config import load_resolved
 from appliance.ipsec.authority import Authority
 from appliance.ipsec.authority_key import Kind, read_passphrase
-from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints
+from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints, newest_signing
 from appliance.ipsec.files import SignerKeyError, require_private
 from appliance.ipsec.proof import RequestRefusedError
 from appliance.ipsec.removals import Kept, RemovalRefusedError, Removals
@@ -80,8 +81,9 @@ class Signer:
     ) -> None:
         self._child = Child(lifeline, messages.SignerLink, said=self._control_said)
         self._authority = authority
-        self._signed = SignedCheckpoints(directory)
-        self._removals = Removals(self._signed, kept)
+        clock = AgeClock(directory / "age", lambda: newest_signing(directory))
+        self._signed = SignedCheckpoints(directory, clock)
+        self._removals = Removals(self._signed, kept, clock)
         self._key = key
         self._public_key = key.public_key().public_bytes_raw()
 
@@ -123,7 +125,7 @@ class Signer:
         try:
             text = self._removals.approve(checkpoint, newest)
         except (RemovalRefusedError, CheckpointRefusedError, OSError) as error:
-            return messages.RemovalRefused(number, str(error))
+            return messages.RemovalRefused(number, str(error), getattr(error, "early", False))
         return messages.RemovalApproved(number, text, self._key.sign(text), self._public_key)
 
     def _issue(self, wanted: messages.CertificateWanted) -> messages.Message:

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
+from appliance.ages import AgeClock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child import Child
@@ -73,7 +74,10 @@ class _Process:
         return Recorder(
             rules,
             Shelf(
-                Path.cwd(), disk=int(rules.disk), seconds=None if rules.days is None else rules.days * _DAY
+                Path.cwd(),
+                disk=int(rules.disk),
+                seconds=None if rules.days is None else rules.days * _DAY,
+                clock=AgeClock(Path.cwd() / "age"),
             ),
             settings.state / "control" / "audit.db",
             [ring for _index, ring in sorted(self._rings.items())],

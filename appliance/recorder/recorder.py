@@ -217,7 +217,7 @@ class Recorder:
     def _missed(self, trigger: Trigger, why: str) -> None:
         """Have it recorded that such a trigger began no recording, which is said again after a while."""
         now = self._clock()
-        if self._told.get(trigger.what, -_TELL_AGAIN) + _TELL_AGAIN <= now:
+        if abs(now - self._told.get(trigger.what, -_TELL_AGAIN)) >= _TELL_AGAIN:  # or the clock was set back
             self._told[trigger.what] = now
             self._answers.append(messages.RecordingMissed(trigger, why))
 

@@ -20,7 +20,7 @@ Invariants:
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -35,7 +35,7 @@ LENT_SECONDS = 600
 MOST_LENT = 4
 _OPENING_SECONDS = 30
 _MOST_DESCRIBED = 32 << 20
-_NOTED, _LENT, _REMOVED = "noted", "lent", "removed"
+_NOTED, _LENT, _REMOVED, _SINCE = "noted", "lent", "removed", "since"
 _ID = re.compile(r"[0-9a-f]{20}")
 _PART, _GONE, _REST = (re.compile(rf"\.([0-9a-f]{{20}})\.{kind}") for kind in ("part", "gone", "rest"))
 _LARGEST = 8  # the part of `disk` that one recording may have
@@ -44,12 +44,13 @@ _log = structlog.get_logger()
 
 
 class Shelf:
-    """The recordings in `folder`. They have `disk` bytes together, and go after `seconds` (None: never)."""
+    """The recordings in `folder`. They have `disk` bytes together, and go after `seconds` (None: never) of `clock`."""
 
-    def __init__(self, folder: Path, *, disk: int, seconds: float | None) -> None:
+    def __init__(self, folder: Path, *, disk: int, seconds: float | None, clock: Callable[[], int]) -> None:
         self._folder = folder
         self._disk = disk
         self._seconds = seconds
+        self._clock = clock
         for mark in folder.glob(f"*/{_LENT}"):
             self._discard(mark.parent)
         for rest in self._named(_REST):
@@ -59,6 +60,7 @@ class Shelf:
         self._lent: list[Recording] = []
         self.recordings = sorted(self._read(), key=lambda recording: recording.id)
         self._described = {found.id: self._length(found) for found in self.recordings}
+        self._since = {found.id: self._kept_since(found) for found in self.recordings}
 
     def _read(self) -> Iterator[Recording]:
         for path in self._folder.iterdir():
@@ -67,6 +69,12 @@ class Shelf:
                     yield msgspec.json.decode((path / ABOUT).read_bytes(), type=Recording)
                 except (OSError, msgspec.MsgspecError) as error:
                     _log.error("a recording cannot be read", recording=path.name, error=str(error))
+
+    def _kept_since(self, recording: Recording) -> int:
+        """When it was kept, by the clock of ages; where that was not written, its end."""
+        with suppress(OSError, ValueError):
+            return int((self._folder / recording.id / _SINCE).read_bytes())
+        return recording.ended
 
     def _length(self, recording: Recording) -> int:
         return (self._folder / recording.id / ABOUT).stat().st_size
@@ -106,8 +114,11 @@ class Shelf:
     def keep(self, recording: Recording) -> None:
         """A recording is whole, and all of it on disk; only what has no name yet needs `progress`."""
         kept = self._folder / recording.id
+        with suppress(OSError):  # a full disk: then it is kept by its end
+            (self.part(recording.id) / _SINCE).write_bytes(b"%d" % self._clock())
         self.part(recording.id).rename(kept)
         (kept / PROGRESS).unlink(missing_ok=True)
+        self._since[recording.id] = self._kept_since(recording)
         self.recordings.append(recording)
         self._described[recording.id] = self._length(recording)
 
@@ -146,7 +157,7 @@ class Shelf:
             (kept / _REMOVED).write_bytes(msgspec.json.encode((who, reason)))
         kept.rename(gone)
         self.recordings.remove(recording)
-        del self._described[recording.id]
+        del self._described[recording.id], self._since[recording.id]
         (gone / BAG).unlink(missing_ok=True)
 
     def _gone(self, recording_id: str) -> Path:
@@ -183,7 +194,7 @@ class Shelf:
         self._take_back(now, 0, LENT_SECONDS)
         while self._seconds is not None and self.recordings:
             oldest = self.recordings[0]
-            if oldest.ended + int(self._seconds * 1e9) > now:
+            if self._since[oldest.id] + int(self._seconds * 1e9) > self._clock():
                 break
             yield oldest, "it is older than recorder.days"
         while room and self.recordings:

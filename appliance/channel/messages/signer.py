@@ -50,10 +50,11 @@ class RemovalApproved(Message):
 
 
 class RemovalRefused(Message):
-    """The removal does not follow from the settings; why."""
+    """The removal does not follow from the settings; why. `early`: it will, as time passes."""
 
     number: int
     reason: str
+    early: bool = False
 
 
 class AuthorityWanted(Message):

@@ -24,6 +24,7 @@ class Notary:
         self.directory = directory
         self.ago = 0
         self.kept = Kept()
+        self.refused: Callable[[bool], object] = bool  # hears whether it was for its age
         self._signed = SignedCheckpoints(directory, clock=self._now)
 
     def _now(self) -> int:
@@ -78,7 +79,8 @@ def make_log(path: Path, key: Ed25519PrivateKey, notary: Notary) -> Iterator[Mak
         try:
             text = notary.approve(checkpoint, newest)
         except RemovalRefusedError as error:
-            logs[-1].removal_refused(number, str(error))
+            logs[-1].removal_refused(number, str(error), early=error.early)
+            notary.refused(error.early)
         else:
             logs[-1].removal_approved(number, text, key.sign(text), public)
 

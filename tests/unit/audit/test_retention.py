@@ -77,6 +77,48 @@ def test_nothing_young_goes(make_log: MakeLog, path: Path) -> None:
     assert search(path, Filter()).entries[-1].sequence
 
 
+def test_records_of_a_future_go_with_those_after_them(make_log: MakeLog, path: Path, notary: Notary) -> None:
+    """The clock stood a year ahead for a while: what was recorded then holds up nothing, and goes neither early."""
+    now = itertools.count(time.time_ns() - 7 * _DAY, 1000)
+    notary.ago, ahead = 7 * _DAY, 0
+    log = make_log(checkpoint_every=10, clock=lambda: next(now) + ahead)
+    for ahead in (0, 365 * _DAY, 0):
+        for number in range(100):
+            log.record(decision(log, number, time=next(now) + ahead))
+            if number % 10 == 9:
+                settle(log)
+    log.close()
+    notary.ago = 0
+    log = make_log(checkpoint_every=10, retention=Retention(days=1))
+    log.record(decision(log))
+    await_removal(path, 250)
+    log.close()
+    assert verify(path).ok
+
+
+def test_what_the_signer_holds_back_for_its_age_is_no_trouble(
+    make_log: MakeLog, path: Path, notary: Notary
+) -> None:
+    """The machine's clock is a year ahead: the signer waits, nothing goes, and nothing is said to be behind."""
+    log = make_log(checkpoint_every=10, retention=Retention(days=30))
+    for number in range(100):
+        log.record(decision(log, number))
+        if number % 10 == 9:
+            settle(log)
+    log.close()
+    told: list[bool] = []
+    notary.refused = told.append
+    log = make_log(
+        checkpoint_every=10, retention=Retention(days=30), clock=lambda: time.time_ns() + 365 * _DAY
+    )
+    log.record(decision(log))
+    settle(log)
+    eventually(lambda: told, "it was refused")
+    settle(log)
+    assert (told[0], log.degraded) == (True, None)
+    assert next(export(path, Filter(), page=1)).sequence == 1
+
+
 def test_size(make_log: MakeLog, path: Path) -> None:
     """A log that grows past its size loses its oldest records, and stays near the limit."""
     log = make_log(checkpoint_every=200, retention=Retention(size=2 << 20))

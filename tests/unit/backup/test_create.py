@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -34,7 +35,7 @@ def state(tmp_path: Path) -> Path:
     for part in ("control", "signer", "api", "ipsec", "run", "rosmaster/log"):
         (state / part).mkdir(parents=True)
     key = Ed25519PrivateKey.generate()
-    memory = SignedCheckpoints(state / "signer")
+    memory = SignedCheckpoints(state / "signer", time.time_ns)
 
     def sign(number: int, text: bytes) -> None:
         memory.approve(text)

@@ -53,8 +53,9 @@ def test_what_is_old_by_the_signers_clock_goes(tmp_path: Path) -> None:
     assert text.startswith("rosrv audit removal 1\n")
     assert f"checkpoint 5\nsequence {5 * _STEP}\n" in text
     assert text.endswith("limit 5 days\n")
-    with pytest.raises(RemovalRefusedError, match="not old enough"):
+    with pytest.raises(RemovalRefusedError, match="not old enough") as refused:
         desk.approve(7)
+    assert refused.value.early
 
 
 def test_nothing_goes_that_is_kept_for_ever(tmp_path: Path) -> None:
@@ -123,7 +124,7 @@ def test_a_new_log_has_nothing_removed(tmp_path: Path) -> None:
     """The first checkpoint of a log cannot say that something was removed before it."""
     desk = Desk.__new__(Desk)
     desk.texts = []
-    desk.signed = SignedCheckpoints(tmp_path)
+    desk.signed = SignedCheckpoints(tmp_path, lambda: _DAY)
     with pytest.raises(CheckpointRefusedError, match="approved was the removal up to 0"):
         desk.sign(removed=7)
     assert not list(tmp_path.iterdir())

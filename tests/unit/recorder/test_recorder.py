@@ -53,7 +53,7 @@ class Scene:
 
     def make_recorder(self) -> Recorder:
         """A recorder, with what it finds."""
-        shelf = Shelf(self.folder, disk=self.disk, seconds=None)
+        shelf = Shelf(self.folder, disk=self.disk, seconds=None, clock=lambda: 0)
         return Recorder(
             self.rules,
             shelf,
@@ -132,7 +132,7 @@ def test_before_and_after(scene: Scene) -> None:
     assert [time for name, time, _data in found if name == "/rosrv/log"] == [happened]
     kept = scene.folder / recording.id
     assert msgspec.json.decode((kept / "recording.json").read_bytes(), type=Recording) == recording
-    assert {path.name for path in kept.iterdir()} == {"recording.bag", "recording.json"}
+    assert {path.name for path in kept.iterdir()} == {"recording.bag", "recording.json", "since"}
 
 
 def test_what_is_in_memory_is_lent_and_not_kept(scene: Scene) -> None:

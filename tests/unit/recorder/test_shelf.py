@@ -1,5 +1,6 @@
 """The shelf: whole recordings only, room for the next, and those that have most of it make it."""
 
+import time
 from pathlib import Path
 
 import msgspec
@@ -41,19 +42,19 @@ def cleared(shelf: Shelf, now: int = 0, *, room: bool = False) -> list[tuple[Rec
 
 def test_what_is_kept_is_found_again(tmp_path: Path) -> None:
     """By the next recorder, in the order of time; what had only been begun is a part, what is spoilt is none."""
-    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     second, first = put(shelf, recording(2)), put(shelf, recording(1))
     shelf.part("f" * 20).mkdir()
     spoilt = tmp_path / ("e" * 20)
     spoilt.mkdir()
     (spoilt / ABOUT).write_text("{")
-    again = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    again = Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     assert again.recordings == [first, second]
     assert again.parts() == [again.part("f" * 20)]
     again.remove(first, "eve", "")
     assert not (tmp_path / first.id).exists()
     assert again.find(first.id) is None
-    again = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    again = Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     assert list(again.removed()) == [(first, "eve", "")]
     again.note(first.id)
     assert not list(again.removed())
@@ -62,16 +63,16 @@ def test_what_is_kept_is_found_again(tmp_path: Path) -> None:
 
 def test_what_the_log_has_is_told_once(tmp_path: Path) -> None:
     """Until it is noted a recording is told again."""
-    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     first, second = put(shelf, recording(1)), put(shelf, recording(2))
     shelf.note(first.id)
     shelf.note("0" * 20)
-    assert Shelf(tmp_path, disk=64 * MIB, seconds=None).unnoted() == [second]
+    assert Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns).unnoted() == [second]
 
 
 def test_who_has_most_makes_room(tmp_path: Path) -> None:
     """The oldest of the kind that has most bytes goes, so that a flood of drops takes away no other recording."""
-    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     put(shelf, recording(1, "order", 8 * MIB))
     put(shelf, recording(2, "fault", 8 * MIB))
     for number in range(3, 8):
@@ -85,19 +86,38 @@ def test_who_has_most_makes_room(tmp_path: Path) -> None:
 def test_descriptions_have_room_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Control is told of all recordings in one message, however many topics they have."""
     monkeypatch.setattr("appliance.recorder.shelf._MOST_DESCRIBED", 1000)
-    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     for number in range(1, 9):
         put(shelf, recording(number))
     cleared(shelf, room=True)
-    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None)
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     left = [(tmp_path / found.id / "recording.json").stat().st_size for found in shelf.recordings]
     assert 0 < sum(left) <= 1000
 
 
 def test_what_is_too_old_goes(tmp_path: Path) -> None:
-    """After as many seconds as are configured, counted from a recording's end."""
-    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=10)
+    """After as many seconds as are configured, counted from when it was kept, by the clock of ages."""
+    age = 1000 * SECOND
+
+    def make() -> Shelf:
+        return Shelf(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
+
+    shelf = make()
     put(shelf, recording(1))
+    age += SECOND
     put(shelf, recording(2))
-    assert not cleared(shelf, 11 * SECOND - 1)
-    assert cleared(shelf, 11 * SECOND + 1) == [(recording(1), "it is older than recorder.days")]
+    age += 9 * SECOND - 1
+    assert not cleared(make(), 5000 * SECOND)  # whatever the machine's clock says
+    age += 1
+    assert cleared(make()) == [(recording(1), "it is older than recorder.days")]
+
+
+def test_the_age_of_a_recording_of_an_earlier_version_is_that_of_its_end(tmp_path: Path) -> None:
+    """It has no file that says when it was kept; an empty one, after a power cut, says nothing either."""
+    age = 0
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
+    (tmp_path / put(shelf, recording(1)).id / "since").unlink()
+    (tmp_path / put(shelf, recording(2)).id / "since").write_bytes(b"")
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=10, clock=lambda: age)
+    for age, gone in ((11 * SECOND - 1, 0), (11 * SECOND, 1), (12 * SECOND, 1)):  # noqa: B007  the clock reads it
+        assert len(cleared(shelf)) == gone
