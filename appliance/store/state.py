@@ -55,7 +55,7 @@ LARGEST_CHANGE = 64 << 10  # bytes of one parameter that is kept at once
 
 
 class IncarnationRow(NamedTuple):
-    """One incarnation as it is kept; `changed` is seconds since the epoch.
+    """One incarnation as it is kept; `changed` is monotonic seconds, for the order only.
 
     `relay_port` is its port on the first relay process, `more_relay_ports` are those on the others.
     """
@@ -134,9 +134,9 @@ class StateStore:
         """What is saved inside outlasts the process when this has ended, by one write."""
         return self.database.together()
 
-    def close(self) -> None:
-        """Write what is left and close."""
-        self.database.close()
+    def close(self, seconds: float | None = None) -> None:
+        """Write what is left, within so many seconds (None: however long it takes), and close."""
+        self.database.close(seconds)
 
     # --- registry ---
 

@@ -126,7 +126,7 @@ class Graph:
         reason = f"[{incarnation.name}] Reason: new node registered with same name"
         other = by.host != incarnation.host
         return [
-            *self.registry.replace(incarnation, time.time()),
+            *self.registry.replace(incarnation, time.monotonic()),
             TellNode(incarnation, NodeCall("shutdown", (reason,))),
             *self._tell_withdrawn(lost),
             *self._close(incarnation),
@@ -141,7 +141,7 @@ class Graph:
     def lost(self, incarnation: Incarnation, why: str) -> Effects:
         """The node does not answer any more: what it had counts for nobody until it returns."""
         return [
-            *self.registry.overshadow(incarnation, time.time()),
+            *self.registry.overshadow(incarnation, time.monotonic()),
             *self._tell_withdrawn(incarnation.registrations.values()),
             WithdrawNode(incarnation),
             DropCalls(incarnation),
@@ -157,7 +157,7 @@ class Graph:
         for service in incarnation.resources(Kind.SERVICE):
             if self._others_offer(incarnation, service):
                 effects += self.unregistered(incarnation, Kind.SERVICE, service)
-        effects += self.registry.revive(incarnation, time.time())
+        effects += self.registry.revive(incarnation, time.monotonic())
         effects.append(PlaceNode(incarnation))
         for registration in incarnation.in_order():
             if registration.kind is Kind.PUBLICATION:

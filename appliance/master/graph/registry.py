@@ -84,7 +84,7 @@ class Incarnation:
     relay_port: int
     own: bool = False
     life: Life = Life.LIVE
-    changed: float = 0.0  # wall-clock seconds when `life` changed
+    changed: float = 0.0  # monotonic seconds when `life` changed, or of the start if that was before it
     touched: float = 0.0  # monotonic seconds of its last registering call
     registrations: dict[tuple[Kind, str], Registration] = field(default_factory=dict)
     shelf: dict[tuple[Kind, str], Registration] = field(default_factory=dict)  # what the policy took back

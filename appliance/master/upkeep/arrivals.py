@@ -74,7 +74,7 @@ class Arrivals:
             relay_port=relay_port,
             more_relay_ports=tuple(more),
             own=caller.own,
-            changed=time.time(),
+            changed=time.monotonic(),
             touched=time.monotonic(),
         )
         self.enactor.carry_out(self.registry.add(incarnation))

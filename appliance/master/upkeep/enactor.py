@@ -4,6 +4,7 @@ What the store was told of the registry comes back after a restart (`restore`).
 """
 
 import asyncio
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import assert_never
@@ -205,7 +206,7 @@ def restore(registry: Registry, store: StateStore) -> int:
             relay_port=row.relay_port,
             own=row.own,
             life=Life(row.life),
-            changed=row.changed,
+            changed=time.monotonic(),  # the row's may be of another life of the machine: only its order counts
             more_relay_ports=row.more_relay_ports,
         )
         for row in incarnations

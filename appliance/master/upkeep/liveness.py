@@ -288,7 +288,7 @@ class Liveness:
         await self._enactor.take_out(incarnation, registrations)
 
     async def _look_at_retired(self, incarnation: Incarnation, *, answered: bool, refused: bool) -> None:
-        age = time.time() - incarnation.changed
+        age = time.monotonic() - incarnation.changed
         if incarnation.life is Life.REPLACED:
             if refused or age > _REPLACED_SECONDS:
                 self._forget(incarnation)

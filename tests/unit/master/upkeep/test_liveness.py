@@ -2,6 +2,7 @@
 
 import asyncio
 import ipaddress
+import time
 from typing import Any, cast
 
 import pytest
@@ -46,6 +47,21 @@ async def test_a_service_that_nobody_took_comes_back() -> None:
     world.clients.silent = set()
     await world.look(node)
     assert world.hidden.has(Kind.SERVICE, "/s") == ["/a"]
+
+
+async def test_a_clock_that_is_set_forward_forgets_no_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node that was lost a moment ago comes back with all it had, whatever year it is by then."""
+    world = await ControlParts.begun()
+    node = world.node("/n")
+    await world.register(node, Kind.PUBLICATION, "/a")
+    world.clients.silent = {"/n"}
+    await world.look(node)
+    real = time.time
+    monkeypatch.setattr(time, "time", lambda: real() + 365 * 86_400)
+    await world.look(node)
+    world.clients.silent = set()
+    await world.look(node)
+    assert (node.life, world.hidden.has(Kind.PUBLICATION, "/a")) == (Life.LIVE, ["/n"])
 
 
 async def test_a_node_that_missed_a_list_is_told_again_when_it_answers() -> None:

@@ -1,0 +1,52 @@
+"""Spans are measured by the monotonic clock: the machine's date is set, forward and back, while a robot runs."""
+
+import ast
+from pathlib import Path
+
+REPOSITORY = Path(__file__).parents[2]
+READERS = {
+    "a moment that people are shown, or that stands in a file": [
+        "api/history.py", "audit/ids.py", "audit/log.py", "audit_trail.py", "backup/create.py", "control/policies.py",
+        "control/looks.py",
+        "control/recording_orders.py", "evidence/bundle.py", "forwarding/forwarder.py",
+        "hosts/checked_ports.py", "hosts/table.py",
+        "recorder/recorder.py", "recorder/ring.py", "relay/looks.py", "relay/monitors/middle.py",
+        "specifications/monitors.py", "supervisor/life.py", "supervisor/rings.py", "supervisor/supervisor.py",
+    ],
+    "an end that is a date: of a certificate, a token, a revocation": [
+        "api/access.py", "api/metrics.py", "api/process.py", "cli/selftest/files.py", "cli/token.py",
+        "control/tokens.py", "hosts/certification.py", "hosts/enrolment_tokens.py", "hosts/revocation_list.py",
+        "hosts/revoked_certificates.py", "hosts/tunnels.py", "hosts/view.py", "ipsec/authority.py",
+    ],
+    "a span that goes on over restarts of the machine, which has no other clock": [
+        "hosts/self_service.py", "store/revisions.py",
+    ],
+    "whether the wall clock can be believed": ["ages.py", "control/clock.py"],
+    "a moment that people ask for (`--since 1h`), or a page that is shown once": [
+        "api/moments.py", "cli/audit/filter.py", "cli/evidence.py", "cli/monitor/offline.py", "cli/monitor/recorder.py",
+        "cli/policy/learning.py", "cli/protect.py", "cli/record.py", "cli/status.py", "cli/status_view.py",
+    ],
+}  # fmt: skip
+"""The files that read the wall clock, by what for. A new one is added here by whoever can say the same of it."""
+
+_WALL = {("time", "time"), ("time", "time_ns"), ("time", "CLOCK_REALTIME")} | {
+    (of, call) for of in ("datetime", "date") for call in ("now", "utcnow", "today")
+}
+
+
+def _reads_wall_clock(path: Path) -> bool:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module == "time":
+            return True  # nobody sees which clock `time()` would be
+        if isinstance(node, ast.Attribute):
+            of = node.value.attr if isinstance(node.value, ast.Attribute) else getattr(node.value, "id", "")
+            if (of, node.attr) in _WALL:
+                return True
+    return False
+
+
+def test_only_these_files_read_the_wall_clock() -> None:
+    """What waits, expires or counts seconds elsewhere would believe a clock that was set."""
+    package = REPOSITORY / "appliance"
+    found = {str(path.relative_to(package)) for path in package.rglob("*.py") if _reads_wall_clock(path)}
+    assert found == {file for files in READERS.values() for file in files}
