@@ -68,6 +68,7 @@ _OWN, _ADMIN = "own", "admin"
 _SWITCH_SECONDS = 0.001
 _GARBAGE = 10_000  # objects more than at the last look for garbage: records that wait for the log are none
 _SAVE_SECONDS = 1.0
+_CLOSE_SECONDS = 1.2  # of the state, and of the log: in three seconds the supervisor ends who has not ended
 _WARNINGS = 100  # of the policy, that a start tells
 _RESERVED_SHARES = AUDIT_RESERVE.bounds.whole // AUDIT_RESERVE.bounds.host  # of a host, in the disk's reserve
 
@@ -327,8 +328,10 @@ class _Control:
         parts.rosmaster.close()
         base.trail.happened("appliance stopped", "control ended in an orderly way")
         base.store.save_parameters(parts.parameters.tree)
-        base.store.close()
-        self._audit.close()
+        base.store.close(_CLOSE_SECONDS)
+        unwritten = self._audit.close(_CLOSE_SECONDS)
+        if unwritten is not None:
+            _log.error("the last records of the audit log are not written", reason=unwritten)
 
     # --- what the supervisor says ---
 

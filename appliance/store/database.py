@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
+import structlog
 
 from appliance.store.ahead import Parameter, Parameters, WriteAhead
 
@@ -27,6 +28,11 @@ _ROWS = 64  # of one statement
 
 _CATCH_UP_SECONDS = 1.0
 _SETTLE_SECONDS = 5.0
+
+
+_LEFT = "changes that the file state.ahead took are made at the next start, others are lost"
+
+_log = structlog.get_logger()
 
 
 class _Queued(NamedTuple):
@@ -48,13 +54,15 @@ class Database:
     """The state file at `path`, created with `schema` when it is new.
 
     Raises `StoreError` when the file is no database or cannot be opened. `failed` hears of a write that could not
-    be done (a full disk): nothing is dropped, the write is tried again until it succeeds or the database is closed.
+    be done (a full disk), once until it can: nothing is dropped, the write is tried again until it succeeds or the
+    database is closed.
     """
 
     def __init__(self, path: Path, schema: str, *, failed: Callable[[str], None]) -> None:
         self._path = path
         self._failed = failed
         self._failing = ""
+        self._told: set[str] = set()
         try:
             self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
             self._connection.execute("PRAGMA journal_mode=WAL")
@@ -122,7 +130,7 @@ class Database:
             try:
                 self._ahead.append(ahead)
             except OSError as error:
-                self._failed(f"{self._path.with_suffix('.ahead')}: {error}")
+                self._fail(f"{self._path.with_suffix('.ahead')}: {error}")
         for statement in statements:
             self._queue.put(statement)
 
@@ -156,12 +164,15 @@ class Database:
             if self._failing:
                 raise StoreError(f"{self._failing}; make room: until then a restart undoes what was ordered")
 
-    def close(self) -> None:
-        """Write what is queued and close the file."""
+    def close(self, seconds: float | None = None) -> None:
+        """Write what is queued, within so many seconds (None: however long it takes), and close the file."""
         self._closing.set()
         self._hurry.set()
         self._queue.put(None)
-        self._thread.join()
+        self._thread.join(seconds)
+        if self._thread.is_alive():
+            self._failed(f"{self._path}: still being written after {seconds:g} s; {_LEFT}")
+            return
         self._connection.close()
         self._ahead.close()
 
@@ -191,10 +202,14 @@ class Database:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
                 self._failing = f"{self._path}: {error}"
-                self._failed(self._failing)
+                self._fail(self._failing)
                 if self._closing.wait(0.5):
+                    self._fail(f"{self._failing}; {_LEFT}")
                     return
             else:
+                if self._told:
+                    _log.warning("state is written again", file=str(self._path))
+                    self._told.clear()
                 self._failing = ""
                 self._ahead.taken(sum(statement.ahead for statement in statements))
                 return
@@ -205,7 +220,12 @@ class Database:
                 os.fsync(log.fileno())
             self._ahead.sync()  # else it could come back with what the database has had long since
         except OSError as error:
-            self._failed(f"{self._path}: {error}")
+            self._fail(f"{self._path}: {error}")
+
+    def _fail(self, reason: str) -> None:
+        if reason not in self._told:
+            self._told.add(reason)
+            self._failed(reason)
 
     def _catch_up(self) -> None:
         """Carry out what a killed process left, before anything is read."""

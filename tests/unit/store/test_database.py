@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -92,6 +93,23 @@ def test_a_write_that_fails_is_tried_again_until_it_succeeds(
     blocker.close()
     assert "locked" in failures[0]
     assert database.query("SELECT name FROM thing") == [("late",)]
+
+
+def test_what_cannot_be_written_does_not_hold_up_the_end(tmp_path: Path, failures: list[str]) -> None:
+    """While another process holds the file, closing takes as long as it may, says what is left, and loses nothing."""
+    database = Database(tmp_path / "state.db", SCHEMA, failed=failures.append)
+    database.query("SELECT 1")
+    blocker = sqlite3.connect(tmp_path / "state.db", isolation_level=None)
+    blocker.execute("BEGIN EXCLUSIVE")
+    database.submit("INSERT INTO thing VALUES ('late', 1)")
+    began = time.monotonic()
+    database.close(0.1)
+    assert time.monotonic() - began < 3  # that of SQLite's own patience is five
+    assert "made at the next start" in failures[-1]
+    blocker.close()
+    again = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    assert again.query("SELECT name FROM thing") == [("late",)]
+    again.close()
 
 
 def test_who_waits_is_told_that_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
