@@ -16,6 +16,12 @@ def write_whole(path: Path, data: bytes, mode: int) -> None:
             file.flush()
             os.fsync(descriptor)
     except OSError as error:  # a full disk: the system does not say of which file
+        making.unlink()
         error.filename = str(path)
         raise
     making.rename(path)
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(folder)  # else the file before could come back with the power
+    finally:
+        os.close(folder)

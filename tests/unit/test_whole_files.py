@@ -35,6 +35,21 @@ def test_what_cannot_be_written_leaves_the_file_before(tmp_path: Path) -> None:
     assert path.read_text() == "before"
 
 
+def test_it_outlasts_the_machines_power(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is in the file is on the disk before it has its name, and the name before it is said to be written."""
+    synced: list[tuple[str, list[str]]] = []
+    fsync = os.fsync
+
+    def noted(descriptor: int) -> None:
+        fsync(descriptor)
+        there = sorted(path.name for path in tmp_path.iterdir())
+        synced.append((Path(f"/proc/self/fd/{descriptor}").readlink().name, there))
+
+    monkeypatch.setattr(os, "fsync", noted)
+    write_whole(tmp_path / "key.pem", b"key", 0o600)
+    assert synced == [("key.pem.new", ["key.pem.new"]), (tmp_path.name, ["key.pem"])]
+
+
 def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:
     """The system says only that there is no space: who reads it learns where to make room."""
     need_root()
@@ -42,5 +57,6 @@ def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:
     try:
         with pytest.raises(OSError, match=r"No space left.*audit\.pub"):
             write_whole(tmp_path / "audit.pub", bytes(8192), 0o644)
+        assert not list(tmp_path.iterdir())  # what was begun takes no room
     finally:
         subprocess.run(["umount", "--lazy", tmp_path], check=True)
