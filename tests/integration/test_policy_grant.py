@@ -1,6 +1,8 @@
 """A refusal of the running appliance is granted: by its record, on the command line and over REST."""
 
+import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 from xmlrpc.client import ServerProxy
 
 import pytest
@@ -47,6 +49,26 @@ def refused(appliance: Appliance, method: str, *arguments: object) -> str:
     record = str(text).rpartition("[")[2].rstrip("]")
     appliance.recorded("--event", "decision", id=record)
     return record
+
+
+def test_a_full_disk_leaves_the_policy_as_it_was(appliance: Appliance, tmp_path: Path) -> None:
+    """`--write` to the file in force: without room for it the file is whole, says so, and is itself."""
+    record = refused(appliance, "registerPublisher", "/base", "/cmd_vel", "std_msgs/String", HERE)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8k", "rosrv-grant-test", tmp_path], check=True)
+    try:
+        policy = tmp_path / "policy.ini"
+        policy.write_text(POLICY)
+        policy.chmod(0o640)
+        (tmp_path / "filler").write_bytes(bytes(4096))
+        done = appliance.rosrv("policy", "grant", record, "--write", str(policy), check=False)
+        assert (done.returncode, "No space left" in done.stderr) == (2, True), done.stderr
+        assert policy.read_text() == POLICY
+        (tmp_path / "filler").unlink()
+        appliance.rosrv("policy", "grant", record, "--write", str(policy))
+        assert "/cmd_vel = ocu robot" in policy.read_text()
+        assert policy.stat().st_mode & 0o777 == 0o640
+    finally:
+        subprocess.run(["umount", "--lazy", tmp_path], check=True)
 
 
 def test_what_was_refused_is_granted_on_trial(appliance: Appliance) -> None:

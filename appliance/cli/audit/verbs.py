@@ -7,7 +7,8 @@ copy; with `--api` they read the running appliance's log over REST.
 import json
 import sys
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -224,7 +225,7 @@ def export(
         if output is None:
             count = _write_all(entries, told, sys.stdout)
         else:
-            with output.open("x", encoding="ascii") as file:
+            with output.open("x", encoding="ascii") as file, _or_nothing(output):
                 count = _write_all(entries, told, file)
     if output is not None:
         tell(f"{count} records in {output}")
@@ -235,6 +236,16 @@ def _print_lines(entries: list[Entry], as_json_lines: bool, *, ocsf: bool) -> No
     for entry in entries:
         write(formatted(entry))
     sys.stdout.flush()
+
+
+@contextmanager
+def _or_nothing(output: Path) -> Iterator[None]:
+    """A file that is not whole is none."""
+    try:
+        yield
+    except BaseException:
+        output.unlink()
+        raise
 
 
 def _write_all(lines: Iterable[tuple[int, str]], told: Callable[[int], None], file: TextIO) -> int:

@@ -1,5 +1,7 @@
 """`rosrv policy grant`: what would grant a request that was refused, as the smallest change of the policy in force."""
 
+import os
+import stat
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -15,6 +17,7 @@ from appliance.cli.output import printable, say, say_json, usage_error
 from appliance.cli.policy.in_force import say_loaded
 from appliance.cli.target import Appliance, speaks
 from appliance.cli.trials import ConfirmWithin, seconds_within
+from appliance.whole_files import write_whole
 
 
 @speaks
@@ -85,7 +88,11 @@ def grant(
         raise typer.Exit(1)
     if write is not None:
         try:
-            write.write_text(found.text, encoding="utf-8")
+            there = write.stat() if write.exists() else None
+            place = write.resolve()
+            write_whole(place, found.text.encode(), 0o644 if there is None else stat.S_IMODE(there.st_mode))
+            if there is not None:
+                os.chown(place, there.st_uid, there.st_gid)
         except OSError as error:
             raise usage_error(f"cannot write {write}: {error.strerror}") from None
     if load:

@@ -16,6 +16,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log import AuditLog
 from tests.support.audit import decision, settle
+from tests.support.requirements import need_root
 
 _EVIL = "/evil\x1b[31m\u202e\r\n[bold]x[/bold]"
 _LIMIT_SECONDS = 60
@@ -163,6 +164,20 @@ def test_export(state: Path, tmp_path: Path) -> None:
     again = rosrv("export", "--output", str(target), state=state)
     assert again.returncode == 2
     assert str(target) in again.stderr
+
+
+def test_an_export_that_does_not_fit_leaves_no_file(state: Path, tmp_path: Path) -> None:
+    """A part of it would look like all there was, and stand in the way of the next."""
+    need_root()
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4k", "rosrv-export-test", disk], check=True)
+    try:
+        done = rosrv("export", "--output", str(disk / "out.ndjson"), state=state)
+        assert (done.returncode != 0, "No space left" in done.stderr) == (True, True), done.stderr
+        assert not list(disk.iterdir())
+    finally:
+        subprocess.run(["umount", "--lazy", disk], check=True)
 
 
 def test_verify(state: Path) -> None:
