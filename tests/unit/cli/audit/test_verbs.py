@@ -16,6 +16,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log import AuditLog
 from tests.support.audit import decision, settle
+from tests.support.command import rosrv as run
 from tests.support.requirements import need_root
 
 _EVIL = "/evil\x1b[31m\u202e\r\n[bold]x[/bold]"
@@ -39,14 +40,8 @@ def state(tmp_path: Path) -> Path:
 
 
 def rosrv(*arguments: str, state: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """Run `rosrv audit` with its output in a pipe."""
-    environment = {name: value for name, value in os.environ.items() if name != "ROSRV_STATE"}
-    if state is not None:
-        environment["ROSRV_STATE"] = str(state)
-    return subprocess.run(
-        [sys.executable, "-m", "appliance.cli.main", "audit", *arguments],
-        capture_output=True, text=True, env=environment, timeout=_LIMIT_SECONDS, check=False,
-    )  # fmt: skip
+    """What `rosrv audit` says."""
+    return run("audit", *arguments, **({} if state is None else {"ROSRV_STATE": str(state)}))
 
 
 def lines(done: subprocess.CompletedProcess[str]) -> list[dict[str, object]]:
