@@ -1,4 +1,7 @@
-"""What is learnt from drives of the simulated LandShark is judged by other drives and by faults put into them."""
+"""What is learnt from drives of the simulated LandShark is judged by other drives and by faults put into them.
+
+It computes for a quarter of a minute, and so is not in `make test`, where tests/unit/learning says what is learnt.
+"""
 
 from benchmarks.learning import KINDS, judge
 
