@@ -81,7 +81,9 @@ class Specifications:
         tick = random.choice(("", "", "", "event tick() every 2ms { total = 0; }"))
         return (
             f"s{number}() {{ int total = 0; double level = 1.5; bool seen = false; std::string last;\n"
-            f"std::vector<int> all; {helper}\n" + "\n".join([*events, tick, *properties]) + "\n}"
+            f"std::vector<int> all; std::vector<double> window; double slots[3] = {{1}}; {helper}\n"
+            + "\n".join([*events, tick, *properties])
+            + "\n}"
         )
 
     def _event(self, index: int) -> str:
@@ -157,6 +159,18 @@ class Specifications:
         ]  # fmt: skip
         choices += [f'for (int i = 0; i < {name}.size(); i++) {{ if ({name}[i] == "nnnn") {{ total += i; }} }}'
                     for name, (_, kind) in names.items() if kind == "std::string[]"]  # fmt: skip
+        choices += random.sample(
+            (
+                "window.push_back(level); if (window.size() > 3) { window.erase(window.begin()); }",
+                "for (double each : window) { level += each; }", f"slots[total % 3] = {value};", "level = slots[1];",
+                f"if (window.size() > 1) {{ window[1] += {value}; window.pop_back(); }}",
+                "window.insert(window.begin(), level); all.resize(3); all.back()++;",
+                "window.clear(); total += all.size();",
+                "{ std::vector<double> other = window; other.push_back(level); window = other; level = other[0]; }",
+                *(f"window = {name};" for name, (_, kind) in names.items() if kind == "std::vector<double>"),
+            ),
+            2,
+        )  # fmt: skip
         for name in (name for name, (_, kind) in names.items() if kind.endswith(("g>", "e>", "t[]"))):
             choices += [f"for (double each : {name}) {{ level += each; }}", f"total += {name}.size();",
                         f"if (!{name}.empty()) {{ level = {name}[0]; }}", f"level = {name}[total];",
@@ -170,7 +184,7 @@ class Specifications:
         if depth < 2:
             choices += ["return;", "DROP;"] * 2
         if depth < 2 and random.random() < 0.3:
-            choices += ['ROS_WARN("said %d", total);', "all.push_back(total);",
+            choices += ['ROS_WARN("said %d", total);', "std::sort(all.begin(), all.end());",
                         "for (int i = 0; i < 3; i++) { total += i; }"]  # fmt: skip
             choices += [f'{name} = "other";' for name in texts]
         return random.choice(choices)

@@ -5,6 +5,7 @@ more than the width, conversions out of range, division by zero.
 """
 
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
@@ -27,8 +28,10 @@ FUNCTIONS = """
 int ii(double d) { return d > 2e9 ? 5 : d < -2e9 ? -5 : d != d ? 0 : (int) d; }
 unsigned int uu(double d) { return d > 4e9 || !(d > 0) ? 9u : (unsigned int) d; }
 """
+VECTORS = "std::vector<long> v = {1, 2, 3}; std::vector<long> w; long f[4] = {5, 6}; long total = 0;\n"
 HEADERS = (
-    "#include <algorithm>\n#include <cmath>\n#include <cstdint>\n#include <cstdio>\nusing std::printf;\n"
+    "#include <algorithm>\n#include <cmath>\n#include <cstdint>\n#include <cstdio>\n#include <vector>\n"
+    "using std::printf;\n"
 )
 
 
@@ -66,6 +69,45 @@ def program(random: Random) -> str:
         operator = random.choice(("=", "+=", "-=", "*="))
         lines.append(f"{name} {operator} {value if exact else f'ii({value})'};")
         lines.append(f'printf("%.9g\\n", (double) {name});')
+    return "\n".join(lines)
+
+
+def vector_program(random: Random) -> str:
+    """Changes of two vectors that are kept, of copies of them, and of an array, and what is in them after each."""
+    lines = []
+    for _ in range(80):
+        a, b = random.sample(("v", "w"), 2)
+        k, x = random.randrange(12), random.randrange(-99, 99)
+        lines.append(
+            random.choice(
+                (
+                    f"{a}.push_back({x});",
+                    f"{a}.push_back(total);",
+                    f"if (!{a}.empty()) {{ {a}.pop_back(); }}",
+                    f"if (!{a}.empty()) {{ {a}[{k} % {a}.size()] = {x}; {a}.back() += {a}.front(); }}",
+                    f"{a}.insert({a}.begin() + {k} % ({a}.size() + 1), {x});",
+                    f"{a}.insert({a}.end(), {x});",
+                    f"if (!{a}.empty()) {{ {a}.erase({a}.begin() + {k} % {a}.size()); }}",
+                    f"{a}.erase({a}.begin() + {a}.size() / 2, {a}.end());",
+                    f"{a}.resize({k});",
+                    f"{a} = {b};",
+                    f"{a} = {{{x}, total, {k}}};",
+                    f"{a}.clear();",
+                    f"f[{k % 4}] += {x} + f[{k % 3}];",
+                    f"for (auto& one : {a}) {{ one += {x}; }}",
+                    f"for (int i = 0; i < {a}.size(); i++) {{ {a}[i] *= i; }}",
+                    f"{{ std::vector<long> t = {a}; t.push_back({x}); {a} = {b}; {b} = t; t[0] = {k}; }}",
+                    f"{{ std::vector<long> t({k}); std::vector<long> u({k}, {x}); t = u; t.insert(t.begin(), 7);"
+                    f" {a} = t; }}",
+                    f"if ({a}.size() > 4) {{ {a}.erase({a}.begin()); }}",
+                )
+            )
+        )
+        lines.append(f"for (auto one : {a}) {{ total = total * 3 + one; }}")
+        lines += [
+            f'printf("%.9g\\n", (double) ({value}));'
+            for value in ("total", "v.size() * 100 + w.size()", "f[0] + f[1] * 3 + f[2] * 5 + f[3] * 7")
+        ]
     return "\n".join(lines)
 
 
@@ -109,7 +151,7 @@ def test_functions_on_floats_are_the_compilers(tmp_path: Path) -> None:
     ).split()
 
 
-def in_module(body: str) -> list[str]:
+def in_module(body: str, before: str = FUNCTIONS) -> list[str]:
     """What a program prints if it keeps its values in variables and the module takes the message."""
     begins = 'printf("%.9g\\n", '
     lines: list[str] = []
@@ -121,7 +163,7 @@ def in_module(body: str) -> list[str]:
         else:
             lines.append(line)
     variables = " ".join(f"double {name} = 0;" for name in names)
-    text = "\n".join((f"s() {{ {variables} {FUNCTIONS} event e() /t std_msgs/Int32 '{{}}' {{", *lines, "} }"))
+    text = "\n".join((f"s() {{ {variables} {before} event e() /t std_msgs/Int32 '{{}}' {{", *lines, "} }"))
     monitors = load(text)
     monitors.write_module()
     monitors.monitor("s").seen = True
@@ -131,18 +173,27 @@ def in_module(body: str) -> list[str]:
     return [f"{monitors.value('s', name):.9g}" for name in names]
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_the_language_agrees_with_a_compiler(seed: int, tmp_path: Path) -> None:
-    """A hundred values of each random program are the compiler's: by engine, interpreter and module."""
+def printed(body: str, before: str, directory: Path) -> list[str]:
+    """What a program puts out that the compiler has made."""
     compiler = need_program("g++", "g++")
-    body = program(Random(seed))  # noqa: S311  draws examples, not keys
-    source = tmp_path / "program.cpp"
-    source.write_text(f"{HEADERS}{FUNCTIONS}int main() {{\n{body}\n}}\n")
-    subprocess.run(
-        [compiler, "-w", "-fwrapv", "-O0", "-o", str(tmp_path / "program"), str(source)], check=True
-    )
-    expected = subprocess.run([str(tmp_path / "program")], check=True, capture_output=True, text=True).stdout
-    outcome = act(body, before=FUNCTIONS)
+    source, program = directory / "program.cpp", str(directory / "program")
+    source.write_text(f"{HEADERS}{before}int main() {{\n{body}\n}}\n")
+    subprocess.run([compiler, "-w", "-fwrapv", "-O0", "-o", program, str(source)], check=True)
+    return subprocess.run([program], check=True, capture_output=True, text=True).stdout.split()
+
+
+@pytest.mark.parametrize(
+    "make", [(program, FUNCTIONS), (vector_program, VECTORS)], ids=["numbers", "vectors"]
+)
+@pytest.mark.parametrize("seed", range(6))
+def test_the_language_agrees_with_a_compiler(
+    seed: int, make: tuple[Callable[[Random], str], str], tmp_path: Path
+) -> None:
+    """More than a hundred values of each random program are the compiler's: by engine, interpreter and module."""
+    write, before = make
+    body = write(Random(seed))  # noqa: S311  draws examples, not keys
+    expected = [line.replace("-nan", "nan") for line in printed(body, before, tmp_path)]
+    outcome = act(body, before=before)
     assert not outcome.faults
-    assert [line.text for line in outcome.log] == expected.replace("-nan", "nan").split()
-    assert in_module(body) == expected.replace("-nan", "nan").split()
+    assert [line.text for line in outcome.log] == expected
+    assert in_module(body, before) == expected
