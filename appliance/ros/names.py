@@ -127,7 +127,7 @@ def _refusal(name: str, grammar: re.Pattern[str]) -> str:
     for position, character in enumerate(name):
         if character != "~" and grammar.match(f"/a{character}a") is None:
             allowed = (
-                "printable ASCII without quotes, '*', '?' and '\\'"
+                "printable ASCII without quotes, '*', '?' and '\\'; such a member is read and set with its namespace"
                 if grammar is _PARAMETER
                 else "letters, digits, '_', '/'"
             )

@@ -1,5 +1,6 @@
 """A refusal of the running appliance is granted: by its record, on the command line and over REST."""
 
+import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -71,7 +72,7 @@ def test_a_full_disk_leaves_the_policy_as_it_was(appliance: Appliance, tmp_path:
         subprocess.run(["umount", "--lazy", tmp_path], check=True)
 
 
-def test_what_was_refused_is_granted_on_trial(appliance: Appliance) -> None:
+def test_what_was_refused_is_granted_on_trial(appliance: Appliance, tmp_path: Path) -> None:
     """Shown as a diff, over REST alike; loaded with the time limit of any change; the node gets it without more ado."""
     call = ("registerPublisher", "/base", "/cmd_vel", "std_msgs/String", HERE)
     record = refused(appliance, *call)
@@ -84,6 +85,11 @@ def test_what_was_refused_is_granted_on_trial(appliance: Appliance) -> None:
     assert why[-1] == "would be allowed by: /cmd_vel = ocu robot"
     assert any(line.startswith("rule: [Publishers] /cmd*") for line in why)
     assert appliance.rest().get(f"/v1/audit/{record}/why").json["lines"] == why
+    new, dos = tmp_path / "new.ini", tmp_path / "dos.ini"
+    dos.write_bytes(b"[Groups]\r\n")
+    for file, ends in ((new, b"\n"), (dos, b"\r\n")):  # whose lines go on ending as they did
+        appliance.rosrv("policy", "grant", record, "--write", str(file))
+        assert set(re.findall(rb"\r?\n", file.read_bytes())) == {ends}
     done = appliance.rosrv("policy", "grant", record, "--load", "--confirm-within", "5m")
     assert "unless you say: rosrv policy confirm" in done.stdout
     with ServerProxy(appliance.master_uri) as master:

@@ -90,7 +90,11 @@ def grant(
         try:
             there = write.stat() if write.exists() else None
             place = write.resolve()
-            write_whole(place, found.text.encode(), 0o644 if there is None else stat.S_IMODE(there.st_mode))
+            write_whole(
+                place,
+                _with_ends_of(place, found.text),
+                0o644 if there is None else stat.S_IMODE(there.st_mode),
+            )
             if there is not None:
                 os.chown(place, there.st_uid, there.st_gid)
         except OSError as error:
@@ -102,6 +106,12 @@ def grant(
             say_json(body)
         else:
             say_loaded(body)
+
+
+def _with_ends_of(file: Path, text: str) -> bytes:
+    """The text with lines that end as those of the file that is there; what is in force has none but LF."""
+    ends = b"\r\n" if file.exists() and b"\r\n" in file.read_bytes() else b"\n"
+    return text.encode().replace(b"\n", ends)
 
 
 def _show(found: Granted) -> None:

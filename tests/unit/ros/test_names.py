@@ -232,6 +232,13 @@ def test_parameters_that_could_mislead_are_refused(name: str) -> None:
         names.resolve_parameter(name, "/talker")
 
 
+def test_a_member_that_no_key_names_is_had_with_its_namespace() -> None:
+    """A dictionary may have any members, and the refusal of the key of such a one says how it is read and set."""
+    assert names.is_relative_member("\u00fc")
+    with pytest.raises(InvalidNameError, match="such a member is read and set with its namespace"):
+        names.resolve_parameter("/ns/\u00fc", "/talker")
+
+
 @pytest.mark.parametrize("caller_id", ["/a", "/a/b", "/rostopic_4_1699999999999", "/_a", "/1"])
 def test_caller_id_is_returned_unchanged(caller_id: str) -> None:
     """A canonical global name is a caller_id."""
