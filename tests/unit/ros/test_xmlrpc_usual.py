@@ -102,14 +102,71 @@ def test_a_multicall_of_roslaunch_is_usual_however_long(value: Value) -> None:
             parse_call(body, limits)
 
 
-def test_a_part_that_is_not_plain_leaves_the_multicall_to_the_walk() -> None:
-    """A struct is none of the pattern's, nor is a value that is longer than one pattern may take at once."""
-    values: list[Value] = [{"a": 1}, "x" * 40_000, [[[1]]]]
-    for value in values:
-        several = parts(["/a", "/b", 1], ["/a", "/c", value])
-        body = dumped(several, "system.multicall")
-        assert usual_call(body, Limits()) is None
-        assert parse_call(body).params == tuple(several)
+@pytest.mark.parametrize(
+    "value", [{"a": {"b": [1, {}]}}, "x" * 40_000, [[[1]]], "<robot/>\n", "<struct>", "]]>", {}], ids=repr
+)
+def test_a_part_that_is_not_plain_is_left_to_the_walk_alone(value: Value) -> None:
+    """A struct is none of the pattern's, nor is a text with a mark-up, nor what is longer than one pattern may take."""
+    several = parts(["/a", "/b", 1], ["/a", "/c", value], ["/a", "/d", 2])
+    body = dumped(several, "system.multicall")
+    assert usual_call(body, Limits()) == ("system.multicall", several)
+    for depth in range(1, 8):
+        read = usual_call(body, Limits(depth=depth))
+        assert read is None or read == walked(body, "methodCall", Limits(depth=depth))
+
+
+def test_two_values_are_not_taken_for_one_struct() -> None:
+    """What balances by the tags in comments only, and goes out of its array, is refused as the walk refuses it."""
+    first, second = (b"<value><struct><!--<%bstruct>--></struct></value>" % slash for slash in (b"", b"/"))
+    within = first + b"</param><param>" + second
+    body = dumped(parts(["/a"]), "system.multicall")
+    body = body.replace(b"<data>\n<value>", b"<data>\n" + within + b"<value>", 1)
+    assert within in body
+    assert usual_call(body, Limits()) is None
+    assert walked(body, "methodCall", Limits()) is None
+
+
+def test_few_parts_are_walked_alone() -> None:
+    """Where most are, one walk takes less time."""
+    params: list[Value] = ["/a", "/b", {}]
+    several = parts(*[params] * 256)
+    body = dumped(several, "system.multicall")
+    assert usual_call(body, Limits()) is None
+    assert parse_call(body).params == tuple(several)
+
+
+PIECES = [
+    b"<struct>",
+    b"</struct>",
+    b"</value>",
+    b"<!--",
+    b"-->",
+    b"<![CDATA[",
+    b"]]>",
+    b"</param><param>",
+    b"<value>1</value>",
+]
+
+
+@given(data=st.data())
+@settings(max_examples=examples(1000))
+def test_no_struct_hides_what_is_around_it(data: st.DataObject) -> None:
+    """Tags, comments and sections that begin in one part and end in another: as the walk has it, or left to it."""
+    given: list[list[Value]] = [
+        ["/a", "/b", 1],
+        ["/a", "/c", {"d": {"e": 1}}],
+        ["/a", "/f", "<&"],
+        ["/a", "/g", 2],
+    ]
+    body = dumped(
+        parts(*data.draw(st.lists(st.sampled_from(given), min_size=1, max_size=4))), "system.multicall"
+    )
+    places = [at for at in range(len(body)) if body[at : at + 1] in b"<>"]
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.sampled_from(places)) + data.draw(st.integers(0, 1))
+        body = body[:at] + data.draw(st.sampled_from(PIECES)) + body[at:]
+    call = usual_call(body, Limits())
+    assert call is None or call == walked(body, "methodCall", Limits())
 
 
 @pytest.mark.parametrize("piece", [b" ", b"\n", b"<value>a</value>", b"<value>a</value> \n", b"1"])
