@@ -88,9 +88,8 @@ class _Walk:
         self._waiting = 0  # records that lead to the next line, and to a checkpoint only with it
         self._records = self._proven = self._left_out = 0
         self._first = self._last = 0
-        self._expected: tuple[int, bytes] | None = (
-            None  # the next line's sequence, and the hash it must follow
-        )
+        # The next line's sequence, and the hash it must follow
+        self._expected: tuple[int, bytes] | None = None
 
     def run(self, lines: Iterator[_Line]) -> ExportVerification:
         """Check every line."""

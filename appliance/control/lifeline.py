@@ -47,9 +47,8 @@ class ControlLifeline:
         self.surroundings = Surroundings()
         self.sockets: dict[str, socket.socket] = {}
         self.restored = asyncio.Event()
-        self.announced = (
-            False  # whether whoever started the appliance knew what `Ready` said before this life
-        )
+        # Whether whoever started the appliance knew what `Ready` said before this life
+        self.announced = False
         self._routes: dict[str, list[asyncio.Future[str | None]]] = {}  # what is asked and not answered
         self._free_questions = asyncio.Semaphore(ROUTES_AT_ONCE)
         self._endpoints: list[asyncio.Future[messages.EndpointFound]] = []

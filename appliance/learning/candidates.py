@@ -117,9 +117,8 @@ class Knowledge:
         yield from proposer.of_orders()
 
 
-_Place = tuple[
-    str, int | None, int | None, Series
-]  # path, element and length of an array, and what is known of it
+# Path, element and length of an array, and what is known of it
+_Place = tuple[str, int | None, int | None, Series]
 
 
 class _Proposer:

@@ -65,9 +65,8 @@ class ProbeResult:
     port: int
     uid: int
     attempts: tuple[Attempt, ...]
-    listening: tuple[
-        str, ...
-    ]  # addresses on which someone listens on the port: without any nothing is proven
+    # Addresses on which someone listens on the port: without any nothing is proven
+    listening: tuple[str, ...]
 
     @property
     def closed(self) -> bool:

@@ -155,9 +155,8 @@ class RingReader:
         place, torn = self.places.get(stream), False
         for run in self._runs(blocks, place):
             at = done = run.begins if run.broken else 0 if place is None else place.offset
-            in_doubt = (
-                run.broken
-            )  # until the first record says whether what is missing is of the time asked for
+            # Until the first record says whether what is missing is of the time asked for
+            in_doubt = run.broken
             view = memoryview(bytes(run.data))
             while at + _LENGTH.size <= len(view):
                 if _LENGTH.unpack_from(view, at)[0] == PAD:

@@ -21,9 +21,8 @@ READ = select.EPOLLIN
 WRITE = select.EPOLLOUT
 HANGUP = select.EPOLLRDHUP
 
-_EVENTS_PER_TURN = (
-    64  # Python takes memory for so many each time: for more of them not from where that is quick
-)
+# Python takes memory for so many each time: for more of them not from where that is quick
+_EVENTS_PER_TURN = 64
 _LONGEST_WAIT = 3600.0
 
 Handler = Callable[[int], None]

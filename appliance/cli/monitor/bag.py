@@ -127,9 +127,8 @@ class Recorded:
                     yield connection.topic, time_ns, data
 
 
-_Header = tuple[
-    str, str, str, str, str | None, int | None
-]  # topic, type, definition, md5sum, caller, latching
+# Topic, type, definition, md5sum, caller, latching
+_Header = tuple[str, str, str, str, str | None, int | None]
 
 
 class Recording:

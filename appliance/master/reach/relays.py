@@ -128,9 +128,8 @@ class RelayControl:
         post = self._posts[index]
         self.carried.lost(index)
         post.attach(channel)
-        post.send(
-            self.monitors().statement(index)
-        )  # before anything is placed: nothing goes past the monitors
+        # Before anything is placed: nothing goes past the monitors
+        post.send(self.monitors().statement(index))
         if self.own_header is not None:
             post.send(self.own_header)
         with post.restating():
