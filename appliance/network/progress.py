@@ -16,11 +16,8 @@ STILL_SECONDS = 20.0
 LONGEST_SECONDS = 600.0  # also of what runs in a circle
 _LOOK_SECONDS = 0.5
 _SAY_SECONDS = 10.0
-_STATE, _MAJOR_FAULTS, _TIMES = (
-    0,
-    9,
-    slice(11, 13),
-)  # in /proc/PID/stat, behind the name: see proc_pid_stat(5)
+# In /proc/PID/stat, behind the name: see proc_pid_stat(5).
+_STATE, _MAJOR_FAULTS, _TIMES = 0, 9, slice(11, 13)
 
 Start = Callable[..., "subprocess.Popen[str]"]
 

@@ -154,19 +154,10 @@ class Recording:
 
     def relay(self, connection: Connection, time_ns: int, data: bytes) -> None:
         """Write a message of a recorded publisher."""
-        caller, latching = (
-            getattr(connection.ext, "callerid", None),
-            getattr(connection.ext, "latching", None),
-        )
-        header = (
-            connection.topic,
-            connection.msgtype,
-            connection.msgdef.data,
-            connection.digest,
-            caller,
-            latching,
-        )
-        self._write(header, time_ns, data)
+        caller = getattr(connection.ext, "callerid", None)
+        latching = getattr(connection.ext, "latching", None)
+        sent = connection.topic, connection.msgtype, connection.msgdef.data, connection.digest
+        self._write((*sent, caller, latching), time_ns, data)
 
     def publish(self, outcome: Outcome) -> None:
         """Write what monitors published."""

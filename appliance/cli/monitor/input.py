@@ -87,10 +87,8 @@ def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
     for path, text in texts.items():
         found = _NOT_UTF_8.search(text)
         if found is not None:
-            line, column = (
-                text.count("\n", 0, found.start()) + 1,
-                found.start() - text.rfind("\n", 0, found.start()),
-            )
+            line = text.count("\n", 0, found.start()) + 1
+            column = found.start() - text.rfind("\n", 0, found.start())
             raise SpecificationError.at(Position(path, line, column), _SAVE_AS_UTF_8)
     sent = {Path(path).name: text for path, text in texts.items()}
     return Sources(sent, definitions, signatures_of(named))

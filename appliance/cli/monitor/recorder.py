@@ -79,10 +79,8 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
     """
     found: list[tuple[Span, Recording]] = []
     for row in sorted(known.recordings, key=lambda row: row.began):
-        since, until = (
-            max(row.began, found[-1][0].until + 1 if found else span.since),
-            min(row.ended, span.until),
-        )
+        since = max(row.began, found[-1][0].until + 1 if found else span.since)
+        until = min(row.ended, span.until)
         if since <= until:
             found.append((Span(since, until), row))
     memory = time.time_ns() - int(known.before * _SECOND)
