@@ -13,7 +13,7 @@ from appliance.policy.hosts import HostTable, Network
 from appliance.policy.limits import read_limits
 from appliance.policy.lint import lint
 from appliance.policy.model import Address, Category
-from appliance.policy.policy import Policy, PolicyParts
+from appliance.policy.policy import Policy
 from appliance.policy.reader import SectionText, read
 from appliance.policy.rules import RuleCompiler
 from appliance.policy.settings import read_monitor, read_options, read_ports
@@ -54,23 +54,21 @@ def compile_policy(
     lint(compiler.tables, present, written, groups=groups, hosts=table, findings=findings)
     named = {atom for rules in compiler.tables.values() for rule in rules.rules for atom in rule.atoms}
     return Policy(
-        PolicyParts(
-            text=text,
-            file=file,
-            warnings=tuple(sorted(findings.warnings)),
-            hosts=table,
-            named=frozenset(named),
-            tables=compiler.tables,
-            present=frozenset(present),
-            ports=ports,
-            monitored_topics=monitor.topics,
-            monitored_services=monitor.services,
-            limits=limits,
-            takeover=options.takeover,
-            tell=options.tell,
-            enrolled=dict(hosts or {}),
-            robot=groups.robot,
-        )
+        text=text,
+        file=file,
+        warnings=tuple(sorted(findings.warnings)),
+        hosts=table,
+        named=frozenset(named),
+        tables=compiler.tables,
+        present=frozenset(present),
+        ports=ports,
+        monitored_topics=monitor.topics,
+        monitored_services=monitor.services,
+        limits=limits,
+        takeover=options.takeover,
+        tell=options.tell,
+        enrolled=dict(hosts or {}),
+        robot=groups.robot,
     )
 
 

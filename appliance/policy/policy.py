@@ -65,9 +65,15 @@ class RuleTable:
     audit_only: bool = False
 
 
-@dataclass(frozen=True, kw_only=True)
-class PolicyParts:
-    """What the compiler hands over; see the attributes of `Policy` of the same names."""
+@dataclass(kw_only=True, eq=False, repr=False)
+class Policy:
+    """A policy in force (or about to be); made by `compile_policy` only.
+
+    `text` and `file` are what it was compiled from; `warnings` the lint; `named` all whom a rule names; `present` the
+    categories that have a section; `ports` the ports for node proxies and relay; `monitored_topics` and
+    `monitored_services` the names in `[Monitor]`; `takeover` is `same-host` or `granted`; `enrolled` and `robot` are
+    the addresses that were given for `host:NAME` and `robot`.
+    """
 
     text: str
     file: str
@@ -84,35 +90,13 @@ class PolicyParts:
     tell: str
     enrolled: Mapping[str, Address]
     robot: tuple[Network, ...]
+    kept: dict[tuple[int, int, Category, str], Decision] = field(default_factory=dict, init=False)
+    _kept_below: dict[tuple[int, int, Category, str, bool], Decision] = field(
+        default_factory=dict, init=False
+    )
 
-
-class Policy:
-    """A policy in force (or about to be); made by `compile_policy` only.
-
-    `text` and `file` are what it was compiled from; `warnings` the lint; `ports` the ports for node proxies
-    and relay; `monitored_topics` and `monitored_services` the names in `[Monitor]`; `takeover` is `same-host`
-    or `granted`; `enrolled` and `robot` are the addresses that were given for `host:NAME` and `robot`.
-    """
-
-    def __init__(self, parts: PolicyParts) -> None:
-        self.text = parts.text
-        self.file = parts.file
-        self.warnings = parts.warnings
-        self.ports = parts.ports
-        self.monitored_topics = parts.monitored_topics
-        self.monitored_services = parts.monitored_services
-        self.takeover = parts.takeover
-        self.tell = parts.tell
-        self.enrolled = parts.enrolled
-        self.robot = parts.robot
-        self.hosts = parts.hosts
-        self._limits = parts.limits
-        self._named = parts.named
-        self._tables = parts.tables
-        self._present = parts.present
-        self.kept: dict[tuple[int, int, Category, str], Decision] = {}
-        self._kept_below: dict[tuple[int, int, Category, str, bool], Decision] = {}
-        self._any_audit_only = any(table.audit_only for table in parts.tables.values())
+    def __post_init__(self) -> None:
+        self._any_audit_only = any(table.audit_only for table in self.tables.values())
 
     def decide(self, request: Request) -> Decision:
         """Whether the rules of the request's own category let its host touch its resource.
@@ -137,7 +121,7 @@ class Policy:
         must grant the host too (an exact key `/arm` says nothing of `/arm/speed`).
         """
         decision = self.decide(request)
-        if not decision.allowed or decision.would_deny or request.category not in self._present:
+        if not decision.allowed or decision.would_deny or request.category not in self.present:
             return decision
         host = request.host
         key = (host.version, int(host), request.category, request.resource, namespace)
@@ -152,7 +136,7 @@ class Policy:
 
     def _decide_below(self, request: Request, namespace: bool) -> Decision | None:
         """The denial of the call on `request.resource` because of a key below it, if there is one."""
-        table = self._tables[request.category]
+        table = self.tables[request.category]
         atoms = self.hosts.atoms_of(request.host)
         deciding = table.tree.below(request.resource)
         if namespace:
@@ -170,15 +154,15 @@ class Policy:
     @property
     def limits_anything(self) -> bool:
         """Whether there is a limit on any topic."""
-        return bool(self._limits.rules)
+        return bool(self.limits.rules)
 
     def limit_rule(self, topic: str) -> LimitRule | None:
         """The line of `[Limits]` that speaks of a topic."""
-        return self._limits.find(topic)
+        return self.limits.find(topic)
 
     def limit(self, part: Part, topic: str, host: Address | None = None) -> Rate:
         """How much may pass for a publisher or subscriber on `host`, or for all publishers of a topic together."""
-        rule = self._limits.find(topic)
+        rule = self.limits.find(topic)
         if rule is None:
             return NO_LIMIT
         return rule.rate(part, self.hosts.atoms_of(host) if host is not None else frozenset())
@@ -193,7 +177,7 @@ class Policy:
 
         With a section in audit-only mode every address is known, because its requests pass.
         """
-        return self._any_audit_only or not self._named.isdisjoint(self.hosts.atoms_of(address))
+        return self._any_audit_only or not self.named.isdisjoint(self.hosts.atoms_of(address))
 
     def named_as(self, address: Address) -> Network:
         """By what the policy names an address: itself, or the smallest network whose every address it means as well."""
@@ -205,11 +189,11 @@ class Policy:
 
     def has_section(self, category: Category) -> bool:
         """Whether the file has the section that decides this category."""
-        return category in self._present
+        return category in self.present
 
     def audit_only(self, category: Category) -> bool:
         """Whether requests of this category pass although the rules deny them."""
-        return self._tables[category].audit_only
+        return self.tables[category].audit_only
 
     def atoms_of(self, address: Address) -> frozenset[Atom]:
         """The networks and groups of this policy that hold an address (for `explain`)."""
@@ -217,7 +201,7 @@ class Policy:
 
     def rules(self, category: Category) -> tuple[CompiledRule, ...]:
         """The rules of a category in the order of the file, `default` included."""
-        return tuple(self._tables[category].rules)
+        return tuple(self.tables[category].rules)
 
     def _decide(self, request: Request) -> Decision:
         category = request.category
@@ -228,11 +212,11 @@ class Policy:
                 return Decision(False, None, _not_a_command(name))
         elif not (is_parameter_key(name) if category in PARAMETERS else is_global_name(name)):
             return Decision(False, None, f"{quoted(name)} is not a resolved ROS name")
-        table = self._tables[category]
+        table = self.tables[category]
         found = table.tree.find(name)
         if category is Category.COMMAND and name in commands.NAMED_ONLY:
             return self._decide_named_only(request, table, found)
-        if category not in self._present:
+        if category not in self.present:
             return self._without_section(request, table)
         return self._apply(request, table, found or table.default)
 
