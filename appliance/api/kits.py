@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.channel.answers.hosts import KitParts
-from appliance.ipsec.kit import Kit, Rest
+from appliance.ipsec.kit import Kit
 from appliance.network.protect import parse_ports, parse_services, protection
 
 
@@ -29,22 +29,5 @@ class Wishes:
 
 def kit_of(body: KitParts, wishes: Wishes, key: str | None) -> Kit:
     """The kit of a host that control has enrolled; `key` None: the host has it."""
-    return Kit(
-        name=body.name,
-        address=body.address,
-        appliance=body.appliance,
-        endpoint=wishes.endpoint,
-        master=body.master,
-        certificate=body.certificate,
-        authority=body.authority,
-        key=key,
-        protect=protection(
-            [body.appliance], parse_ports(wishes.ports), parse_services(wishes.opened), tunnelled=True
-        ),
-        rest=rest_of(body),
-    )
-
-
-def rest_of(body: KitParts) -> Rest | None:
-    """Where a host in its tunnel renews its certificate; None: it cannot."""
-    return Rest(body.rest_url, body.pin) if body.rest_url and body.pin else None
+    ports, opened = parse_ports(wishes.ports), parse_services(wishes.opened)
+    return Kit(body, wishes.endpoint, protection([body.appliance], ports, opened, tunnelled=True), key)

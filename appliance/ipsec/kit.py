@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from string import Template
 
+from appliance.channel.answers.hosts import KitParts
 from appliance.channel.messages import APPLIANCE_NAME
 from appliance.ipsec.strongswan import CHILD, ESP_PROPOSALS, IKE_PROPOSALS
 
@@ -20,45 +21,34 @@ _SCRIPTS = ("join.sh", "leave.sh", "keep.sh", "renew.sh", "README")
 
 
 @dataclass(frozen=True)
-class Rest:
-    """Where the host renews its certificate through the tunnel: URL, and the pin of that server's key."""
-
-    url: str
-    pin: str
-
-
-@dataclass(frozen=True)
 class Kit:
-    """The parts of a kit; `key` is None where the host has made its own. `protect` is an nftables file.
+    """The parts of a kit: what control has of the `host`, and what is its own.
 
-    `rest` is None where the appliance's REST cannot be reached through the tunnel.
+    `endpoint` is the address or name at which the host reaches the appliance, `protect` an nftables file; `key` is None
+    where the host has made its own.
     """
 
-    name: str
-    address: str
-    appliance: str  # the appliance's address in the tunnel
-    endpoint: str  # the address or name at which the host reaches the appliance
-    master: str  # the URI of RVMaster through the tunnel
-    certificate: str
-    authority: str
-    key: str | None
+    host: KitParts
+    endpoint: str
     protect: str
-    rest: Rest | None = None
+    key: str | None
 
 
 def members(kit: Kit) -> list[tuple[str, str, int]]:
     """The files of a kit: path, text, mode."""
+    host = kit.host
     found = [
         ("swanctl/swanctl.conf", swanctl_conf(kit), 0o644),
-        ("swanctl/x509ca/rosrv-ca.pem", kit.authority, 0o644),
-        ("swanctl/x509/rosrv.pem", kit.certificate, 0o644),
+        ("swanctl/x509ca/rosrv-ca.pem", host.authority, 0o644),
+        ("swanctl/x509/rosrv.pem", host.certificate, 0o644),
         ("protect.nft", kit.protect, 0o644),
     ]
     if kit.key is not None:
         found.append(("swanctl/private/rosrv.key", kit.key, 0o600))
-    values = {"name": kit.name, "address": kit.address, "appliance": kit.appliance, "master": kit.master}
+    values = {"name": host.name, "address": host.address, "appliance": host.appliance, "master": host.master}
     values |= {"endpoint": kit.endpoint, "connection": CONNECTION, "child": CHILD}
-    values |= {"rest": kit.rest.url if kit.rest else "", "pin": kit.rest.pin if kit.rest else ""}
+    renews = bool(host.rest_url and host.pin)
+    values |= {"rest": host.rest_url if renews else "", "pin": host.pin if renews else ""}
     values |= {"ike": ", ".join(IKE_PROPOSALS), "esp": ", ".join(ESP_PROPOSALS)}
     for script in _SCRIPTS:
         found.append((script, filled(script, values), 0o644 if script == "README" else 0o755))
@@ -77,7 +67,7 @@ def archive(kit: Kit) -> bytes:
     with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
         for path, content, mode in members(kit):
             data = content.encode()
-            entry = tarfile.TarInfo(f"rosrv-{kit.name}/{path}")
+            entry = tarfile.TarInfo(f"rosrv-{kit.host.name}/{path}")
             entry.size, entry.mode = len(data), mode
             tar.addfile(entry, io.BytesIO(data))
     return buffer.getvalue()
@@ -86,7 +76,7 @@ def archive(kit: Kit) -> bytes:
 def swanctl_conf(kit: Kit) -> str:
     """The host's tunnel as swanctl reads it."""
     return f"""\
-# The tunnel of {kit.name} to the ROSRV appliance. Made by `rosrv host add`.
+# The tunnel of {kit.host.name} to the ROSRV appliance. Made by `rosrv host add`.
 connections {{
   {CONNECTION} {{
     version = 2
@@ -101,7 +91,7 @@ connections {{
     local {{
       auth = pubkey
       certs = rosrv.pem
-      id = fqdn:{kit.name}
+      id = fqdn:{kit.host.name}
     }}
     remote {{
       auth = pubkey
@@ -111,7 +101,7 @@ connections {{
     children {{
       {CHILD} {{
         local_ts = dynamic
-        remote_ts = {kit.appliance}/32
+        remote_ts = {kit.host.appliance}/32
         esp_proposals = {", ".join(ESP_PROPOSALS)}
         start_action = start
         close_action = start

@@ -7,21 +7,33 @@ import tarfile
 from dataclasses import replace
 
 import pytest
+from msgspec import structs
 
-from appliance.ipsec.kit import Kit, Rest, archive, swanctl_conf
+from appliance.channel.answers.hosts import KitParts
+from appliance.ipsec.kit import Kit, archive, swanctl_conf
 from appliance.network.firewall.rules import PortRange
 from appliance.network.protect import protection
 
-KIT = Kit(
+HOST = KitParts(
+    revision=1,
     name="ocu-1",
     address="10.113.11.2",
     appliance="10.113.11.1",
-    endpoint="192.168.1.20",
     master="http://10.113.11.1:11311",
+    rest_url="",
+    rest_trouble="REST is off",
+    pin="",
+    warning=None,
+    serial="1a",
+    expires=0.0,
     certificate="CERTIFICATE\n",
     authority="AUTHORITY\n",
-    key="KEY\n",
-    protect=protection(["10.113.11.1"], PortRange(32768, 60999), (), tunnelled=True),
+)
+KIT = Kit(
+    HOST,
+    "192.168.1.20",
+    protection(["10.113.11.1"], PortRange(32768, 60999), (), tunnelled=True),
+    "KEY\n",
 )
 
 
@@ -107,9 +119,8 @@ def test_the_script_takes_out_the_rule_that_is_never_right() -> None:
 
 def test_a_kit_says_where_its_certificate_is_renewed() -> None:
     """URL and pin of REST in the tunnel; where that cannot be reached, the script says so instead of trying."""
-    text = unpack(replace(KIT, rest=Rest("https://10.113.11.1:8443", "sha256//pin=")))[
-        "rosrv-ocu-1/renew.sh"
-    ][0]
+    host = structs.replace(HOST, rest_url="https://10.113.11.1:8443", pin="sha256//pin=")
+    text = unpack(replace(KIT, host=host))["rosrv-ocu-1/renew.sh"][0]
     assert 'rest="https://10.113.11.1:8443"' in text
     assert 'pin="sha256//pin="' in text
     without = unpack(KIT)["rosrv-ocu-1/renew.sh"][0]
