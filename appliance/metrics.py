@@ -28,132 +28,110 @@ class Metric(NamedTuple):
     """Of a histogram, in seconds."""
 
 
+def _counter(name: str, help: str, *labels: str) -> Metric:  # noqa: A002  as Prometheus's own client calls it
+    return Metric(name, "counter", labels, help)
+
+
+def _gauge(name: str, help: str, *labels: str) -> Metric:  # noqa: A002  as above
+    return Metric(name, "gauge", labels, help)
+
+
+def _histogram(name: str, help: str, *labels: str, bounds: tuple[float, ...] = BOUNDS) -> Metric:  # noqa: A002  as above
+    return Metric(name, "histogram", labels, help, bounds)
+
+
 METRICS = (
-    Metric("rosrv_info", "gauge", ("version",), "1, with the version that runs"),
-    Metric("rosrv_start_time_seconds", "gauge", (), "when RVMaster started, seconds since the epoch"),
-    Metric(
-        "rosrv_decisions_total", "counter", ("category", "outcome"), "decisions: allow, deny or would deny"
-    ),
-    Metric("rosrv_decision_seconds", "histogram", (), "from a request's arrival to its decision"),
-    Metric("rosrv_master_call_seconds", "histogram", ("call",), "from a request's arrival to its answer"),
-    Metric(
-        "rosrv_probe_failed", "gauge", (), "1 while the hidden ROS Master can be reached past the appliance"
-    ),
-    Metric("rosrv_relay_connected", "gauge", (), "1 while every relay process is there"),
-    Metric(
-        "rosrv_relay_connections", "gauge", ("kind",), "subscribers (topic) and clients (service) connected"
-    ),
-    Metric("rosrv_relay_messages_total", "counter", ("resource",), "messages relayed, by topic or service"),
-    Metric("rosrv_relay_bytes_total", "counter", ("resource",), "bytes relayed, by topic or service"),
-    Metric(
-        "rosrv_relay_dropped_total", "counter", ("resource",), "messages that slow subscribers did not get"
-    ),
-    Metric(
+    _gauge("rosrv_info", "1, with the version that runs", "version"),
+    _gauge("rosrv_start_time_seconds", "when RVMaster started, seconds since the epoch"),
+    _counter("rosrv_decisions_total", "decisions: allow, deny or would deny", "category", "outcome"),
+    _histogram("rosrv_decision_seconds", "from a request's arrival to its decision"),
+    _histogram("rosrv_master_call_seconds", "from a request's arrival to its answer", "call"),
+    _gauge("rosrv_probe_failed", "1 while the hidden ROS Master can be reached past the appliance"),
+    _gauge("rosrv_relay_connected", "1 while every relay process is there"),
+    _gauge("rosrv_relay_connections", "subscribers (topic) and clients (service) connected", "kind"),
+    _counter("rosrv_relay_messages_total", "messages relayed, by topic or service", "resource"),
+    _counter("rosrv_relay_bytes_total", "bytes relayed, by topic or service", "resource"),
+    _counter("rosrv_relay_dropped_total", "messages that slow subscribers did not get", "resource"),
+    _counter(
         "rosrv_relay_limited_total",
-        "counter",
-        ("resource", "part"),
         "messages that limits of the policy dropped: of a publisher, a subscriber, a topic",
+        "resource",
+        "part",
     ),
-    Metric(
+    _gauge(
         "rosrv_relay_memory_bytes",
-        "gauge",
-        ("what",),
         "bytes that hosts hold in the relays: frames (unfinished), queues, latched, headers",
+        "what",
     ),
-    Metric(
+    _histogram(
         "rosrv_relay_delay_seconds",
-        "histogram",
-        ("resource",),
         "messages by the delay the relay and its monitors added, by topic",
-        DELAY_BOUNDS,
+        "resource",
+        bounds=DELAY_BOUNDS,
     ),
-    Metric("rosrv_monitor_dropped_total", "counter", ("resource",), "messages that monitors dropped"),
-    Metric("rosrv_monitor_changed_total", "counter", ("resource",), "messages that monitors changed"),
-    Metric(
+    _counter("rosrv_monitor_dropped_total", "messages that monitors dropped", "resource"),
+    _counter("rosrv_monitor_changed_total", "messages that monitors changed", "resource"),
+    _counter(
         "rosrv_monitor_events_total",
-        "counter",
-        ("kind", "monitor"),
         "what monitors did: verdict, drop, change, fault, log, publish; what several changed counts for each;"
         " `trial drop`, … of those on trial",
+        "kind",
+        "monitor",
     ),
-    Metric(
+    _gauge(
         "rosrv_monitor_margin",
-        "gauge",
-        ("monitor", "place", "holds"),
         "how close a comparison of numbers at this line and column came today (UTC) while it was true, and while not",
+        "monitor",
+        "place",
+        "holds",
     ),
-    Metric("rosrv_monitor_slices", "gauge", ("monitor",), "slices that a parametric specification has now"),
-    Metric("rosrv_monitor_slice_limit", "gauge", ("monitor",), "slices that it may have at a time"),
-    Metric("rosrv_monitors", "gauge", ("state",), "monitors: enabled, trial, disabled, holding, failing"),
-    Metric("rosrv_nodes", "gauge", ("state",), "nodes: live, or lost and awaited"),
-    Metric("rosrv_registrations", "gauge", ("kind",), "registrations of live nodes"),
-    Metric("rosrv_rosmaster_reachable", "gauge", (), "1 while the real ROS Master answers"),
-    Metric("rosrv_delivery_queue", "gauge", (), "calls that wait to be made to nodes"),
-    Metric("rosrv_tunnel_up", "gauge", ("host",), "1 while the tunnel of an enrolled host stands"),
-    Metric("rosrv_tunnel_age_seconds", "gauge", ("host",), "age of the SA; 0 while there is none"),
-    Metric(
-        "rosrv_tunnel_bytes",
-        "gauge",
-        ("host", "direction"),
-        "bytes of the present SA: in (from the host), out",
-    ),
-    Metric(
+    _gauge("rosrv_monitor_slices", "slices that a parametric specification has now", "monitor"),
+    _gauge("rosrv_monitor_slice_limit", "slices that it may have at a time", "monitor"),
+    _gauge("rosrv_monitors", "monitors: enabled, trial, disabled, holding, failing", "state"),
+    _gauge("rosrv_nodes", "nodes: live, or lost and awaited", "state"),
+    _gauge("rosrv_registrations", "registrations of live nodes", "kind"),
+    _gauge("rosrv_rosmaster_reachable", "1 while the real ROS Master answers"),
+    _gauge("rosrv_delivery_queue", "calls that wait to be made to nodes"),
+    _gauge("rosrv_tunnel_up", "1 while the tunnel of an enrolled host stands", "host"),
+    _gauge("rosrv_tunnel_age_seconds", "age of the SA; 0 while there is none", "host"),
+    _gauge("rosrv_tunnel_bytes", "bytes of the present SA: in (from the host), out", "host", "direction"),
+    _gauge(
         "rosrv_host_certificate_expiry_seconds",
-        "gauge",
-        ("host",),
         "until a host's certificate ends, negative once it has",
+        "host",
     ),
-    Metric(
+    _gauge(
         "rosrv_host_ports_open",
-        "gauge",
-        ("host",),
         "1 if a check from outside found ROS ports open, 0 if closed, -1 not known",
+        "host",
     ),
-    Metric("rosrv_hosts", "gauge", ("state",), "hosts by state, as `rosrv host list` shows it"),
-    Metric("rosrv_ipsec_troubles", "gauge", (), "what `rosrv status` says is wrong with IPsec, in number"),
-    Metric("rosrv_audit_queue", "gauge", (), "audit records that wait to be on disk"),
-    Metric("rosrv_audit_lag_seconds", "gauge", (), "how long the oldest of them has waited"),
-    Metric("rosrv_audit_failed", "gauge", (), "1 while the audit log cannot be written"),
-    Metric(
+    _gauge("rosrv_hosts", "hosts by state, as `rosrv host list` shows it", "state"),
+    _gauge("rosrv_ipsec_troubles", "what `rosrv status` says is wrong with IPsec, in number"),
+    _gauge("rosrv_audit_queue", "audit records that wait to be on disk"),
+    _gauge("rosrv_audit_lag_seconds", "how long the oldest of them has waited"),
+    _gauge("rosrv_audit_failed", "1 while the audit log cannot be written"),
+    _gauge(
         "rosrv_audit_degraded",
-        "gauge",
-        (),
         "1 while checkpoints, the full-text index or retention are behind, or its disk is nearly full",
     ),
-    Metric("rosrv_syslog_up", "gauge", (), "1 while the audit log is forwarded; absent when it is not to be"),
-    Metric(
-        "rosrv_syslog_sent_total", "counter", (), "messages the receiver has, since the forwarder started"
-    ),
-    Metric("rosrv_syslog_lag_records", "gauge", (), "audit records that wait to be forwarded"),
-    Metric("rosrv_syslog_lag_seconds", "gauge", (), "how long the oldest of them has waited"),
-    Metric(
-        "rosrv_syslog_missed_total",
-        "counter",
-        (),
-        "records that retention removed before they were forwarded",
-    ),
-    Metric(
+    _gauge("rosrv_syslog_up", "1 while the audit log is forwarded; absent when it is not to be"),
+    _counter("rosrv_syslog_sent_total", "messages the receiver has, since the forwarder started"),
+    _gauge("rosrv_syslog_lag_records", "audit records that wait to be forwarded"),
+    _gauge("rosrv_syslog_lag_seconds", "how long the oldest of them has waited"),
+    _counter("rosrv_syslog_missed_total", "records that retention removed before they were forwarded"),
+    _gauge(
         "rosrv_clock_synchronised",
-        "gauge",
-        (),
         "1 while a time service keeps the machine's clock, 0 while none does, -1 not known",
     ),
-    Metric(
-        "rosrv_clock_behind_seconds",
-        "gauge",
-        (),
-        "the clock was set back: it stands so long before the last record",
-    ),
-    Metric(
-        "rosrv_recorder_up", "gauge", (), "1 while the flight recorder runs; absent when nothing is recorded"
-    ),
-    Metric("rosrv_recordings", "gauge", (), "recordings that are kept"),
-    Metric("rosrv_recordings_bytes", "gauge", (), "bytes of them"),
-    Metric("rosrv_policy_revision", "gauge", (), "revision of the policy in force"),
-    Metric("rosrv_policy_differs_from_file", "gauge", (), "1 while the policy in force is not the file's"),
-    Metric("rosrv_process_restarts_total", "counter", ("role",), "times a process was started again"),
-    Metric("rosrv_process_resident_bytes", "gauge", ("role",), "memory of a process"),
-    Metric("rosrv_rest_calls_total", "counter", ("method", "status"), "REST calls since the api started"),
+    _gauge("rosrv_clock_behind_seconds", "the clock was set back: it stands so long before the last record"),
+    _gauge("rosrv_recorder_up", "1 while the flight recorder runs; absent when nothing is recorded"),
+    _gauge("rosrv_recordings", "recordings that are kept"),
+    _gauge("rosrv_recordings_bytes", "bytes of them"),
+    _gauge("rosrv_policy_revision", "revision of the policy in force"),
+    _gauge("rosrv_policy_differs_from_file", "1 while the policy in force is not the file's"),
+    _counter("rosrv_process_restarts_total", "times a process was started again", "role"),
+    _gauge("rosrv_process_resident_bytes", "memory of a process", "role"),
+    _counter("rosrv_rest_calls_total", "REST calls since the api started", "method", "status"),
 )
 
 
