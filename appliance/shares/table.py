@@ -15,32 +15,31 @@ class Share(NamedTuple):
     """One row of the table.
 
     `thing` is what is finite, where, with its unit: "connections to RVMaster". `bounds` are as they are by default;
-    `setting` says where an operator changes them ("limits.connections" of appliance.yaml), or is "" where nobody does.
     `at_limit` is what the host that is beyond its share sees, and what the others see; `alarm` the audit event and the
-    metric that tell of it. `shown_by` are the tests that use it up, as paths below tests/.
+    metric that tell of it. `shown_by` are the tests that use it up, as paths below tests/. `setting` says where an
+    operator changes the bounds ("limits.connections" of appliance.yaml); it is "" where nobody does.
     """
 
     thing: str
     bounds: Bounds
-    setting: str
     at_limit: str
     alarm: str
     shown_by: tuple[str, ...]
+    setting: str = ""
 
 
 RVMASTER_CONNECTIONS = Share(
     "connections to RVMaster and the nodes' faces",
     Bounds(whole=4096, host=512, strangers=512, kept=1024),
-    "limits.connections",
     "503 with the reason; a host within its share gets the place of an idle or unfinished connection of hosts"
     " that have no more rights to it, strangers first",
     "`limit exceeded`",
     ("integration/master/test_shares.py::test_connections_of_two_hundred_addresses",),
+    setting="limits.connections",
 )
 RVMASTER_BYTES = Share(
     "bytes of requests and answers under way, RVMaster and faces",
     Bounds(whole=512 << 20, host=64 << 20, strangers=1 << 20, kept=192 << 20),
-    "",
     "503 with the reason; the request that holds most of a host that holds more makes room",
     "`limit exceeded`",
     (
@@ -51,7 +50,6 @@ RVMASTER_BYTES = Share(
 RVMASTER_FAREWELLS = Share(
     "connections that RVMaster tells that they are too many",
     Bounds(whole=256, host=8, strangers=64, kept=64),
-    "",
     "closed without a word",
     "`limit exceeded`",
     ("unit/rpc/test_visitors.py::test_connections_turned_away_in_all",),
@@ -59,7 +57,6 @@ RVMASTER_FAREWELLS = Share(
 RVMASTER_REQUESTS = Share(
     "requests that RVMaster and faces serve at once",
     Bounds(whole=64, host=16, strangers=8, kept=52),
-    "",
     "the request waits for its host's turn; hosts that the policy names as one network take turns as one, and"
     " have half of the whole together",
     "none: nothing is refused",
@@ -71,7 +68,6 @@ RVMASTER_REQUESTS = Share(
 PARAMETER_BYTES = Share(
     "bytes of parameters",
     Bounds(whole=64 << 20, host=32 << 20, strangers=8 << 20, kept=24 << 20),
-    "limits.parameter_bytes (the parts are as large in proportion)",
     "the value is refused, with the reason; one that takes no more than the value in its place is never"
     " refused, and stays charged to the host that had set that one",
     "`limit exceeded`",
@@ -79,11 +75,11 @@ PARAMETER_BYTES = Share(
         "integration/master/test_shares.py::test_parameters_of_two_hundred_addresses",
         "unit/master/test_parameter_charges.py::test_no_sequence_gets_beyond_a_share",
     ),
+    setting="limits.parameter_bytes (the parts are as large in proportion)",
 )
 LARGE_WRITES = Share(
     "large values on their way to ROSMaster",
     Bounds(whole=2, host=1, strangers=1, kept=1),
-    "",
     "the value waits for its host's turn; small calls go between",
     "none: nothing is refused",
     ("unit/rpc/test_bulk.py::test_large_values_of_a_host_go_one_at_a_time",),
@@ -91,7 +87,6 @@ LARGE_WRITES = Share(
 PROBES = Share(
     "nodes that are asked at once whether they are there",
     Bounds(whole=64, host=16, strangers=8, kept=24),
-    "",
     "the node is asked when it is its host's turn",
     "none: nothing is refused",
     ("unit/master/upkeep/test_liveness.py::test_silent_nodes_of_a_host_delay_no_look_at_anothers",),
@@ -99,7 +94,6 @@ PROBES = Share(
 NODE_CALLS_UNDER_WAY = Share(
     "calls that are being made to nodes for ROSMaster",
     Bounds(whole=512, host=128, strangers=64, kept=192),
-    "",
     "the node is told when it is its host's turn",
     "none: nothing is refused",
     ("unit/master/reach/test_delivery.py::test_silent_nodes_of_a_host_delay_no_call_to_anothers",),
@@ -107,7 +101,6 @@ NODE_CALLS_UNDER_WAY = Share(
 QUEUED_NODE_CALLS = Share(
     "bytes of calls that wait for nodes",
     Bounds(whole=96 << 20, host=64 << 20, strangers=0, kept=0),
-    "",
     "the host that has most loses the oldest call to the node that has most of it; the node is told how things"
     " are once it answers",
     "the process log; the node is looked at",
@@ -116,25 +109,24 @@ QUEUED_NODE_CALLS = Share(
 RELAY_FRAMES = Share(
     "bytes of unfinished messages in one relay",
     Bounds(512 << 20, 256 << 20, 0, 0),
-    "relay.memory_bytes (half of it)",
     "a host gets no more than is left for all others: its publisher or client that sends more is cut and may come back;"
     " up to 4 KiB of a connection are never refused",
     "`limit exceeded`, `connection closed`; `rosrv_relay_memory_bytes`",
     ("unit/relay/test_shares.py::test_unfinished_messages_of_a_guest_stop_nobody_else",),
+    setting="relay.memory_bytes (half of it)",
 )
 RELAY_QUEUES = Share(
     "bytes that wait for subscribers and clients in one relay",
     Bounds(256 << 20, 128 << 20, 0, 0),
-    "relay.memory_bytes (a quarter of it)",
     "a host gets no more than is left for all others: messages for its slow subscribers are dropped, and one that"
     " takes nothing of a message for ten seconds is cut",
     "`rosrv_relay_dropped_total`, `rosrv_relay_memory_bytes`",
     ("unit/relay/test_shares.py::test_subscribers_of_a_guest_that_never_read_stop_nobody_else",),
+    setting="relay.memory_bytes (a quarter of it)",
 )
 RELAY_LATCHED = Share(
     "bytes of latched messages in one relay",
     Bounds(256 << 20, 128 << 20, 0, 0),
-    "relay.memory_bytes (a quarter of it)",
     "a host gets no more than is left for all others, and who has most makes room for who has less: a message"
     " that is not kept is passed on; a later subscriber gets it from the publisher once there is room again",
     "`limit exceeded`; `rosrv_relay_memory_bytes`",
@@ -142,20 +134,20 @@ RELAY_LATCHED = Share(
         "unit/relay/test_shares.py::test_latched_messages_of_a_guest_stop_nobody_else",
         "unit/relay/test_shares.py::test_latched_messages_of_two_hundred_hosts_leave_room_for_the_robots",
     ),
+    setting="relay.memory_bytes (a quarter of it)",
 )
 RELAY_CONNECTIONS = Share(
     "connections to one relay",
     Bounds(whole=16_384, host=8192, strangers=2048, kept=14_336),
-    "relay.connections",
     "closed; a stranger here is a host without a grant, and the longest waiting one makes room for a newcomer;"
     " a host with grants gets the place of a connection of the host that has most, while it has fewer",
     "`connection refused`",
     ("integration/master/test_shares.py::test_connections_to_the_relay",),
+    setting="relay.connections",
 )
 RELAY_HEADERS = Share(
     "bytes of unfinished connection headers in one relay, beyond 4 KiB each",
     Bounds(64 << 20, 16 << 20, 16 << 20, 32 << 20),
-    "",
     "the long header that waits longest makes room, strangers' first; a peer whose header is beyond its share is turned"
     " away",
     "`connection refused`; `rosrv_relay_memory_bytes`",
@@ -167,7 +159,6 @@ RELAY_HEADERS = Share(
 RECORDER_MEMORY = Share(
     "bytes of messages that the flight recorder remembers (divided among the relays)",
     Bounds(whole=64 << 20, host=32 << 20, strangers=0, kept=0),
-    "recorder.memory (a host's part is half of it, a topic's a quarter)",
     "while there is room everybody may have it; then what is older than recorder.before goes first, and a topic or a"
     " host beyond its part loses its own oldest messages",
     "the recording says what is missing",
@@ -175,22 +166,22 @@ RECORDER_MEMORY = Share(
         "unit/recorder/test_ring.py::test_flood_pushes_out_itself",
         "unit/recorder/test_ring.py::test_many_topics_of_a_host_push_out_its_own",
     ),
+    setting="recorder.memory (a host's part is half of it, a topic's a quarter)",
 )
 RECORDER_DISK = Share(
     "bytes of recordings (a host here is one recording)",
     Bounds(whole=2 << 30, host=256 << 20, strangers=0, kept=0),
-    "recorder.disk (one recording has an eighth of it)",
     "the oldest recording of the kind of trigger that has most goes; a kind begins six recordings an hour",
     "`recording removed`, `recording missed`",
     (
         "unit/recorder/test_shelf.py::test_who_has_most_makes_room",
         "unit/recorder/test_recorder.py::test_a_flood_of_triggers_fills_no_disk",
     ),
+    setting="recorder.disk (one recording has an eighth of it)",
 )
 REST_CONNECTIONS = Share(
     "connections to REST, TLS handshakes included",
     Bounds(whole=512, host=64, strangers=192, kept=320),
-    "api_limits.connections",
     "closed at once; a stranger here is a peer that showed no good token in the last 15 minutes, and the one that waits"
     " longest makes room",
     "none",
@@ -198,6 +189,7 @@ REST_CONNECTIONS = Share(
         "integration/master/test_shares.py::test_handshakes_with_rest",
         "unit/api/test_listener.py::test_strangers_in_the_handshake_make_room",
     ),
+    setting="api_limits.connections",
 )
 _STREAMS_SHOWN_BY = (
     "unit/api/test_streams.py::test_two_hundred_viewers_leave_places_to_operators",
@@ -207,23 +199,22 @@ REST_STREAMS = Share(
     "streams of REST, for each of: the audit log followed, /v1/live (a host here is a token, one without a registration"
     " is a viewer's)",
     Bounds(whole=16, host=6, strangers=0, kept=4),
-    "api_limits.streams (the parts are as large in proportion)",
     "503 with the reason and Retry-After",
     "`rest call` with status 503",
     _STREAMS_SHOWN_BY,
+    setting="api_limits.streams (the parts are as large in proportion)",
 )
 REST_STREAM_PEERS = Share(
     "streams of REST, by the machine that follows",
     Bounds(whole=16, host=8, strangers=0, kept=0),
-    "api_limits.streams (the parts are as large in proportion)",
     "503 with the reason and Retry-After",
     "`rest call` with status 503",
     _STREAMS_SHOWN_BY,
+    setting="api_limits.streams (the parts are as large in proportion)",
 )
 REST_EXPORTS = Share(
     "exports of the log and of evidence under way (a host here is a token, one without a registration is a viewer's)",
     Bounds(whole=4, host=2, strangers=0, kept=1),
-    "",
     "503 with the reason and Retry-After",
     "`rest call` with status 503",
     _STREAMS_SHOWN_BY,
@@ -231,7 +222,6 @@ REST_EXPORTS = Share(
 AUDIT_KINDS = Share(
     "kinds of folded denials in the audit log",
     Bounds(whole=8192, host=256, strangers=64, kept=0),
-    "",
     "further denials are counted as one kind of that host; those of strangers as one kind of all strangers",
     "`denials folded` with `scope` host or strangers",
     (
@@ -243,7 +233,6 @@ AUDIT_KINDS = Share(
 AUDIT_READ_KINDS = Share(
     "kinds of folded reads in the audit log",
     Bounds(whole=8192, host=512, strangers=0, kept=0),
-    "",
     "further reads are recorded in full and count as bytes of the host",
     "none",
     ("unit/audit/test_folding.py::test_reads_beyond_the_share_are_recorded_in_full",),
@@ -251,7 +240,6 @@ AUDIT_READ_KINDS = Share(
 AUDIT_BYTES = Share(
     "bytes of audit records to pay off; time pays 64 KiB a second of each host's",
     Bounds(whole=1 << 40, host=16 << 20, strangers=0, kept=1 << 39),
-    "",
     "the host's calls wait, one of many parts is refused in words; strangers are served nothing, and what is"
     " recorded of that is folded",
     "`limit exceeded`",
@@ -264,7 +252,6 @@ AUDIT_BYTES = Share(
 AUDIT_RESERVE = Share(
     "bytes of the disk that are kept for the audit log",
     Bounds(whole=64 << 20, host=1 << 20, strangers=0, kept=16 << 20),
-    "audit.reserve_bytes",
     "below it a host pays off 8 KiB a second, and its calls wait for that; of the last quarter only hosts with"
     " a registration have any, the others are refused in words; on a full disk nothing is granted until there is room",
     "`disk nearly full`; `rosrv status`",
@@ -272,11 +259,11 @@ AUDIT_RESERVE = Share(
         "unit/audit/test_budget.py::test_the_last_of_the_disk_is_for_hosts_with_a_registration",
         "unit/audit/test_room.py::test_a_disk_that_fills_is_told_before_it_is_full",
     ),
+    setting="audit.reserve_bytes",
 )
 NODE_PORTS = Share(
     "ports of [Ports] (one for each node and relay, and one more for each node)",
     Bounds(whole=2000, host=1500, strangers=0, kept=0),
-    "[Ports] range of the policy",
     "a host may have three times as many as are left for all others, and hosts that the policy names as one network are"
     " one; nodes without a registration make room at once; then registering is refused",
     "the refused call's record",
@@ -284,11 +271,11 @@ NODE_PORTS = Share(
         "integration/master/test_shares.py::test_ports_and_names",
         "unit/master/reach/test_places.py::test_no_host_takes_all_ports",
     ),
+    setting="[Ports] range of the policy",
 )
 NAMES = Share(
     "registrations (topics, services and parameters of nodes)",
     Bounds(whole=50_000, host=5000, strangers=0, kept=0),
-    "limits.topics_per_host (a host's)",
     "a host may have three times as many as are left, and hosts that the policy names as one network are one; then"
     " registering is refused with the reason",
     "`decision`: the refused call's record",
@@ -296,11 +283,11 @@ NAMES = Share(
         "integration/master/test_floods.py::test_registrations_of_one_node",
         "unit/master/calls/test_gate.py::test_a_host_has_as_many_registrations_as_are_left",
     ),
+    setting="limits.topics_per_host (a host's)",
 )
 GRANTS = Share(
     "grants of the relays (who may subscribe to what, who may call what)",
     Bounds(whole=200_000, host=20_000, strangers=0, kept=0),
-    "",
     "the host, or of all hosts that with most, loses its oldest grants that nobody is connected by",
     "none: a node that asks again gets it again",
     ("unit/master/reach/test_relays.py::test_grants_of_all_hosts_are_bounded",),
@@ -308,7 +295,6 @@ GRANTS = Share(
 IKE_HANDSHAKES = Share(
     "IKE handshakes under way (a host is an address; nobody is known before his handshake)",
     Bounds(whole=2000, host=5, strangers=2000, kept=0),
-    "",
     "not answered until one ends, after 15 s at most; from 30 on an address has to answer once before it counts",
     "none: charon's log",
     ("unit/ipsec/test_strongswan.py::test_two_hundred_addresses_leave_handshakes_for_hosts",),
@@ -316,11 +302,11 @@ IKE_HANDSHAKES = Share(
 DESCRIPTORS = Share(
     "descriptors of control, of each relay, of the supervisor (the api has a sixteenth of it)",
     Bounds(whole=65_536, host=32_768, strangers=32_768, kept=32_768),
-    "the system's limit (nofile)",
     "never reached: where the system allows fewer, connections have no more than half of them, and those above it are"
     " told so as above any other share",
     "none",
     ("unit/shares/test_descriptors.py::test_all_shares_together_fit_the_descriptors",),
+    setting="the system's limit (nofile)",
 )
 
 SHARES: tuple[Share, ...] = tuple(row for row in list(globals().values()) if isinstance(row, Share))
