@@ -26,7 +26,7 @@ from appliance.rosmop.ir.values import Values, struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
 from appliance.rosmop.outcomes import Verdict
-from appliance.rosmop.runtime.context import Context, LogLine, line_of
+from appliance.rosmop.runtime.context import Context, LogLine, Published
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
@@ -53,13 +53,17 @@ _CLOCK = struct.Struct("<qq")
 _NEVER = (1 << 63) - 1  # comes after every time, so that output is due
 
 
+Output = LogLine | Published
+
+
 class Walked(NamedTuple):
     """What a walk has done.
 
     `position` is where the first message begins that is left; `run` where what goes on in its buffer begins (behind the
     last dropped message). `dropped` are counts for each of the walker's events, if any was, `told` for each of its
-    verdicts, if there was any. `sooner`: something is due earlier than it was. `lines` were put out, each with where
-    the frame begins of the message that it is about; their text took so many `seconds` (`Prepared.clock`).
+    verdicts, if there was any. `sooner`: something is due earlier than it was. `output` are the lines that were put out
+    and the messages that were published, in order, each with where the frame begins of the message that it is about; to
+    make them took so many `seconds` (`Prepared.clock`).
     """
 
     position: int
@@ -67,15 +71,15 @@ class Walked(NamedTuple):
     dropped: Sequence[int]
     told: Sequence[int] = ()
     sooner: bool = False
-    lines: Sequence[tuple[int, LogLine]] = ()
+    output: Sequence[tuple[int, Output]] = ()
     seconds: float = 0.0
 
 
 class Prepared(NamedTuple):
     """What holds for all walks of a topic until the engine, or anything else, has done something: the sender of
     the messages; bits of `told` (and whether no message may be changed), `enabled` and `counted`, as the module takes
-    them; where walks add up how many messages a set of events (see `Walker.writers`) has changed; and what tells
-    seconds of processor time.
+    them; where walks add up how many messages a set of events (see `Walker.writers`) has changed; what tells seconds of
+    processor time; and where is said which publications may be made, for each whether it may.
     """
 
     source: int
@@ -84,6 +88,7 @@ class Prepared(NamedTuple):
     counted: int
     changed: dict[int, int]
     clock: Callable[[], float]
+    publishes: Sequence[tuple[int, bool]] = ()
 
 
 class Due(Protocol):
@@ -104,6 +109,7 @@ class Home:
         running: Sequence[RunningProperty],
         throttles: Sequence[tuple[Context, int, int]],
         *,
+        values: Values,
         due: Due,
     ) -> None:
         """`throttles`: specification, site, and address of when output there was last due."""
@@ -122,6 +128,10 @@ class Home:
             (self._names.index(name), buffer, _element_code(cells.variables[name][1]))
             for name, buffer in cells.vectors.items()
         ]
+        self._records = [
+            (name, slice(at, at + cells.sizes[name]), values.encoder(kind), values.decoder(kind))
+            for name, (at, kind) in cells.records.items()
+        ]
         self._generation = cells.generation
         self._source, self._until = cells.source, cells.until
         self._clocks = [(running[number], address) for number, address in cells.clocks.items()]
@@ -137,6 +147,8 @@ class Home:
         self.prepared = prepared
         self.machine.refuel(FUEL)
         _PREPARED.pack_into(self._memory, self._source, prepared.source << 32, *prepared[1:4])
+        for address, counted in prepared.publishes:
+            _TIME.pack_into(self._memory, address, counted)
 
     def _enter(self) -> None:
         states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
@@ -148,6 +160,10 @@ class Home:
         for place, buffer, code in self._vectors:
             values[place] = self._entered_vector(values[place], buffer, code)
         self._cells.pack_into(self._memory, self._base, *states, *values)
+        for name, where, encode, _ in self._records:
+            raw = bytearray()
+            encode(self._namespace[name], raw)
+            self._memory[where] = raw.ljust(where.stop - where.start, b"\0")
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
         for running, address in self._clocks:
@@ -205,6 +221,8 @@ class Home:
                 if count == BEYOND
                 else [*struct.unpack_from(f"<{count}{code}", self._memory, at)]
             )
+        for name, where, _, decode in self._records:
+            found[name] = decode(self._memory, where.start)[0]
         self._namespace.update(found)
 
 
@@ -249,6 +267,9 @@ class Walker:
         """Whether the time that a message takes is little enough not to be counted, but for that of its lines."""
         self._lines = [(line, home.named(line.context)) for line in module.lines] if feed.says else []
         self._said = module.said
+        self.publishes = tuple((home.named(context), topic) for context, topic in feed.publishes)
+        """What it may publish: the name of the monitor, and the topic."""
+        self._publications = [module.publications[each] for each in feed.publishes]
         self._monitors = tuple(dict.fromkeys(monitors))
         self._memory = home.machine.memory  # it does not grow
         self._owner = self._memory.obj
@@ -292,15 +313,18 @@ class Walker:
         counted: Sequence[bool] = (),
         source: int = 0,
         changed: dict[int, int] | None = None,
+        published: Sequence[bool] = (),
         clock: Callable[[], float] = lambda: 0.0,
     ) -> Prepared:
         """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none,
-        `counted` for each verdict whether there may be more. Good until the engine is asked for anything.
+        `counted` for each verdict whether there may be more, `published` the same of what it `publishes`. Good until
+        the engine is asked for anything.
         """
         bits = sum(1 << number for number, silent in enumerate(told) if silent) - (LOUD if loud else 0)
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
         only = sum(1 << number for number, silent in enumerate(counted) if silent)
-        return Prepared(source, bits, enabled, only, {} if changed is None else changed, clock)
+        publishes = [*zip_longest(self._publications, published, fillvalue=False)]
+        return Prepared(source, bits, enabled, only, {} if changed is None else changed, clock, publishes)
 
     def walk(  # noqa: PLR0917  called for every batch: keywords would cost a tenth of it
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
@@ -317,7 +341,7 @@ class Walker:
         frames = self._frames
         end = frames + len(view)
         begun, said = run, 0
-        lines: list[tuple[int, LogLine]] = []
+        output: list[tuple[int, Output]] = []
         seconds = 0.0
         while True:
             try:
@@ -325,7 +349,7 @@ class Walker:
             except MachineTrap:
                 answer = self._stopped(frames + position, end, time_ns)
             said |= answer
-            seconds += self._put_out(lines, prepared.clock) if self._lines else 0
+            seconds += self._put_out(output, prepared.clock) if self._lines else 0
             if answer >= LEFT:
                 self._undo()
             effects = (answer >> 32 & 0xFFFFFF) * _EFFECT.size
@@ -338,7 +362,7 @@ class Walker:
                     if first > run:
                         pieces.append(view[run:first])
                     run = (what >> 32) - frames
-            if answer & _ADDRESS == end and run == begun and said < TOLD and not lines:
+            if answer & _ADDRESS == end and run == begun and said < TOLD and not output:
                 return None
             position = (answer & _ADDRESS) - frames
             sooner = bool(answer & SOONER)
@@ -346,13 +370,13 @@ class Walker:
                 if sooner:
                     self._home.hasten()
                 dropped, told = self._counted() if run != begun or said & TOLD else ((), ())
-                return Walked(position, run, dropped, told, sooner, lines, seconds)
+                return Walked(position, run, dropped, told, sooner, output, seconds)
 
     def take(
         self, message: Buffer, time_ns: int, source: int = 0
     ) -> tuple[Sequence[str], Sequence[LogLine]] | None:
         """Take a message of which nothing is to be told but which events happened and what was put out: they. None if
-        it is left.
+        it is left, as one is that publishes.
 
         Only as `walk`, and where nobody asks what has `happened`.
         """
@@ -367,14 +391,15 @@ class Walker:
         if walked is not None and not walked.position:
             return None
         events = tuple(name for (name,), count in zip(self.events, self.happened(), strict=True) if count)
-        return events, [line for _, line in walked.lines] if walked is not None else []
+        output = walked.output if walked is not None else ()
+        return events, [line for _, line in output if isinstance(line, LogLine)]
 
     def _walk_elsewhere(  # noqa: PLR0917  as `walk`
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
     ) -> Walked:
         dropped: Sequence[int] = ()
         told: Sequence[int] = ()
-        lines: list[tuple[int, LogLine]] = []
+        output: list[tuple[int, Output]] = []
         seconds = 0.0
         sooner = False
         while position < len(view) and not sooner:
@@ -390,7 +415,7 @@ class Walker:
                     break
                 sooner = walked.sooner
                 told = _sums(told, walked.told)
-                lines += [(position, line) for _, line in walked.lines]
+                output += [(position, each) for _, each in walked.output]
                 seconds += walked.seconds
                 if walked.run:
                     if position > run:
@@ -398,7 +423,7 @@ class Walker:
                     run = following
                     dropped = _sums(dropped, walked.dropped)
             position = following
-        return Walked(position, run, dropped, told, sooner, lines, seconds)
+        return Walked(position, run, dropped, told, sooner, output, seconds)
 
     def _walk_beginning(
         self, frame: memoryview, shown: int, time_ns: int, prepared: Prepared
@@ -413,8 +438,8 @@ class Walker:
             frame[4:size] = area[4:]
         return walked
 
-    def _put_out(self, lines: list[tuple[int, LogLine]], clock: Callable[[], float]) -> float:
-        """Append what is put out, each line with where its frame begins; the seconds that it took."""
+    def _put_out(self, output: list[tuple[int, Output]], clock: Callable[[], float]) -> float:
+        """Append what is put out and published, each with where its frame begins; the seconds that it took."""
         at, end = self._said, _LENGTH.unpack_from(self._memory, SURE)[0]
         if at == end:
             return 0.0
@@ -422,7 +447,7 @@ class Walker:
         while at < end:
             number, frame = HEAD.unpack_from(self._memory, at)
             line, monitor = self._lines[number]
-            lines.append((frame - self._frames, line_of(line.level, line.text(self._memory, at), monitor)))
+            output.append((frame - self._frames, line.put_out(self._memory, at, monitor)))
             at += line.size
         return clock() - began
 
@@ -483,7 +508,8 @@ def walks_of(compiled: Compiled, monitors: Sequence[Monitor], due: Due) -> Walks
     """The walkers of all topics that can have one; their monitors are told where their state is."""
     found = list(groups(compiled.specifications))
     components = [group.component for group in found]
-    module = module_of(compiled.functions, components, Values(compiled.messages), compiled.stamped)
+    values = Values(compiled.messages)
+    module = module_of(compiled.functions, components, values, compiled.stamped)
     if not module.feeds:
         return Walks()
     machine = Machine(module.code, module.memory)
@@ -500,7 +526,7 @@ def walks_of(compiled: Compiled, monitors: Sequence[Monitor], due: Due) -> Walks
             for (context, site), address in module.throttles.items()
             if context in contexts
         ]
-        home = Home(machine, cells, compiled.namespace, running, throttles, due=due)
+        home = Home(machine, cells, compiled.namespace, running, throttles, values=values, due=due)
         for number in group.specifications:
             monitors[number].home = home
         for (topic, _), events in zip(group.component.topics, group.events, strict=True):

@@ -23,7 +23,7 @@ from appliance.relay.monitors.passage import Passage
 from appliance.relay.monitors.places import HEAD, Place, Senders, Sighting
 from appliance.relay.monitors.trials import Trials
 from appliance.rosmop.outcomes import Outcome
-from appliance.rosmop.runtime.context import BUDGET
+from appliance.rosmop.runtime.context import BUDGET, Published
 
 if TYPE_CHECKING:
     from appliance.rosmop.engine import MonitorSet
@@ -109,10 +109,10 @@ class Lane:
         if walked is None:
             return batch
         gone = self._counts.add(walked, now)
-        if walked.position == len(batch.view) and not gone and not walked.sooner and not walked.lines:
+        if walked.position == len(batch.view) and not gone and not walked.sooner and not walked.output:
             return batch
         passage = Passage(batch, now)
-        if walked.lines:
+        if walked.output:
             middle.spent += walked.seconds
             self._say(walked, passage)
         passage.pieces = pieces
@@ -159,7 +159,7 @@ class Lane:
             middle.spent += time.thread_time() - began
         elif walked is not None:
             middle.spent += walked.seconds
-        if walked is not None and walked.lines:
+        if walked is not None and walked.output:
             self._say(walked, passage)
         if not counts.begun:
             middle.observer.owe(counts)
@@ -172,15 +172,20 @@ class Lane:
         return passage.position == passage.end
 
     def _say(self, walked: Walked, passage: Passage) -> None:
-        """Tell what was put out."""
+        """Tell what was put out, and publish what was published."""
         middle, monitors, began = self._middle, self._middle.monitors, time.thread_time()
         assert monitors is not None  # noqa: S101  they have put it out
         head = HEAD if monitors.stamped(self._place[1]) else 0
-        for position, line in walked.lines:
+        published = [said for _, said in walked.output if isinstance(said, Published)]
+        if published:
+            middle.observer.published(published, self._place, passage.time)
+        for position, said in walked.output:
+            if isinstance(said, Published):
+                continue
             first = position + 4
             size = _unpack_length(passage.view, position)[0]
             sighting = Sighting(passage, position, bytes(passage.view[first : first + min(size, head)]))
-            middle.observer.said(line, self._place, passage.time, sighting)
+            middle.observer.said(said, self._place, passage.time, sighting)
         middle.spent += time.thread_time() - began
         if middle.spent > LONGEST:
             middle.look_again()
@@ -200,6 +205,7 @@ class Lane:
                 counted=[observer.hides_verdict(verdict, place) for verdict in walker.verdicts],
                 source=self._source,
                 changed=counts.changed,
+                published=[observer.hides_publication(*each, place) for each in walker.publishes],
                 clock=time.thread_time,
             )
         self._walker, self._sight = walker, self._middle.sight

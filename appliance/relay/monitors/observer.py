@@ -80,6 +80,10 @@ class Observer:
         """Whether the next such verdict at a place is only counted."""
         return self._observations.told("verdict", verdict.monitor, place, _which(verdict))
 
+    def hides_publication(self, monitor: str, topic: str, place: Place) -> bool:
+        """Whether the next message that a monitor publishes on a topic, because of one at a place, is only counted."""
+        return self._observations.told(f"{self._prefix}publish", monitor, _of_publication(place, topic))
+
     def asks(self, verdict: Verdict, source: int) -> bool:
         """Whether a verdict is told in full, and so explained: as many as `_EXPLAINED` in a second are."""
         place = self.senders.place(source) or NOWHERE
@@ -112,7 +116,7 @@ class Observer:
             self._observations.note(
                 f"{self._prefix}publish",
                 published.monitor,
-                place._replace(key="", resource=published.topic),
+                _of_publication(place, published.topic),
                 outcome.time,
                 f"{published.type} on {published.topic}",
                 detail={"because_of": place.resource, **of_published(outcome, number, self._who)},
@@ -121,6 +125,17 @@ class Observer:
                 size=len(published.data),
             )
             self._publish(published)
+
+    def published(self, messages: Iterable[Published], place: Place, time: int) -> None:
+        """Publish what comes of messages at this place, of which is told only how many there were."""
+        counts: dict[tuple[str, str], int] = {}
+        for message in messages:
+            key = message.monitor, message.topic
+            counts[key] = counts.get(key, 0) + 1
+            self._publish(message)
+        for (monitor, topic), count in counts.items():
+            where = _of_publication(place, topic)
+            self._observations.add(f"{self._prefix}publish", monitor, where, time, count)
 
     def said(self, line: LogLine, place: Place, time: int, sighting: Sighting | None = None) -> None:
         """Tell a line of output."""
@@ -354,6 +369,11 @@ def _monitor(event: str) -> str:
 def _together(events: Sequence[str]) -> list[str]:
     """The events that changed a message, if it was more than one monitor."""
     return list(events) if _monitor(events[0]) != _monitor(events[-1]) else []
+
+
+def _of_publication(place: Place, topic: str) -> Place:
+    """Where a publication is told that comes of a message at a place."""
+    return place._replace(key="", resource=topic)
 
 
 def _which(verdict: Verdict) -> str:

@@ -27,7 +27,7 @@ from appliance.rosmop.ir import form
 from appliance.rosmop.ir.assembly import PAGE, assembled
 from appliance.rosmop.ir.layout import NOW, POSITION, ROOM, SAID, SURE, UNDO, Cells, NotScalarError
 from appliance.rosmop.ir.module import CHANGED, DROPPED, HAPPENED, RESET, Writer, Written
-from appliance.rosmop.ir.output import Line
+from appliance.rosmop.ir.output import Line, Publication
 from appliance.rosmop.ir.parts import ELSEWHERE
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.ir.wasm import (
@@ -77,7 +77,7 @@ class Feed:
     `verdicts` have the place of an event, of its step of a property, and of the handler. `log` is where the log of
     patches begins, `undo` the addresses of variables and of what they held before the message that is left. `brief`:
     it has no loops. `functions` are the numbers of those of the events in the module. `says`: it may put out
-    lines; all before the address at `SURE` are.
+    lines or publish; all before the address at `SURE` are. `publishes`: the contexts and topics of what it may publish.
     """
 
     name: str
@@ -92,6 +92,7 @@ class Feed:
     says: bool
     settle: str
     """The export that is called when what was done to the message that is left is taken back; none if it is empty."""
+    publishes: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -111,13 +112,17 @@ class FeedModule:
     throttles: Mapping[tuple[str, int], int]
     budgets: Mapping[str, int]
     """Where the budget of each specification stands, by its context."""
-    lines: Sequence[Line]
+    lines: Sequence[Line | Publication]
     strings: Mapping[bytes, int]
     """Where constant strings stand."""
     rooms: Sequence[range]
     """Where vectors stand that are kept or made."""
     said: int
-    """Where lines of output are noted, by their places among the `lines`."""
+    """Where lines of output and publications are noted, by their places among the `lines`."""
+    publications: Mapping[tuple[str, str], int]
+    """Where it must stand (i64) whether what a context publishes on a topic is only counted."""
+    places: Sequence[range]
+    """What it uses for messages that it makes."""
 
 
 def module_of(
@@ -174,6 +179,8 @@ def module_of(
         {raw: writer.constants[raw] for raw in writer.strings},
         writer.rooms,
         writer.said,
+        writer.publications,
+        writer.places,
     )
 
 
@@ -237,8 +244,10 @@ class _Walk:
             for number, event in enumerate(events)
         ]
         functions = [*self._written, *self._run()]
-        self._says = any(written.says for written in functions)
-        if self._says and stamped and any(written.early for written in functions):
+        says = any(written.says for written in functions)
+        self._publishes = sorted({each for written in functions for each in written.publishes})
+        self._says = says or bool(self._publishes)
+        if says and stamped and any(written.early for written in functions):
             raise NotScalarError("output about a message whose header is changed")
         self._budgets = sorted({writer.budget(writer.functions[event.function].context) for event in events})
         self._counters = writer.take(16 * len(events) + 8 * len(self.verdicts))
@@ -246,10 +255,11 @@ class _Walk:
             {name for written in functions for name in written.assigned}.difference(cells.noted)
         )
         self._settles = not set(cells.kept).isdisjoint(assigned)
-        kept = [
-            cells.vectors[name] + 2 * ROOM if name in cells.vectors else writer.take(8) for name in assigned
-        ]
-        self._undo = tuple((cells.variables[name][0], at) for name, at in zip(assigned, kept, strict=True))
+        self._undo = tuple(
+            (address, cells.vectors[name] + 2 * ROOM if name in cells.vectors else writer.take(8))
+            for name in assigned
+            for address in cells.words(name)
+        )
         self._log = writer.take(16 * sum(written.writes for written in self._written))
         properties = {
             advance.property for event in events for advance in event.advances if advance.property is not None
@@ -286,6 +296,7 @@ class _Walk:
             [written.number for written in self._written],
             self._says,
             f"settle {self._cells.settle}" if self._settles else "",
+            self._publishes,
         )
 
     def _run(self) -> list[Written]:

@@ -1,14 +1,14 @@
 """What stands where in the memory of a module, and how large the values of a type are there.
 
 A variable of the set stands at its address, in 8 bytes: a number, or of a string (`texts.py`) or vector (`vectors.py`)
-where it is and how long.
+where it is and how long; a message stands as it is sent (`records.py`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.output import Line
+from appliance.rosmop.ir.output import Line, Publication
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.ir.wasm import F32, F64, I32, I64
 from appliance.rosmop.types import kinds
@@ -20,7 +20,10 @@ messages before; and what is given out begins.
 """
 
 LINES = 64 << 10
-"""Bytes for lines of output; a message whose line has no room is left."""
+"""Bytes for lines of output and messages that are published; a message whose line has no room is left."""
+
+MOST_MADE = 1024
+"""Bytes of a message that is made or kept here, without what its strings have."""
 
 
 ROOM = 8 << 10
@@ -73,6 +76,10 @@ class Cells:
     """Where each stands, and its type; in the order of the places."""
     texts: dict[str, int] = field(default_factory=dict)
     """Where strings may be put when there is 0 (i32) at `generation`, by the variable that holds them (`texts.py`)."""
+    records: dict[str, tuple[int, kinds.Record]] = field(default_factory=dict)
+    """Where each variable that is a message stands, and its type."""
+    sizes: dict[str, int] = field(default_factory=dict)
+    """The bytes of each of these, a multiple of 8."""
     generation: int = 0
     settle: int = 0
     """The number of the function that puts them there."""
@@ -93,6 +100,13 @@ class Cells:
         place = self.base + 8 * (self.properties + len(self.variables))
         return self.variables.setdefault(name, (place, kind))[0]
 
+    def words(self, name: str) -> Sequence[int]:
+        """Where the 8 bytes of a variable stand, or each 8 of a message."""
+        if name not in self.records:
+            return (self.variables[name][0],)
+        begin = self.records[name][0]
+        return range(begin, begin + self.sizes[name], 8)
+
 
 class Layout:
     """Gives out the memory of a module."""
@@ -112,7 +126,11 @@ class Layout:
         """Those of them that are strings."""
         self.rooms: list[range] = []
         """Where vectors stand."""
-        self.lines: list[Line] = []
+        self.lines: list[Line | Publication] = []
+        self.publications: dict[tuple[str, str], int] = {}
+        """Where it stands (i64) whether what a specification publishes on a topic is only counted."""
+        self.places: list[range] = []
+        """Where messages stand that are made or kept here, and whether what is published is only counted."""
         self._used = FIRST
         self.said = self.take(LINES)
         """Where lines stand."""
@@ -128,11 +146,70 @@ class Layout:
             return kind.length * self.size(kind.element)
         raise NotScalarError(str(kind))
 
+    def field(self, kind: Type, number: int) -> Type:
+        """The type of a field of a message."""
+        if not isinstance(kind, kinds.Record):
+            raise NotScalarError(str(kind))
+        return self._values.fields(kind)[number]
+
     def offset(self, kind: Type, number: int) -> int:
         """Where a field of a message begins in it. Raises `NotScalarError` where that differs."""
         if not isinstance(kind, kinds.Record):
             raise NotScalarError(str(kind))
-        return sum(map(self.size, self._values.fields(kind)[:number]))
+        return sum(map(self.extent, self._values.fields(kind)[:number]))
+
+    def extent(self, kind: Type) -> int:
+        """The same of one that is made here, where a string is 8 bytes: where it is and how long."""
+        if isinstance(kind, kinds.Record):
+            return sum(map(self.extent, self._values.fields(kind)))
+        return 8 if isinstance(kind, kinds.String) else self.size(kind)
+
+    def leaves(self, kind: Type, at: int = 0) -> Iterator[tuple[int, Type]]:
+        """The numbers, times and strings of one that is made here, and where each stands."""
+        parts = self._values.fields(kind) if isinstance(kind, kinds.Record) else ()
+        if isinstance(kind, kinds.Vector):
+            parts = [kind.element] * (kind.length or 0)
+        elif not isinstance(kind, kinds.Record):
+            yield at, kind
+        for part in parts:
+            yield from self.leaves(part, at)
+            at += self.extent(part)
+
+    def arrays(self, kind: Type) -> Iterator[int]:
+        """The bytes that a copy is charged for: those of each array in a message."""
+        parts = self._values.fields(kind) if isinstance(kind, kinds.Record) else ()
+        if isinstance(kind, kinds.Vector):
+            yield (kind.length or 0) * self._values.width(kind.element)
+            parts = [kind.element] * (kind.length or 0)
+        for part in parts:
+            yield from self.arrays(part)
+
+    def made(self, kind: Type) -> int:
+        """Where a message is made. Raises `NotScalarError` of one of any size, or a large one."""
+        size = self.extent(kind)
+        if size > MOST_MADE:
+            raise NotScalarError(f"{kind} of {size} bytes")
+        at = self.take(size)
+        self.places.append(range(at, at + -(-size // 8) * 8))
+        return at
+
+    def record(self, name: str, kind: Type) -> int:
+        """Where a variable of the set stands that is a message."""
+        cells = self.shared[name]
+        if name not in cells.records:
+            if not isinstance(kind, kinds.Record):
+                raise NotScalarError(str(kind))
+            self.copied(kind)
+            cells.records[name] = (self.made(kind), kind)
+            cells.sizes[name] = len(self.places[-1])
+        return cells.records[name][0]
+
+    def publication(self, context: str, topic: str) -> int:
+        """Where it stands whether what a specification publishes on a topic is only counted."""
+        if (context, topic) not in self.publications:
+            at = self.publications[context, topic] = self.take(8)
+            self.places.append(range(at, at + 8))
+        return self.publications[context, topic]
 
     def element(self, kind: Type) -> tuple[Type, int]:
         """The type of the elements of a string or vector, and the bytes from one to the next (strings: in the table).

@@ -2,19 +2,21 @@
 
 Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
 has a fixed size (`places.py`); strings are kept (`texts.py`), vectors of numbers are kept, made and changed
-(`vectors.py`).
+(`vectors.py`); messages without arrays of any length are made and published, and kept, too, if they have no strings or
+arrays (`records.py`).
 
 `Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
 
 - An event, and the handler of a verdict, takes where the message is in the memory and its size (i32, i32), and returns
   bits (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`, `RESET`.
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
-  it is taken back. Within what it calls it is a trap. Beyond are strings and messages that are made or changed,
-  messages that are kept, vectors of anything but numbers, of more than `ROOM` bytes, of the message that are changed,
-  handed back or by reference, or compared, what is published, recursion, `sin` and its like. An event of which no
-  message can come past such a place has no module: `NotScalarError` names what is beyond.
-- A line of output is noted behind those before, where `SAID` points, and the message at hand stands at `POSITION`
-  (`output.py`).
+  it is taken back. Within what it calls it is a trap. Beyond are strings that are made or changed, vectors of anything
+  but numbers, of more than `ROOM` bytes, of the message that are changed, handed back or by reference, or compared,
+  `MESSAGE`, messages of more than `MOST_MADE` bytes or with what is beyond, what is published with a string of more
+  than `MOST_KEPT`, or first of its kind of a second, recursion, `sin` and its like. An event of which no message can
+  come past such a place has no module: `NotScalarError` names what is beyond.
+- A line of output, and a message that is published, is noted behind those before, where `SAID` points, and the message
+  at hand stands at `POSITION` (`output.py`).
 - Before a field is written, what stood there is noted in the log (address, size, bytes; 16 bytes each) that `UNDO`
   points behind.
 - What the form charges is taken from the budget of its specification, as everywhere.
@@ -29,10 +31,7 @@ from typing import Any
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.arithmetic import to_floating
 from appliance.rosmop.ir.layout import (
-    LINES,
     NOW,
-    POSITION,
-    SAID,
     UNDO,
     Cells,
     Layout,
@@ -41,9 +40,10 @@ from appliance.rosmop.ir.layout import (
     machine_type,
 )
 from appliance.rosmop.ir.output import BYTES, HEAD, Line, is_text
+from appliance.rosmop.ir.records import Records
 from appliance.rosmop.ir.texts import mismatch, settling
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
-from appliance.rosmop.ir.vectors import OF_VECTORS, Vectors, made_in
+from appliance.rosmop.ir.vectors import OF_VECTORS, made_in
 from appliance.rosmop.ir.wasm import (
     COMPARE,
     DROP,
@@ -73,7 +73,7 @@ class Written:
     """A function that is written: its types and code; what it assigns, how many fields it writes, and whether it drops.
 
     `brief`: without loops. `passes`: some message comes to its end. `says`: it may put out lines. `early`: it may write
-    into the first bytes of the message, where a header is.
+    into the first bytes of the message, where a header is. `publishes`: contexts, and topics on which they may publish.
     """
 
     number: int
@@ -87,6 +87,7 @@ class Written:
     passes: bool
     says: bool
     early: bool
+    publishes: frozenset[tuple[str, str]] = frozenset()
 
 
 class Writer(Layout):
@@ -140,7 +141,7 @@ class Writer(Layout):
         return written
 
 
-class _Body(Vectors):
+class _Body(Records):
     """Writes one function."""
 
     def __init__(
@@ -153,6 +154,7 @@ class _Body(Vectors):
     ) -> None:
         answers = isinstance(function, form.Function) and function.parameters == ("m",)
         super().__init__(writer, parameters, context, answers=answers)
+        self._own_places(function)
         self._writer = writer
         self._function = function
         self._made = made_in(function.body, writer.shared)
@@ -192,6 +194,7 @@ class _Body(Vectors):
             self._depends,
             self._says,
             self._early,
+            frozenset(self._publishes),
         )
 
     def _mismatch(self) -> int:
@@ -220,6 +223,8 @@ class _Body(Vectors):
         value = node.value.value if isinstance(node.value, form.Discard) else node.value
         if isinstance(value, form.Assign):
             return self._assigned_to(value)
+        if isinstance(value, form.Call) and self._changes_message(value):
+            return self._change(value)
         if isinstance(value, form.Literal) and value.value is None:
             return b""
         if isinstance(value, form.Conditional) and value.type == kinds.VOID:
@@ -401,8 +406,8 @@ class _Body(Vectors):
             return self._assigned_text(node)
         if isinstance(node.type, kinds.Vector):
             return self._assigned_vector(node)
-        if isinstance(node.type, kinds.Record) and node.name not in self._writer.shared:
-            return b"".join(self._place(node.value)) + self._set(f"place of {node.name}")
+        if isinstance(node.type, kinds.Record):
+            return self._assigned_record(node)
         machine, value = machine_type(node.type), self._value(node.value)
         cells = self._writer.shared.get(node.name)
         if cells is None:
@@ -421,15 +426,8 @@ class _Body(Vectors):
         for place, value in enumerate(line.values):
             first, slot, size = self._slot(value, f"value {place} {number}", HEAD.size + 8 * place)
             code, stores, cost = code + first, stores + slot, cost + size
-        code += self._cell(0x28, SAID) + self._set("line")
-        end = self._get("line") + constant(I32, line.size) + b"\x6a"
-        full = end + constant(I32, self._writer.said + LINES) + b"\x4b"
-        code += self._when(full, self._elsewhere) + self._spend(cost) + self._cell(0x36, SAID, end)
-        for offset, head in ((0, constant(I32, len(self._writer.lines))), (4, self._cell(0x28, POSITION))):
-            code += self._get("line") + head + b"\x36\x00" + unsigned(offset)
-        self._writer.lines.append(line)
         self._says = True
-        return code + stores + constant(I32, 0)
+        return code + self._noted_line(line, cost) + stores + constant(I32, 0)
 
     def _slot(self, node: form.Expression, name: str, at: int) -> tuple[bytes, bytes, bytes]:
         """What comes first; what puts a value into the line (of a string: its place and length); its cost."""
@@ -535,6 +533,7 @@ class _Body(Vectors):
             self._assigned |= called.assigned
         self._brief = self._brief and called.brief
         self._says = self._says or called.says
+        self._publishes |= called.publishes
         return code + b"\x10" + unsigned(called.number)
 
 

@@ -1,8 +1,10 @@
-"""Lines of output of which a module keeps the values, so that their text is made of them later.
+"""Lines of output and published messages of which a module keeps the values, so that they are made of them later.
 
 A line stands in the module's memory as its number among those of the module, the address of the frame (i32 each), and 8
 bytes for each value: an integer, a double, or a string's address (the low 32 bits) and length. It costs the most that
 it can: text is not made before it is paid for.
+
+A message that is published has behind number and frame its fields as they are sent, of strings address and length.
 """
 
 import struct
@@ -10,16 +12,18 @@ from collections.abc import Callable, Sequence
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.functions import FAULTING, FUNCTIONS
-from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, OUTPUT_COST
+from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, OUTPUT_COST, LogLine, Published, line_of
 from appliance.rosmop.runtime.output import MAX_PRECISION
 from appliance.rosmop.types import kinds
 
 HEAD = struct.Struct("<II")
-"""The number of a line and where its frame is."""
+"""The number of a line or publication and where its frame is."""
 
 BYTES = BYTES_PER_INSTRUCTION // 4
 """Of a string, for an instruction more."""
 
+_TEXT = struct.Struct("<II")
+_LENGTH = struct.Struct("<I")
 _PIECE = 512  # bytes that a number may take
 _SHORT = 1024  # bytes of a text whose size is not charged
 _Make = Callable[[Sequence[object]], object]
@@ -43,15 +47,15 @@ class Line:
         """Instructions: with one for each `BYTES` of its strings at least what is taken for it."""
         return OUTPUT_COST + 3 * (self.longest // BYTES_PER_INSTRUCTION + 1)  # formatted, joined and put out
 
-    def text(self, memory: memoryview, at: int) -> bytes:
-        """The text of a line that stands there."""
+    def put_out(self, memory: memoryview, at: int, monitor: str) -> LogLine:
+        """The line that stands there."""
         values: list[object] = [*self._slots.unpack_from(memory, at + HEAD.size)]
         for place in self._texts:
             where, size = divmod(values[place], 1 << 32)[::-1]  # type: ignore[operator]  # an integer
             values[place] = bytes(memory[where : where + size])
         text = self._make(values)
         assert isinstance(text, bytes)  # noqa: S101  as its type says
-        return text
+        return line_of(self.level, text, monitor)
 
     def _made(self, node: form.Expression) -> _Make:
         """How a part of the text is made of the values."""
@@ -74,6 +78,33 @@ class Line:
         place = len(self.values)
         self.values.append(node)
         return lambda values: values[place]
+
+
+class Publication:
+    """A message that is published; `room` and `texts`: the bytes of what is noted of it, and where its strings are."""
+
+    def __init__(self, node: form.Publish, context: str, room: int, texts: Sequence[int]) -> None:
+        self.context = context
+        self.cost = OUTPUT_COST + room
+        self.size = HEAD.size + -(-room // 8) * 8
+        self._node = node
+        self._room = room
+        self._texts = texts
+
+    def put_out(self, memory: memoryview, at: int, monitor: str) -> Published:
+        """The message that stands there."""
+        node, begin = self._node, at + HEAD.size
+        if not self._texts:
+            data = bytes(memory[begin : begin + self._room])
+            return Published(monitor, node.topic, node.kind.name, data, node.site)
+        done = begin
+        pieces: list[bytes | memoryview] = []
+        for text in self._texts:
+            where, size = _TEXT.unpack_from(memory, begin + text)
+            pieces += (memory[done : begin + text], _LENGTH.pack(size), memory[where : where + size])
+            done = begin + text + _TEXT.size
+        pieces.append(memory[done : begin + self._room])
+        return Published(monitor, node.topic, node.kind.name, b"".join(pieces), node.site)
 
 
 def is_text(node: form.Expression) -> bool:

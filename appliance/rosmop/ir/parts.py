@@ -25,6 +25,7 @@ class Parts(ABC):
         self._assigned: set[str] = set()  # variables of the set, and local vectors
         self._rooms: dict[str, int] = {}  # where local vectors are
         self._brief = True
+        self._publishes: set[tuple[str, str]] = set()  # contexts and topics
 
     @abstractmethod
     def _block(self, statements: Sequence[form.Statement]) -> bytes:

@@ -196,6 +196,12 @@ class Places(Arithmetic):
 
 def root_of(node: form.Expression) -> str:
     """The variable that a value is, is in, or is copied from; none where that is not plain."""
+    found = root(node)
+    return "" if found is None else found.name
+
+
+def root(node: form.Expression) -> form.Read | form.Assign | None:
+    """The same as it is read or assigned."""
     while not isinstance(node, form.Read | form.Assign):
         if isinstance(node, form.Copy):
             node = node.value
@@ -204,5 +210,5 @@ def root_of(node: form.Expression) -> str:
         elif isinstance(node, form.Call) and node.function == "l_element":
             node = node.arguments[0]
         else:
-            return ""
-    return node.name
+            return None
+    return node

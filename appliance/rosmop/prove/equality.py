@@ -3,10 +3,11 @@
 An event and its function in the module are equal if, for every message of up to `AREA` bytes and every state, the
 function leaves the message to Python (which then judges it anew), or
 
-- the form neither faults nor publishes anything,
+- the form does not fault,
 - both say the same of whether the event happened, dropped the message, changed it,
 - and the bytes of the message, the variables and what is left of the budget are the same. (What lines of output say is
-  not compared, and an event that looks at a string or vector that is kept, or changes or makes one, is not proved.)
+  not compared, and an event that looks at a string, vector or message that is kept, or changes or makes one, or
+  publishes, is not proved.)
 
 Where it leaves the message, the walk takes back what it has done: each variable that it has written stands among those
 that are taken back, and each byte in the log (`module_terms.py`).
@@ -126,13 +127,15 @@ class Validation:
     def _compared(self, name: str, number: int, topic: str) -> str:
         begin, cells, known = self._beginning()
         meant = Meaning(self._forms, self._values, begin, name).result()
-        done = Execution(self.codes, number, begin.message, begin.size, cells, self._strings).done()
+        done = Execution(
+            self.codes, number, begin.message, begin.size, cells, self._strings, self._module.places
+        ).done()
         self._check_undone(done, topic)
         left = either(done.trapped, done.bits == _ELSEWHERE)
         unknown = either(*meant.unknown.values())
         wrong = {
             "it looks beyond the message": done.outside,
-            "it goes on where the form faults or publishes": both(opposite(left), meant.left),
+            "it goes on where the form faults": both(opposite(left), meant.left),
         }
         others = {
             "whether it happened": _bit(done.bits, _HAPPENED) != meant.happened,

@@ -200,9 +200,8 @@ class Meaning:
     def _drop(self, _node: form.Drop, state: State) -> None:
         state.slots[_DROPPED] = z3.BoolVal(True)
 
-    def _publish(self, _node: form.Publish, state: State) -> None:
-        """What comes out of it is for Python."""
-        self._leave_to_python(state, z3.BoolVal(True))
+    def _publish(self, _node: form.Publish, _state: State) -> None:
+        raise UnknownError("a message that is published")
 
     def _log(self, node: form.Log, state: State) -> None:
         """A line costs the most that it can; that the module keeps the right values for it is not looked at."""

@@ -8,7 +8,8 @@ Three kinds of places are known, and an address that is none of them is a differ
 - the log, by which a message that is left is put back: whatever is written into the message was noted there before,
   address, size and the bytes that stood there, and a note is never written again.
 
-Of strings that variables keep, and of constant ones, nothing is known: who looks at them is not proved.
+Of strings that variables keep, and of constant ones, nothing is known, nor of messages that are made, kept or
+published: who looks at them is not proved.
 
 What the function has left (`ELSEWHERE`) and a trap are the same: the walk takes back what was begun.
 """
@@ -88,7 +89,8 @@ class Done:
 class Execution:
     """One event's function, by its number, begun with these cells (truths are numbers, too).
 
-    `strings` are the addresses of strings, and of the cells that say where they are.
+    `strings` are the addresses of strings, and of the cells that say where they are; `messages` those of messages that
+    are made or kept, and of what says whether one may be published.
     """
 
     def __init__(  # noqa: PLR0917  as `done` names them
@@ -99,9 +101,11 @@ class Execution:
         size: Term,
         cells: Mapping[int, Term],
         strings: Sequence[range] = (),
+        messages: Sequence[range] = (),
     ) -> None:
         self._functions = functions
         self._strings = strings
+        self._messages = messages
         self._size = size
         self._trapped: list[Term] = []
         self._outside: list[Term] = []
@@ -281,10 +285,12 @@ class Execution:
             self._stored.add(place)
 
     def _cell(self, address: Any, offset: int) -> int:
-        """A constant address of what is no string."""
+        """A constant address of what is neither a string nor a message."""
         number = z3.simplify(_bits(address))
         known = z3.is_bv_value(number)
         place = int(number.as_long()) + offset if known else -1
+        if any(place in message for message in self._messages) or (self._messages and not known):
+            raise NotProvedError("uses a message that is made, kept or published")
         if any(place in string for string in self._strings) or (self._strings and not known):
             raise NotProvedError("uses a constant string, or a string or vector that is kept or made")
         if not known:

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
 BUDGET = 1_000_000
 """Instructions that a specification may spend on one message."""
@@ -63,8 +63,7 @@ def line_of(level: str, text: bytes, monitor: str) -> LogLine:
     return LogLine(level, text.decode("utf-8", "replace").rstrip("\n"), monitor)
 
 
-@dataclass(frozen=True, slots=True)
-class Published:
+class Published(NamedTuple):
     """A message to be published by a monitor; `site` is that of the statement."""
 
     monitor: str

@@ -38,7 +38,8 @@ _LOGICS = (
     "pattern: globally: e0 forbids e1 within 800us{violation}",
 )
 _HANDLERS = (*[""] * 8, "@{} {{ }}", '@{} {{ ROS_WARN("{}"); }}', "@{} {{ DROP; }}", "@{} {{ __RESET; }}",
-             "@{} {{ total = total + 1; }}")  # fmt: skip
+             "@{} {{ total = total + 1; }}",
+             "@{} {{ told.linear.z = total; PUBLISH(/told, geometry_msgs/Twist, told); }}")  # fmt: skip
 
 
 def definitions() -> Definitions:
@@ -81,7 +82,8 @@ class Specifications:
         tick = random.choice(("", "", "", "event tick() every 2ms { total = 0; }"))
         return (
             f"s{number}() {{ int total = 0; double level = 1.5; bool seen = false; std::string last;\n"
-            f"std::vector<int> all; std::vector<double> window; double slots[3] = {{1}}; {helper}\n"
+            f"std::vector<int> all; std::vector<double> window; double slots[3] = {{1}};\n"
+            f"geometry_msgs::Twist told; std_msgs::Bool flag; {helper}\n"
             + "\n".join([*events, tick, *properties])
             + "\n}"
         )
@@ -156,6 +158,7 @@ class Specifications:
             *(f'if ({name} == "abc") {{ last = {name}; }}' for name in texts),
             *(f'ROS_INFO("%s %.3f %d", {name}.c_str(), {value}, total);' for name in texts),
             f'ROS_WARN("%g and %5d", (double) {value}, total);', f"std::cout << {value} << std::endl;",
+            *self._publications([*texts, "last", '"none"'], value),
         ]  # fmt: skip
         choices += [f'for (int i = 0; i < {name}.size(); i++) {{ if ({name}[i] == "nnnn") {{ total += i; }} }}'
                     for name, (_, kind) in names.items() if kind == "std::string[]"]  # fmt: skip
@@ -188,6 +191,21 @@ class Specifications:
                         "for (int i = 0; i < 3; i++) { total += i; }"]  # fmt: skip
             choices += [f'{name} = "other";' for name in texts]
         return random.choice(choices)
+
+    def _publications(self, texts: list[str], value: str) -> list[str]:
+        """Statements that make messages, change those that are kept, and publish."""
+        text = self._random.choice(texts)
+        return [
+            f"{{ std_msgs::String m; m.data = {text}; PUBLISH(/text, std_msgs/String, m); }}",
+            f"{{ std_msgs::Header m; m.seq = {value}; m.stamp = ros::Time::now(); m.frame_id = {text};"
+            ' if (m.frame_id == "abc") { total++; } PUBLISH(/header, std_msgs/Header, m); }',
+            f"{{ geometry_msgs::PoseWithCovariance m; m.pose.position.x = {value}; m.covariance[total] = level;"
+            " level = m.covariance[3]; PUBLISH(/pose, geometry_msgs/PoseWithCovariance, m); }",
+            f"told.linear.x = {value}; told.angular = told.linear; PUBLISH(/told, geometry_msgs/Twist, told);",
+            "PUBLISH(/linear, geometry_msgs/Vector3, told.linear); total += told.angular.x;",
+            f"{{ geometry_msgs::Twist m = told; m.linear.y = {value}; told = m; }}",
+            f"flag.data = {value}; PUBLISH(/text2, std_msgs/Bool, flag);",
+        ]
 
 
 class Messages:

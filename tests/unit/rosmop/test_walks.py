@@ -17,7 +17,7 @@ from appliance.rosmop.ir.layout import LINES
 from appliance.rosmop.ir.places import MOST_TEXTS
 from appliance.rosmop.logics.interface import ClockedRun, FiniteRun
 from appliance.rosmop.outcomes import Outcome, Verdict, named
-from appliance.rosmop.runtime.context import LogLine
+from appliance.rosmop.runtime.context import LogLine, Published
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walks import BEGINNING, Walker
@@ -61,6 +61,10 @@ class Fed:
         """How often there was each verdict, whoever came to it."""
         self.lines: list[LogLine] = []
         """What was put out since it was checked last."""
+        self.published: list[Published] = []
+        """The same of what was published."""
+        self.publishing = True
+        """Whether publications are only counted."""
         self.counting = False
         """Whether verdicts are only counted."""
         self._inside = False
@@ -77,20 +81,23 @@ class Fed:
         expected = []
         began, self.counts = len(self.interpreted), Counter()
         lines: list[LogLine] = []
+        published: list[Published] = []
         for body in bodies:
             outcome = self.interpreter.process(topic, bytearray(body), time)
             self.interpreted += (one for each in (*outcome.before, outcome) for one in each.verdicts)
             lines += (line for each in (*outcome.before, outcome) for line in each.log)
+            published += (one for each in (*outcome.before, outcome) for one in each.published)
             self.came[outcome.result if not outcome.faults else "fault"] += 1
             if outcome.result != "dropped":
                 expected.append(bytes(outcome.buffer))
         self._inside = not self._inside
-        told, self.lines = len(self.told), []
+        told, self.lines, self.published = len(self.told), [], []
         assert self._fed(frames(bodies), topic, time) == frames(expected)
         assert self.counts + Counter(map(named, self.told[told:])) == Counter(
             map(named, self.interpreted[began:])
         )
         assert self.lines == lines
+        assert self.published == published
         assert self.counting or self.told[told:] == self.interpreted[began:]
         assert self.state() == _state(self.interpreter)
         return expected
@@ -111,11 +118,17 @@ class Fed:
             if walker is not None and self.monitors.walks(walker, time):
                 before = position
                 counted = [self.counting] * len(walker.verdicts)
-                prepared = walker.prepare(loud=False, told=(), counted=counted)
+                publishing = [self.publishing] * len(walker.publishes)
+                prepared = walker.prepare(loud=False, told=(), counted=counted, published=publishing)
                 walked = walker.walk(view, position, run, pieces, time, prepared)
                 for verdict, count in zip(walker.verdicts, walked.told if walked else (), strict=False):
                     self.counts[named(verdict)] += count
-                self.lines += (line for _, line in (walked.lines if walked else ()))
+                output = [each for _, each in walked.output] if walked else []
+                self.lines += (each for each in output if isinstance(each, LogLine))
+                published = [each for each in output if isinstance(each, Published)]
+                if published:
+                    self.came["published together"] += len(published)
+                self.published += published
                 position, run = (len(view), run) if walked is None else (walked.position, walked.run)
                 self.came["together"] += position > before
                 if position == len(view):
@@ -125,6 +138,7 @@ class Fed:
             outcome = self.monitors.process(topic, view[first:following], time)
             self.told += (one for each in (*outcome.before, outcome) for one in each.verdicts)
             self.lines += (line for each in (*outcome.before, outcome) for line in each.log)
+            self.published += (one for each in (*outcome.before, outcome) for one in each.published)
             if outcome.result == "dropped":
                 pieces.append(view[run:position])
                 run = following
@@ -171,6 +185,7 @@ def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> Non
     for number in range(4):
         traffic = messages.traffic()
         fed.counting = bool(seed + number & 2)
+        fed.publishing = bool(seed + number & 3)
         fed.check([*traffic.bodies(), *wild], traffic.topic, number)
 
 
@@ -186,7 +201,8 @@ def test_most_of_that_is_taken_together_and_everything_comes_up() -> None:
         for traffic in (messages.traffic() for _ in range(6)):
             fed.check(list(traffic.bodies()), traffic.topic)
         came += fed.came
-    assert min(came[what] for what in ("fault", "dropped", "changed", "passed", "together")) > 3
+    found = ("fault", "dropped", "changed", "passed", "together", "published together")
+    assert min(came[what] for what in found) > 3
 
 
 @FEW

@@ -21,6 +21,7 @@ from appliance.relay.report import Reporter
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import ClockedRun, FiniteRun
+from appliance.rosmop.runtime.context import Published
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walks import Walked
 from tests.support.relay_memory import share
@@ -63,11 +64,13 @@ class Monitored:
     ) -> None:
         self.heard = Heard()
         self.time = began
+        self.published: list[Published] = []
+        """What monitors have published."""
         self._loop = Loop()
         self.middle = Middle(
             self._loop,
             self.heard,
-            publish=lambda _published: None,
+            publish=self.published.append,
             changed=lambda _topics: None,
         )
         self.middle.now = lambda: self.time  # type: ignore[method-assign]  # the test sets the time
@@ -145,6 +148,7 @@ def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traff
                     way.middle.switch(switched[1], number != switched[0])
             one, together = (way.through(traffic) for way in ways)
             assert one == together, f"batch {number} of {traffic.topic}"
+            assert ways[0].published == ways[1].published
             one_state, state = (way.state() for way in ways)
             assert one_state == state, f"after batch {number} of {traffic.topic}"
             if number % 4 == 3:
@@ -226,6 +230,18 @@ HARD = {
             event f(std::string f) /stamped own/Stamped '{frame:f}' { ROS_WARN("from %s", f.c_str()); }
             ptltl: f @violation { ROS_ERROR("not f"); if (1 > 0) { DROP; } } }
         t() { int n = 0; event e(int kind) /plain own/Plain '{kind:kind}' { n++; if (kind == 1) { return; } } }""",
+    "published for every message": """
+        s() { geometry_msgs::Vector3 last; std_msgs::String text; int n = 0;
+            event e(int count, double x) /plain own/Plain '{count:count, x:x}' {
+                std_msgs::Header h; h.seq = count; h.stamp = ros::Time::now(); PUBLISH(/header, std_msgs/Header, h);
+                n++; if (x > 2) { last.y = n; ROS_INFO("%d", n); PUBLISH(/last, geometry_msgs/Vector3, last); }
+                if (count == 5) { x = 3; } last.x = x; PUBLISH(/last, geometry_msgs/Vector3, last);
+                if (n % 7 == 3) { return; } }
+            event f(std::string f) /stamped own/Stamped '{frame:f}' {
+                std_msgs::String m; m.data = f; PUBLISH(/text, std_msgs/String, m); }
+            ptltl: f @violation { PUBLISH(/last, geometry_msgs/Vector3, last); if (last.x > 1) { DROP; } } }
+        t() { std_msgs::Bool b; event e(int kind) /plain own/Plain '{kind:kind}' {
+            b.data = kind; PUBLISH(/bool, std_msgs/Bool, b); if (kind == 1) { return; } } }""",
     "a budget that runs out": """
         s() { int n = 0; event e(int count, double x) /plain own/Plain '{count:count, x:x, kind:2}' {
             if (count == 5 && x > 50) { while (true) { n++; } } n = 1; } }""",

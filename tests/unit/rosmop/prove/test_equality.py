@@ -93,6 +93,9 @@ UNPROVED = {
     "uses a constant string, or a string or vector that is kept or made": event(
         'if (x) { last = "x"; }', "int x", "count:x", "std::string last;"
     ),
+    "uses a message that is made, kept or published": event(
+        "if (x) { m.data = x; PUBLISH(/out, std_msgs/Int32, m); }", "int x", "count:x", "std_msgs::Int32 m;"
+    ),
     IN_PYTHON: event("y = sin(y);", "double y", "x:y"),
 }
 

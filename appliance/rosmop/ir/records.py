@@ -1,0 +1,234 @@
+"""Messages that are made or kept: fields that are put into them, copies, and what is published of them.
+
+Each has its own part of the memory and stands there as it is sent, but of a string stands its address and length; so
+what has arrays of any length is beyond. One that is kept has no strings either.
+
+Whatever is put there has one encoding only: what has several in the message that it comes from (a truth, a time with
+too many nanoseconds) is written anew, and a message that puts a NaN there is left. So what is published is copied.
+"""
+
+from collections.abc import Iterator
+
+from appliance.rosmop.ir import form
+from appliance.rosmop.ir.layout import LINES, MOST_MADE, POSITION, SAID, NotScalarError, machine_type
+from appliance.rosmop.ir.output import HEAD, Line, Publication
+from appliance.rosmop.ir.places import root, root_of
+from appliance.rosmop.ir.texts import MOST_KEPT
+from appliance.rosmop.ir.values import struct_code, struct_size
+from appliance.rosmop.ir.vectors import Vectors
+from appliance.rosmop.ir.wasm import COMPARE, F32, F64, I32, I64, STORE, constant, unsigned
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
+
+_CHANGING = ("a_slot", "a_put")
+"""Functions that put something into a message, or into an array of fixed length in one."""
+
+_LOADS = {8: 0x29, 4: 0x28, 2: 0x2F, 1: 0x2D}
+_STORES = {4: 0x36, 2: 0x3B, 1: 0x3A, 8: 0x37}
+
+
+class Records(Vectors):
+    """Writes what makes messages."""
+
+    _messages: frozenset[str] = frozenset()
+    """The local variables that are messages with a place of their own; of others it is that of what they are."""
+
+    def _own_places(self, function: form.Function | form.Skipper) -> None:
+        """Find out which local variables have a place of their own: whatever may differ from where it came from."""
+        given = function.parameters if isinstance(function, form.Function) else ()
+        inner = [*form.nodes(function.body)]
+        assigned = [
+            (node.name, root_of(node.value))
+            for node in inner
+            if isinstance(node, form.Assign)
+            and isinstance(node.type, kinds.Record)
+            and node.name not in (*self._layout.shared, *given)
+        ]
+        changed = {
+            root_of(node.arguments[0])
+            for node in inner
+            if isinstance(node, form.Call) and node.function in _CHANGING
+        }
+        made = {
+            name
+            for name, source in assigned
+            if not source or source in self._layout.shared or name in changed
+        }
+        while more := {name for name, source in assigned if source in made} - made:
+            made |= more
+        self._messages = frozenset(made)
+
+    def _is_own(self, name: str) -> bool:
+        return name in self._messages or name in self._layout.shared
+
+    def _place(self, node: form.Expression) -> tuple[bytes, bytes]:
+        if isinstance(node, form.Read) and node.name in self._layout.shared:
+            return b"", constant(I32, self._layout.record(node.name, node.type))
+        if isinstance(node, form.Copy) and root_of(node) in self._layout.shared:
+            raise NotScalarError(
+                "a copy of a message that is kept"
+            )  # that may be changed while this is looked at
+        return super()._place(node)
+
+    def _elements(self, node: form.Expression) -> tuple[bytes, bytes, bytes]:
+        if isinstance(node, form.Copy) and self._is_message(node.value):
+            raise NotScalarError("a copy of an array in a message that is made")  # as above
+        if not isinstance(node, form.Item) or not isinstance(node.type, kinds.String):
+            return super()._elements(node)
+        first, place = self._place(node.base)
+        name, at = f"text {len(self._locals)}", self._layout.offset(node.base.type, node.number)
+        code = first + place + self._set(name)
+        begin, length = (self._get(name) + b"\x28\x00" + unsigned(at + more) for more in (0, 4))
+        return code, begin, length + b"\xad"
+
+    def _assigned_record(self, node: form.Assign) -> bytes:
+        """Give a message to a variable."""
+        if node.name in self._layout.shared:
+            at = self._layout.record(node.name, node.type)
+            self._assigned.add(node.name)
+            return self._put_value(constant(I32, at), 0, node.type, node.value)
+        name = f"place of {node.name}"
+        if node.name not in self._messages:
+            return b"".join(self._place(node.value)) + self._set(name)
+        code = constant(I32, self._layout.made(node.type)) + self._set(name)
+        return code + self._put_value(self._get(name), 0, node.type, node.value)
+
+    # What is put into one
+
+    def _changes_message(self, node: form.Expression) -> bool:
+        """Whether it puts something into a message that is made or kept here."""
+        if not isinstance(node, form.Call) or node.function not in _CHANGING:
+            return False
+        return self._is_message(node.arguments[0])
+
+    def _is_message(self, node: form.Expression) -> bool:
+        """Whether it is in a message that is made or kept here."""
+        found = root(node)
+        return found is not None and isinstance(found.type, kinds.Record) and self._is_own(found.name)
+
+    def _change(self, node: form.Call) -> bytes:
+        """Put a value into a field, or into an element of an array of fixed length."""
+        base, where, value = node.arguments
+        if root_of(base) in self._layout.shared:
+            self._assigned.add(root_of(base))
+        if node.function == "a_slot":
+            assert isinstance(where, form.Literal)  # noqa: S101  the number of a field
+            number = int(where.value or 0)
+            first, place = self._place(base)
+            kind, offset = self._layout.field(base.type, number), self._layout.offset(base.type, number)
+            return first + self._put_value(place, offset, kind, value)
+        name = f"element {len(self._locals)}"
+        kind, _ = self._layout.element(base.type)
+        address = self._address_of(form.Call(value.type, "l_element", (base, where), node.site))
+        return address + self._set(name) + self._put_value(self._get(name), 0, kind, value)
+
+    def _put_value(self, place: bytes, offset: int, kind: Type, value: form.Expression) -> bytes:
+        """Put a value of this type so many bytes behind a place."""
+        if isinstance(kind, kinds.Record | kinds.Vector):
+            return self._put_whole(place, offset, kind, value)
+        if isinstance(kind, kinds.String):
+            first, begin, length = self._elements(value)
+            code = first + place + begin + b"\x36\x00" + unsigned(offset)
+            return code + place + length + b"\xa7\x36\x00" + unsigned(offset + 4)
+        if struct_code(kind) != struct_code(value.type):
+            raise NotScalarError(str(value.type))
+        return self._put_number(place, offset, kind, self._value(value))
+
+    def _put_number(self, place: bytes, offset: int, kind: Type, value: bytes) -> bytes:
+        codes, machine = struct_code(kind) or "", machine_type(kind)
+        store = bytes((STORE[struct_size(codes)], 0)) + unsigned(offset)
+        if machine in (F32, F64):
+            kept = f"kept {machine}"
+            none = self._get(kept, machine) + self._get(kept, machine) + bytes((COMPARE[machine]["!="],))
+            code = value + self._set(kept, machine) + self._when(none, self._elsewhere)
+            bits = b"\xbc" if machine == F32 else b"\xbd"
+            return code + place + self._get(kept, machine) + bits + store
+        code = b""
+        if len(codes) == 2:
+            code, value = self._parts_of(kind, value)
+        return code + place + value + store
+
+    def _put_whole(self, place: bytes, offset: int, kind: Type, value: form.Expression) -> bytes:
+        """A message, or an array of fixed length: zeros, or a copy."""
+        if value.type != kind:
+            raise NotScalarError(str(value.type))
+        size = self._layout.extent(kind)
+        if isinstance(value, form.Zero):
+            return b"".join(
+                place
+                + constant(I64 if some == 8 else I32, 0)
+                + bytes((_STORES[some], 0))
+                + unsigned(offset + at)
+                for at, some in _pieces(size)
+            )
+        code, own = b"", self._is_own(root_of(value))
+        if isinstance(value, form.Copy):
+            value = value.value
+            code = b"".join(self._allocated(constant(I64, made)) for made in self._layout.arrays(kind))
+        elif own:
+            raise NotScalarError("two names of one message")
+        source = f"source {len(self._locals)}"
+        code += b"".join(self._place(value)) + self._set(source)
+        return code + self._copy_of(place, offset, kind, source, own=own)
+
+    def _copy_of(self, place: bytes, offset: int, kind: Type, source: str, *, own: bool) -> bytes:
+        """Copy what stands where a local variable says; `own`: it is such a message itself."""
+        from_there = self._get(source)
+        if own:
+            return b"".join(
+                place
+                + from_there
+                + bytes((_LOADS[some], 0))
+                + unsigned(at)
+                + bytes((_STORES[some], 0))
+                + unsigned(offset + at)
+                for at, some in _pieces(self._layout.extent(kind))
+            )
+        self._layout.size(kind)  # fixed: it stands as in a message
+        return b"".join(
+            self._put_number(place, offset + at, leaf, self._loaded(from_there, at, leaf))
+            for at, leaf in self._layout.leaves(kind)
+        )
+
+    # What is published
+
+    def _noted_line(self, line: Line | Publication, cost: bytes) -> bytes:
+        """Pay for a line of output or a publication and begin it, where the local variable `line` says then."""
+        code = self._cell(0x28, SAID) + self._set("line")
+        end = self._get("line") + constant(I32, line.size) + b"\x6a"
+        full = end + constant(I32, self._layout.said + LINES) + b"\x4b"
+        code += self._when(full, self._elsewhere) + self._spend(cost) + self._cell(0x36, SAID, end)
+        for offset, head in ((0, constant(I32, len(self._layout.lines))), (4, self._cell(0x28, POSITION))):
+            code += self._get("line") + head + b"\x36\x00" + unsigned(offset)
+        self._layout.lines.append(line)
+        return code
+
+    def _publish(self, node: form.Publish) -> bytes:
+        """Note a message that is published; elsewhere if it is to be told in full."""
+        kind, source = node.kind, f"source {len(self._locals)}"
+        size = self._layout.extent(kind)
+        if size > MOST_MADE:
+            raise NotScalarError(f"{kind} of {size} bytes")
+        texts = [at for at, leaf in self._layout.leaves(kind) if isinstance(leaf, kinds.String)]
+        publication = Publication(node, self._context, size, texts)
+        counted = self._cell(0x29, self._layout.publication(self._context, node.topic))
+        self._publishes.add((self._context, node.topic))
+        code = self._when(counted + b"\x50", self._elsewhere)
+        code += b"".join(self._place(node.value)) + self._set(source)
+        cost = constant(I64, publication.cost)
+        for at in texts:
+            length = self._get(source) + b"\x35\x00" + unsigned(at + 4)
+            long = length + constant(I64, MOST_KEPT) + b"\x56"
+            code, cost = code + self._when(long, self._elsewhere), cost + length + b"\x7c"
+        code += self._noted_line(publication, cost)
+        own = self._is_own(root_of(node.value))
+        return code + self._copy_of(self._get("line"), HEAD.size, kind, source, own=own)
+
+
+def _pieces(size: int) -> Iterator[tuple[int, int]]:
+    """Where to load and store how many bytes, of so many."""
+    at = 0
+    for some in (8, 4, 2, 1):
+        while size - at >= some:
+            yield at, some
+            at += some
