@@ -406,7 +406,7 @@ inline carry_out() {
     /* = appliance/relay/grants.py StatedTable.state */
     :: message == grant -> allowed[PAIR(number, flags)] = true
     /* = appliance/relay/grants.py StatedTable.withdraw
-       = appliance/relay/engine.py Engine._connected_by
+       = appliance/relay/engine.py Engine._cut_by
        = appliance/relay/connections/subscriber.py Subscriber.cut */
     :: message == revoke ->
         allowed[PAIR(number, flags)] = false;

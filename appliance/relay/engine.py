@@ -44,6 +44,8 @@ from appliance.relay.recorder_ring import Recorded
 from appliance.relay.report import Reporter
 from appliance.shares.pool import Standing
 
+_Grant = tuple[str, str, str, str, str]  # kind, key, name of the topic or service, host, caller id
+
 
 class Engine:
     """One relay, without the process around it."""
@@ -75,6 +77,7 @@ class Engine:
         self._own_headers: dict[str, dict[str, str]] = {}
         self._own_service = OwnService(loop, self._reporter.send)
         self.clients: set[ServiceClient] = set()
+        self._by_grant: dict[_Grant, set[Subscriber | ServiceClient]] = {}
         self._services: dict[tuple[str, str], ServiceTraffic] = {}
         self.visitors: set[Visitor] = set()
         self.waiting: dict[str, set[Visitor]] = {}
@@ -185,22 +188,20 @@ class Engine:
         elif isinstance(message, messages.PublicationWithdrawn):
             self._remove_topic(message.key, message.topic, "the topic is published no longer")
         elif isinstance(message, messages.GrantRevoked):
-            for subscriber in self._connected_by(message):
-                subscriber.cut("its grant is revoked")
+            self._cut_by(("topic", message.key, message.topic, message.host, message.caller_id))
         elif isinstance(message, messages.ServiceWithdrawn):
             self._cut_clients("the service is offered no longer", message.key, message.service)
             self._forget_services(message.key, message.service)
         elif isinstance(message, messages.ClientRevoked):
-            client = message.host, message.caller_id
-            self._cut_clients("its grant is revoked", message.key, message.service, client)
+            self._cut_by(("service", message.key, message.service, message.host, message.caller_id))
 
-    def _cut_clients(
-        self, reason: str, key: str, service: str | None = None, of: tuple[str, str] | None = None
-    ) -> None:
+    def _cut_by(self, grant: _Grant) -> None:
+        for peer in list(self._by_grant.get(grant, ())):
+            peer.cut("its grant is revoked")
+
+    def _cut_clients(self, reason: str, key: str, service: str | None = None) -> None:
         for client in list(self.clients):
-            placed = client.service
-            who = client.host, client.caller_id
-            if placed.key == key and service in {None, placed.service} and of in {None, who}:
+            if client.service.key == key and service in {None, client.service.service}:
                 client.cut(reason)
 
     def _forget_services(self, key: str, service: str | None = None) -> None:
@@ -249,18 +250,10 @@ class Engine:
     def _limit_subscriber(self, message: messages.GrantInstalled) -> None:
         """Limit the connections of this grant so from now on."""
         flow = self._flows.of(message.limit, message.topic, message.host, message.caller_id)
-        for subscriber in self._connected_by(message):
-            subscriber.flow = flow
-
-    def _connected_by(self, grant: messages.GrantInstalled | messages.GrantRevoked) -> list[Subscriber]:
-        placed = self.topics.get((grant.key, grant.topic))
-        members = () if placed is None else placed[0].members
-        who = grant.host, grant.caller_id
-        return [
-            subscriber
-            for subscriber in members
-            if isinstance(subscriber, Subscriber) and (subscriber.host, subscriber.caller_id) == who
-        ]
+        grant = ("topic", message.key, message.topic, message.host, message.caller_id)
+        for subscriber in self._by_grant.get(grant, ()):
+            if isinstance(subscriber, Subscriber):
+                subscriber.flow = flow
 
     def _make_room(self, host: str, size: int) -> None:
         """A host wants to have a message latched: those that have more than it would have make room."""
@@ -458,12 +451,14 @@ class Engine:
         node = self._table.node(visitor.key)
         traffic = self._services.setdefault((service.key, service.service), ServiceTraffic())
 
+        grant = ("service", service.key, service.service, visitor.host, caller_id)
+
         def refuse(sock: socket.socket, reason: str) -> None:
-            self.clients.discard(client)
+            self._forget(grant, client)
             self._refuse(visitor, ("service", service.service), caller_id, sock, reason)
 
         def ended() -> None:
-            self.clients.discard(client)
+            self._forget(grant, client)
             self.ports.left(visitor.host)
 
         client = ServiceClient(
@@ -479,24 +474,37 @@ class Engine:
             own=self._own_service if node is not None and node.monitors else None,
         )
         self.clients.add(client)
+        self._by_grant.setdefault(grant, set()).add(client)
         client.start(rest)
 
     def _subscribe(self, visitor: Visitor, sock: socket.socket, fields: Mapping[str, str]) -> None:
         relayed, _publisher = self.topics[visitor.key, fields["topic"]]
+        grant = ("topic", visitor.key, relayed.topic, visitor.host, fields["callerid"])
 
         def refuse(sock: socket.socket, reason: str) -> None:
+            self._forget(grant, subscriber)
             self._refuse(visitor, ("topic", relayed.topic), fields["callerid"], sock, reason)
 
         def ended() -> None:
+            self._forget(grant, subscriber)
             self.ports.left(visitor.host)
 
         subscriber = Subscriber(
             self._context, sock, relayed, visitor.host, fields, refuse=refuse, ended=ended
         )
-        grant = self._table.grant(visitor.key, relayed.topic, visitor.host, subscriber.caller_id)
-        if grant is not None:
-            subscriber.flow = self._flows.of(grant.limit, relayed.topic, grant.host, grant.caller_id)
+        stated = self._table.grant(visitor.key, relayed.topic, visitor.host, subscriber.caller_id)
+        if stated is not None:
+            subscriber.flow = self._flows.of(stated.limit, relayed.topic, stated.host, stated.caller_id)
+        self._by_grant.setdefault(grant, set()).add(subscriber)
         relayed.join(subscriber)
+
+    def _forget(self, grant: _Grant, peer: Subscriber | ServiceClient) -> None:
+        if isinstance(peer, ServiceClient):
+            self.clients.discard(peer)
+        peers = self._by_grant.get(grant, set())
+        peers.discard(peer)
+        if not peers:
+            self._by_grant.pop(grant, None)
 
     def _refuse(
         self, visitor: Visitor, asked: tuple[str, str], caller_id: str, sock: socket.socket, reason: str

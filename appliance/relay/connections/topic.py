@@ -86,8 +86,8 @@ class Upstream(Protocol):
     def resume(self) -> None:
         """Read on."""
 
-    def announce(self, names: frozenset[str], type_name: str) -> None:
-        """These are served now, of a topic of this type."""
+    def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
+        """Others are served now, of a topic of this type; `names` says who when the turn of the loop is over."""
 
     def give_again(self) -> None:
         """Have a latching publisher give its message again."""
@@ -144,8 +144,10 @@ class RelayedTopic:
         self._unkept: LatchRefused | None = None
         self._fresh_until = clock() + (APPEARED if fresh else -1)
         self._header: dict[str, str] | None = None
-        self._waiting: tuple[Member, ...] = ()
-        self._served: tuple[Member, ...] = ()
+        # There may be thousands, which end in one turn of the loop: none is looked for.
+        self._waiting: dict[Member, None] = {}
+        self._served: dict[Member, None] = {}
+        self._row: tuple[Member, ...] | None = None  # those that are served, once they are gone through
         self._latched: Batch | None = None
         self._latching = False
         self._withheld = False
@@ -163,12 +165,12 @@ class RelayedTopic:
     @property
     def members(self) -> tuple[Member, ...]:
         """All that are connected for this topic."""
-        return self._waiting + self._served
+        return (*self._waiting, *self._served)
 
     def join(self, member: Member) -> None:
         """A subscriber with a grant: served at once when the publisher's header is known, else when it is."""
         if self._header is None:
-            self._waiting += (member,)
+            self._waiting[member] = None
         else:
             self._serve(member, self._header)
         if self.upstream is not None:
@@ -176,8 +178,9 @@ class RelayedTopic:
 
     def leave(self, member: Member) -> None:
         """A subscriber's connection is closed."""
-        self._waiting = tuple(other for other in self._waiting if other is not member)
-        self._served = tuple(other for other in self._served if other is not member)
+        self._waiting.pop(member, None)
+        self._served.pop(member, None)
+        self._row = None
         self._announce()
         self._reported = False
         self._forget_header()
@@ -202,8 +205,12 @@ class RelayedTopic:
         self._looks = tuple(other for other in self._looks if other != look)
         self._spare_unwanted()
 
+    @property
+    def _is_wanted(self) -> bool:
+        return bool(self._waiting or self._served or self._wanted or self._looks)
+
     def _spare_unwanted(self) -> None:
-        if not (self.members or self._wanted or self._looks) and self.upstream is not None:
+        if not self._is_wanted and self.upstream is not None:
             self.upstream.spare()
 
     def monitor(self, through: Through | None, *, wanted: bool) -> None:
@@ -229,13 +236,13 @@ class RelayedTopic:
             self._recording = self._recorder.open(self.topic, self.host, header)
         self._listen()
         if before is not None and _identity(before) != _identity(header):
-            for member in self._served:
+            for member in self._each():
                 member.cut("the publisher has come back with another type")
-        waiting, self._waiting = self._waiting, ()
+        waiting, self._waiting = self._waiting, {}
         for member in waiting:
             self._serve(member, header)
         self._announce()
-        if (self.members or self._wanted or self._looks) and self.upstream is not None:
+        if self._is_wanted and self.upstream is not None:
             self.upstream.want()
 
     @property
@@ -312,7 +319,7 @@ class RelayedTopic:
             if self._first_words.over(now) or not self._first_words.add(batch, now):
                 self._forget_first_words()
         congested = False
-        for member in self._served:
+        for member in self._each():
             self._dropped += member.deliver(batch)
             congested = congested or member.behind_since is not None
         if congested:
@@ -342,7 +349,7 @@ class RelayedTopic:
             self._admit(waiting, now)
         if self._first_words is not None and self._first_words.over(now):
             self._forget_first_words()
-        for member in self._served:
+        for member in self._each():
             if self._latched is not None and member.missed:
                 self._dropped += member.deliver(self._latched)
             if member.full:
@@ -386,7 +393,7 @@ class RelayedTopic:
     def _serve(self, member: Member, header: Mapping[str, str]) -> None:
         if not member.greet(header):
             return
-        self._served += (member,)
+        self._served[member] = self._row = None
         self._announce()
         self._reported = False
         if self._latched is not None:
@@ -402,7 +409,12 @@ class RelayedTopic:
     def _listen(self) -> None:
         """Begin to keep what a publisher says first that has just appeared and has nobody but a monitor."""
         now = self._clock()
-        if now <= self._fresh_until and self._wanted and not self._latching and not self.members:
+        if (
+            now <= self._fresh_until
+            and self._wanted
+            and not self._latching
+            and not (self._waiting or self._served)
+        ):
             self._first_words = FirstWords(self._share, now)
         self._fresh_until = now - 1  # the next connection is not its first
 
@@ -419,8 +431,16 @@ class RelayedTopic:
     def _announce(self) -> None:
         """Tell the upstream which subscribers are served."""
         if self.upstream is not None and self._header is not None:
-            names = frozenset(member.caller_id for member in self._served)
-            self.upstream.announce(names, self._header.get("type", ""))
+            self.upstream.announce(self._names, self._header.get("type", ""))
+
+    def _names(self) -> frozenset[str]:
+        return frozenset(member.caller_id for member in self._served)
+
+    def _each(self) -> tuple[Member, ...]:
+        """Those that are served, however many of them end meanwhile."""
+        if self._row is None:
+            self._row = tuple(self._served)
+        return self._row
 
     def _latch(self, batch: Batch | None) -> None:
         """Remember the last message of a batch, if its host has the memory for it; None forgets."""
@@ -447,14 +467,14 @@ class RelayedTopic:
 
     def _pause_or_trim(self) -> None:
         """Let the subscribers catch up if all are behind and have not been for long; else drop for the full."""
-        since = [member.behind_since for member in self._served if member.behind_since is not None]
+        since = [member.behind_since for member in self._each() if member.behind_since is not None]
         if since and len(since) == len(self._served) and self.upstream is not None:
             left = max(since) + self._grace - self._clock()
             if left > 0:
                 self._paused = True
                 self.upstream.pause(left)
                 return
-        for member in self._served:
+        for member in self._each():
             if member.full:
                 self._dropped += member.trim()
 

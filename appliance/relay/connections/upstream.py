@@ -56,6 +56,7 @@ class Publisher:
         self._timer: Timer | None = None
         self._linger: Timer | None = None
         self._pause: Timer | None = None
+        self._announcing: Timer | None = None
         self._stream: Stream | None = None
         self._socket: socket.socket | None = None
         self._recv_into: Callable[[memoryview], int]
@@ -147,10 +148,14 @@ class Publisher:
                 "limit exceeded",
             )
 
-    def announce(self, names: frozenset[str], type_name: str) -> None:
-        """The subscribers that are served: the publishers of some types must see them by name."""
-        if self._socket is not None and looks_for_names(type_name):
-            self._presences.want(names, self._address)
+    def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
+        """Others are served now: the publishers of some types must see them by name."""
+        if self._socket is not None and looks_for_names(type_name) and self._announcing is None:
+            self._announcing = self._loop.after(0, lambda: self._show(names()))
+
+    def _show(self, names: frozenset[str]) -> None:
+        self._announcing = None
+        self._presences.want(names, self._address)
 
     def _connected(self) -> None:
         fields = {
@@ -283,6 +288,9 @@ class Publisher:
 
     def _drop_connection(self) -> None:
         self._presences.close()
+        if self._announcing is not None:
+            self._announcing.cancel()
+            self._announcing = None
         if self._stream is not None:
             self._stream.close()
             self._stream = None

@@ -58,7 +58,7 @@ class OwnPublisher:
     def resume(self) -> None:
         """There is nothing to be read."""
 
-    def announce(self, names: frozenset[str], type_name: str) -> None:
+    def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
         """Nobody looks for subscribers by name."""
 
     def give_again(self) -> None:

@@ -47,6 +47,7 @@ from appliance.ros.tcpros import (
     encode_header,
     encode_service_reply,
 )
+from tests.support.steps import steps
 from tests.unit.relay.world import ASK, CALL, HEADER, LIMITS, LOOPBACK, Peer, World
 
 
@@ -83,6 +84,37 @@ def test_control_is_told_when_its_orders_are_carried_out(world: World) -> None:
     world.hears(OrdersCarriedOut)
     publisher.send(encode_frame(b"two"))
     assert subscriber.sock.recv(100) == b""
+
+
+def test_what_a_grant_costs_is_the_same_among_thousands() -> None:
+    """To be given again and to be taken back: whoever else is connected is not gone through."""
+
+    def work(many: int) -> int:
+        world = World(replace(LIMITS, connections=100, connections_per_host=100))
+        try:
+            names = [f"/listener_{number}" for number in range(many)]
+            grants = [GrantInstalled("k", "/chatter", LOOPBACK, name) for name in names]
+            for grant in grants:
+                world.state(grant)
+            topic, _publisher = world.engine.topics["k", "/chatter"]
+            peers: list[Peer] = []
+            for name in names:
+                peers.append(world.connect(encode_header(ASK | {"callerid": name})))
+                world.until(lambda: len(topic.members) == len(peers))
+            revoked = GrantRevoked("k", "/chatter", LOOPBACK, names[0])
+
+            def again_and_back() -> None:
+                world.engine.take(grants[0], ())
+                world.engine.take(revoked, ())
+
+            done = steps(again_and_back)
+            assert world.ends(peers[0]) == b""
+            assert len(topic.members) == many - 1
+            return done
+        finally:
+            world.close()
+
+    assert work(70) < work(10) + 60
 
 
 def test_messages_that_come_with_the_publishers_header_are_not_lost(world: World) -> None:

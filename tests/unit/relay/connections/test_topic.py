@@ -1,7 +1,7 @@
 """One relayed topic, told as a story of its publisher and its subscribers."""
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import pytest
 
@@ -9,6 +9,7 @@ from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, To
 from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.topic import Recorder, RelayedTopic
 from tests.support.relay_memory import share
+from tests.support.steps import steps
 
 HEADER = {"callerid": "/liar", "type": "std_msgs/String", "md5sum": "m", "latching": "0", "topic": "/x"}
 
@@ -43,9 +44,9 @@ class RecordedUpstream:
         """Read."""
         self.asked.append("resume")
 
-    def announce(self, names: frozenset[str], type_name: str) -> None:
+    def announce(self, names: Callable[[], frozenset[str]], type_name: str) -> None:
         """These are served."""
-        self.announced = (sorted(names), type_name)
+        self.announced = (sorted(names()), type_name)
 
     def give_again(self) -> None:
         """The latched message is wanted once more."""
@@ -443,6 +444,41 @@ def test_a_withdrawn_topic_cuts_who_is_served_and_who_waits() -> None:
     waiting = other.join()
     other.topic.cut_all("gone")
     assert waiting.was_cut == "gone"
+
+
+class LeavingMember(RecordedMember):
+    """One that leaves when it is cut, as a real one does."""
+
+    topic: RelayedTopic
+
+    def cut(self, reason: str) -> None:
+        """Its connection is closed."""
+        super().cut(reason)
+        self.topic.leave(self)
+
+
+@pytest.mark.parametrize("served", [True, False], ids=["served", "waiting"])
+def test_what_a_subscriber_costs_is_the_same_among_thousands(served: bool) -> None:
+    """To come and to go: subscribers that end all at once hold the loop up for no longer than their number."""
+
+    def work(many: int) -> int:
+        story = Story()
+        if served:
+            story.topic.upstream_opened(HEADER)
+        story.topic.upstream = None  # who is served it asks once in a turn
+        members = [LeavingMember() for _ in range(many)]
+
+        def come_and_go() -> None:
+            for member in members:
+                member.topic = story.topic
+                story.topic.join(member)
+            story.topic.cut_all("gone")
+
+        done = steps(come_and_go)
+        assert not story.topic.members
+        return done
+
+    assert work(1000) < 15 * work(100)
 
 
 def test_the_upstream_hears_who_is_served() -> None:
