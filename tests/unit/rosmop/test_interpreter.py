@@ -18,12 +18,13 @@ from appliance.rosmop.ir.values import Values
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.messages import Messages as MessageTypes
+from tests.support.examples import examples
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.interpreted import beside, check_same
 from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
 
 MONITORS = Path(__file__).parents[3] / "monitors"
-FEW = settings(max_examples=40, suppress_health_check=list(HealthCheck))
+FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck))
 
 
 def check(monitors: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> None:

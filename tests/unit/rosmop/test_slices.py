@@ -19,6 +19,7 @@ from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.slices import GROWING_LIMIT, MAX_BINDING
 from appliance.rosmop.syntax.parser import parse
 from appliance.rosmop.why import Sender
+from tests.support.examples import examples
 from tests.unit.rosmop.acting import definitions, load, message, refused
 from tests.unit.rosmop.interpreted import beside, check_same
 from tests.unit.rosmop.logics.driving import seeded
@@ -165,7 +166,7 @@ def test_slices_are_what_the_specification_says_of_each_binding(seed: int) -> No
 def test_the_named_events_of_a_slice_alone_give_its_verdict() -> None:
     """Given to the specification without parameters they tell the category; and each of them is of the slice."""
     random, explained = seeded(44), 0
-    for _ in range(60):
+    for _ in range(examples(60)):
         one = replace(made(random), actions=dict.fromkeys("abc", ""))
         one = replace(one, properties=tuple(text.replace("__RESET;", "") for text in one.properties))
         events = trace(random, 20)
@@ -186,7 +187,7 @@ def test_the_named_events_of_a_slice_alone_give_its_verdict() -> None:
                     (each.property, each.category) for each in last.verdicts
                 ], (one.text(binding=True), events[: place + 1], verdict)
                 explained += 1
-    assert explained > 500
+    assert explained > examples(500)
 
 
 def slice_of(one: Made, trace: Trace, binding: Mapping[str, object]) -> Sequence[int]:

@@ -12,10 +12,11 @@ from appliance.rosmop.execution import OnFault
 from appliance.rosmop.logics.catalogue import LOGICS
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.syntax.errors import SpecificationError
+from tests.support.examples import examples
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
 
-FEW = settings(max_examples=40, suppress_health_check=list(HealthCheck))
+FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck))
 PROPERTIES = {
     "fsm": "fsm: one [ e0 -> two, default one ] two [ e1 -> one, default two ]\n@two { DROP; }",
     "tfsm": "tfsm: one [ e0 -> two, default one ] two [ e1 -> one, timeout 3ms -> one ]\n@fail { DROP; __RESET; }\n"
@@ -147,7 +148,9 @@ def test_that_compares_something() -> None:
                 both.give(traffic.topic, body, time)
         story = str(both.check(time))
         found |= {word for word in ("dropped", "Verdict", "s0.tick", "Position", "LogLine") if word in story}
-    assert len(found) == 5
+        if len(found) == 5:
+            return
+    pytest.fail(f"only {found}")
 
 
 @pytest.mark.parametrize("logic", LOGICS)

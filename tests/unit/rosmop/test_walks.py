@@ -22,11 +22,12 @@ from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walks import BEGINNING, Walker
 from appliance.rosmop.why import Sender
+from tests.support.examples import examples
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.interpreted import beside, check_same
 from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
 
-FEW = settings(max_examples=25, suppress_health_check=list(HealthCheck))
+FEW = settings(max_examples=examples(90), suppress_health_check=list(HealthCheck))
 STAMPED = struct.pack("<I3sIIdhI2dBI", 3, b"abc", 9, 8, 2.5, 1, 2, 0.5, 7.0, 1, 0)
 
 

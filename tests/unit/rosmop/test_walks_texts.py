@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from appliance.rosmop import walks
 from appliance.rosmop.ir.texts import MOST_KEPT
+from tests.support.examples import examples
 from tests.unit.rosmop.test_walks import Fed, plain
 
-SOME = settings(max_examples=40, suppress_health_check=list(HealthCheck))
+SOME = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck))
 LONG = b"0123456789abcdef" * (MOST_KEPT // 16)
 TEXTS = (
     b"", b"a", b"abc", b"ab\0c", b"ab\0d", b"\0", b"\xff\xfe", b"\xc3\x28", b"abcdefgh", b"abcdefgi", b"abcdefghi",

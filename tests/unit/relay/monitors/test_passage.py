@@ -24,6 +24,7 @@ from appliance.rosmop.logics.interface import ClockedRun, FiniteRun
 from appliance.rosmop.runtime.context import Published
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walks import Walked
+from tests.support.examples import examples
 from tests.support.relay_memory import share
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.random_specifications import Messages, Specifications, Traffic, definitions
@@ -172,7 +173,7 @@ def random_case(seed: int) -> tuple[dict[str, str], list[Traffic]]:
     ]
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow], derandomize=True)
+@settings(max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow], derandomize=True)
 @given(st.integers(0, 1 << 40))
 def test_random_monitors_do_the_same_together(seed: int) -> None:
     """Whatever monitors do, a batch taken together is what its messages are one by one."""

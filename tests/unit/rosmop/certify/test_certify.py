@@ -22,6 +22,7 @@ from appliance.rosmop.logics.interface import CompiledProperty, FiniteProperty, 
 from appliance.rosmop.logics.tfsm import TimedMachine
 from appliance.rosmop.positions import Position
 from appliance.specifications.files import Sources, SpecificationsRefusedError, check
+from tests.support.examples import examples
 
 EVENTS = ["a", "b", "c", "d"]
 ORIGIN = Position("x.rv", 1, 1)
@@ -200,7 +201,7 @@ def test_what_is_no_automaton_is_refused(logic: str) -> None:
 
 @pytest.mark.parametrize("logic", LOGICS)
 def test_a_thousand_faults_of_compilers_are_refused(logic: str) -> None:
-    """Some two hundred for each logic, each with a trace; a change that changes no verdict is none."""
+    """Two hundred for each logic with all examples, each with a trace; a change that changes no verdict is none."""
     random = Random(2)  # noqa: S311  no secret
     refused = 0
     for compiled in properties(logic, 3, 1000):
@@ -212,7 +213,7 @@ def test_a_thousand_faults_of_compilers_are_refused(logic: str) -> None:
         else:
             assert certificate.wrong, (compiled.formula, wrong)
             refused += 1
-        if refused == 200:
+        if refused == examples(200):
             return
     pytest.fail(f"only {refused} changes were faults")
 

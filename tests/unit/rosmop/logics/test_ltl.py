@@ -5,6 +5,7 @@ from itertools import product
 
 import pytest
 
+from tests.support.examples import examples
 from tests.unit.rosmop.logics.driving import compiled, refusal, seeded, told, traces
 from tests.unit.rosmop.logics.temporal import Printer, Tree, draw
 
@@ -127,7 +128,7 @@ def test_verdicts_against_enumerated_continuations(
     """A violation is where no continuation satisfies the formula, a validation where all do; `x` is not named."""
     random = seeded(5)
     words = lassos(events, stem, loop)
-    for _ in range(count):
+    for _ in range(examples(count)):
         tree = draw(random, 3, TEMPORAL, UNARY, AB)
         text = PRINTER.show(tree, random)
         monitor = compiled("ltl", text, events)

@@ -7,6 +7,7 @@ from itertools import product
 import pytest
 
 from appliance.rosmop.logics.interface import CompiledProperty
+from tests.support.examples import examples
 from tests.unit.rosmop.logics.driving import compiled, play, refusal, seeded, told
 
 Timed = tuple[tuple[int, str], ...]
@@ -156,7 +157,7 @@ def told_by(meaning: Meaning, trace: Timed, end: int) -> list[tuple[int, tuple[s
 def test_timed_patterns_event_by_event() -> None:
     """With time bounds, each verdict is the certain one at its instant, those of deadlines included."""
     random = seeded(16)
-    for meaning in random.sample(meanings(("a", "b", "c"), (0, 3)), 220):
+    for meaning in random.sample(meanings(("a", "b", "c"), (0, 3)), examples(220)):
         pattern = compiled("pattern", meaning.text())
         for _ in range(3):
             times = sorted(random.randint(0, 12) for _ in range(4))

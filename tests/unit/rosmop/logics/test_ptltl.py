@@ -4,6 +4,7 @@ from itertools import product
 
 from appliance.rosmop.logics.interface import FiniteProperty
 from appliance.rosmop.logics.past import PastProperty
+from tests.support.examples import examples
 from tests.unit.rosmop.logics.driving import ABC, compiled, refusal, seeded, told, traces
 from tests.unit.rosmop.logics.temporal import Printer, Tree, draw
 
@@ -67,7 +68,7 @@ def test_random_formulas_on_all_short_traces() -> None:
     """Validation exactly where the formula holds, violation exactly where not; `x` is never named."""
     random = seeded(7)
     words = [*product("abx", repeat=3), *(tuple(random.choices("abx", k=6)) for _ in range(5))]
-    for _ in range(700):
+    for _ in range(examples(700)):
         tree = draw(random, 3, TEMPORAL, ARITY, ("a", "b"))
         text = PRINTER.show(tree, random)
         monitor = compiled("ptltl", text, ("a", "b", "x"))
@@ -80,7 +81,7 @@ def test_table_and_function_agree() -> None:
     """A formula too large for a table is computed, with the same verdicts."""
     random = seeded(8)
     many = " and ".join("(a or b or " + "(*) " * number + "(c or true))" for number in range(1, 25))
-    for _ in range(40):
+    for _ in range(examples(40)):
         tree = draw(random, 4, TEMPORAL, ARITY, ("a", "b"))
         text = PRINTER.show(tree, random)
         wide = " xor ".join("((*) " * number + "c" + ")" * number for number in range(1, 16))
