@@ -72,13 +72,14 @@ class XmlRpcClient:
         body = await self._written(method, params)
         request = self._head % len(body) + body
         attempt = _Attempt()
+        seconds = self._timeout + len(request) // _READ_IN_A_SECOND
         try:
-            response = await self._exchange(request, attempt)
+            response = await self._exchange(request, seconds, attempt)
         except TimeoutError:
             if attempt.connected:
-                why = f"{self._where} did not answer {method} within {self._timeout:g} s"
+                why = f"{self._where} did not answer {method} within {seconds:g} s"
                 raise UnansweredError(why) from None
-            why = f"{self._where} cannot be reached: no connection within {self._timeout:g} s"
+            why = f"{self._where} cannot be reached: no connection within {seconds:g} s"
             raise UnreachedError(why) from None
         except OSError as error:
             raise _kind(error)(f"{self._where} could not be called: {error.strerror or error}") from error
@@ -100,9 +101,9 @@ class XmlRpcClient:
     def _where(self) -> str:
         return node_uri(self.uri.host, self.uri.port, self.uri.path)
 
-    async def _exchange(self, request: bytes, attempt: "_Attempt") -> bytes:
+    async def _exchange(self, request: bytes, seconds: float, attempt: "_Attempt") -> bytes:
         loop = asyncio.get_running_loop()
-        deadline = loop.time() + self._timeout
+        deadline = loop.time() + seconds
         while self._idle:
             connection = self._idle.pop()
             if connection.alive:
@@ -238,5 +239,6 @@ def _kind(error: OSError) -> type[CallFailedError]:
 
 
 _HEAD_LIMIT = 64 << 10
+_READ_IN_A_SECOND = 1 << 20  # bytes, by Python's reader on a slow machine: it has more time for what is large
 _OFFLOAD = 256 << 10  # bytes of a call or an answer that are written or read on the event loop
 _UNREACHABLE = frozenset({101, 111, 113})  # ENETUNREACH, ECONNREFUSED, EHOSTUNREACH
