@@ -5,6 +5,7 @@ import copy
 import ipaddress
 import json
 import subprocess
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -271,3 +272,28 @@ def test_what_rosmaster_has_in_spite_of_its_error(together: bool) -> None:
             asyncio.run(server.calls.set_param(Caller(peer, "/me", 0), *arguments))
     assert server.parameters.tree == {name: value for name, value in tree.items() if name != "run_id"}
     assert server.parameters.weight == measure(server.parameters.tree)[0]
+
+
+def test_others_have_their_turns_while_thousands_of_names_are_decided() -> None:
+    """`getParamNames` asks the policy for each name: the loop turns meanwhile, and the answer has what may be found."""
+    there = mirror(tree={"mine": {f"p{number}": 1 for number in range(5000)}, "hidden": {"key": 1}})
+    none: Any = None
+    master = SimpleNamespace(reachable=True)
+    rights = SimpleNamespace(to_find=lambda _caller, name: SimpleNamespace(allowed="hidden" not in name))
+    calls = ParameterCalls(cast(Any, master), there, none, none, cast(Any, rights), 1 << 30)
+    turns = 0
+
+    async def others() -> None:
+        nonlocal turns
+        while True:
+            turns += 1
+            await asyncio.sleep(0)
+
+    async def scene() -> None:
+        other = asyncio.create_task(others())
+        answer = await calls.get_param_names(Caller(Peer(HOST, str(HOST), "10.0.0.2"), "/me", 0))
+        assert answer[2] == [f"/mine/p{number}" for number in range(5000)]
+        assert turns >= 5
+        other.cancel()
+
+    asyncio.run(scene())
