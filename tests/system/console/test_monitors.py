@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 from playwright.sync_api import expect
 
 from tests.support.appliance import Appliance
@@ -39,6 +40,23 @@ def test_a_monitor_is_switched(appliance: Appliance, opened: Callable[..., Reade
     assert state(appliance, "safeZone")["enabled"] is before
     events = [one for one in appliance.recorded("--event", "monitor *abled") if one["resource"] == "safeZone"]
     assert {one["detail"]["who"] for one in events} == {"first"}
+
+
+@pytest.mark.parametrize("width", [390, 1280, 1920])
+def test_a_name_is_broken_between_its_words_only(opened: Callable[..., Reader], width: int) -> None:
+    """Names of monitors, files, events and types: behind a slash or underscore, never in the middle of a word."""
+    reader = opened(width=width, height=800)
+    for view, heading in (("monitors", None), ("monitors/obstacleAvoidance", "obstacleAvoidance")):
+        page = reader.go(view, heading=heading)
+        expect(page.locator("td .given").first).to_be_visible()
+        broken = page.eval_on_selector_all(
+            "td .given",
+            """names => names.filter(name => new Set([...name.getClientRects()].map(one => one.bottom)).size
+                                              > (name.innerText.match(/[/_]/g) ?? []).length + 1)
+                             .map(name => name.innerText)""",
+        )
+        assert broken == []
+        expect(page.get_by_text("by disk")).to_have_count(0)
 
 
 def test_two_clicks_at_once_are_both_made(appliance: Appliance, opened: Callable[..., Reader]) -> None:

@@ -73,6 +73,7 @@ export function GraphView() {
 function Legend() {
   return html`<ul class="legend" aria-label="Legend">
     <li><svg width="30" height="16" aria-hidden="true"><rect class="legend-node" x="1" y="1" width="28" height="14" rx="4" /></svg>node</li>
+    <li><svg width="32" height="18" aria-hidden="true"><rect class="legend-node" x="3" y="3" width="28" height="14" rx="4" /><rect class="legend-node" x="1" y="1" width="28" height="14" rx="4" /></svg>several, drawn as one</li>
     <li><svg width="30" height="16" aria-hidden="true"><rect class="legend-node lost" x="1" y="1" width="28" height="14" rx="4" /></svg>node that does not answer</li>
     <li><svg width="30" height="16" aria-hidden="true"><rect class="legend-topic" x="1" y="1" width="28" height="14" rx="7" /></svg>topic or service</li>
     <li><svg width="34" height="16" aria-hidden="true"><path class="line mediated" d="M1 8H33" /></svg>mediated by the relay</li>

@@ -6,7 +6,7 @@ import { Moment } from "../moments.js";
 import { count, counted } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
 import { Button, Switch } from "../parts/button.js";
-import { Given } from "../parts/given.js";
+import { By, Given } from "../parts/given.js";
 import { Icon } from "../parts/icon.js";
 import { Empty, Failure, Loading, Notice } from "../parts/notice.js";
 import { Sparkline } from "../parts/plot.js";
@@ -35,7 +35,7 @@ export function Monitors() {
       failed(failure);
     }
   };
-  return html`<div class="head"><h1>Monitors</h1><span class="head-sub">revision ${body.revision}, loaded <${Moment} at=${body.loaded} /> by <${Given} value=${body.who} most=${40} />${body.note && html`: <${Given} value=${body.note} most=${80} />`}</span>
+  return html`<div class="head"><h1>Monitors</h1><span class="head-sub">revision ${body.revision}, loaded <${Moment} at=${body.loaded} /> <${By} who=${body.who} />${body.note && html`: <${Given} value=${body.note} most=${80} />`}</span>
       <div class="head-actions"><${Button} role="admin" tone="primary" onClick=${() => setLoading(true)}><${Icon} name="up" size=${16} />Load a specification</${Button}></div></div>
     <div class="standing">
       ${body.refused.length > 0 && html`<${Notice} tone="deny" title="The relay does not take the specifications: everything is blocked">${body.refused.map((/** @type {string} */ one) => html`<div key=${one}><${Given} value=${one} most=${400} /></div>`)}</${Notice}>`}

@@ -6,7 +6,7 @@ import { lasting, Moment, useNow } from "../moments.js";
 import { notable } from "../notable.js";
 import { count, counted, growth } from "../numbers.js";
 import { Badge } from "../parts/badge.js";
-import { Given } from "../parts/given.js";
+import { By, Given } from "../parts/given.js";
 import { Loading } from "../parts/notice.js";
 import { Plot } from "../parts/plot.js";
 import { Link } from "../router.js";
@@ -38,7 +38,7 @@ function Health(/** @type {{status: any, alarms: any[]}} */ { status, alarms }) 
   const { policy, monitors, ipsec, audit } = status;
   return html`<section class="cards" aria-label="Health">
     <${Card} name="Appliance" to="/console/now" tone=${state[0]} figure=${state[1]} words>${status.isolation === "none" ? "isolation none: ports of nodes stay open" : `isolation ${status.isolation}`}</${Card}>
-    <${Card} name="Policy" to="/console/policy" figure=${`Revision ${policy.revision}`} words tone=${policy.confirm_by ? "warn" : ""}>${policy.confirm_by ? "goes back unless confirmed" : html`by <${Given} value=${policy.who} most=${30} />${policy.differs_from_file ? ", not what the file says" : ""}`}</${Card}>
+    <${Card} name="Policy" to="/console/policy" figure=${`Revision ${policy.revision}`} words tone=${policy.confirm_by ? "warn" : ""}>${policy.confirm_by ? "goes back unless confirmed" : html`<${By} who=${policy.who} most=${30} />${policy.differs_from_file ? ", not what the file says" : ""}`}</${Card}>
     <${Card} name="Nodes" to="/console/graph" figure=${count(status.nodes)}>${counted(status.topics, "topic")}, ${counted(status.services, "service")}${status.shadows ? `, ${status.shadows} lost` : ""}</${Card}>
     <${Card} name="Monitors enabled" to="/console/monitors" figure=${`${monitors.enabled} of ${monitors.loaded}`} tone=${monitors.held.length || monitors.failing.length ? "deny" : ""}>${monitors.held.length ? `${monitors.held.length} hold their topics` : monitors.failing.length ? `${monitors.failing.length} failing` : "none held, none failing"}</${Card}>
     <${Card} name="Tunnels up" to="/console/hosts" figure=${`${ipsec.up} of ${ipsec.enrolled}`}>${ipsec.enrolled ? "enrolled hosts" : "no host is enrolled"}</${Card}>

@@ -11,8 +11,14 @@ export function Given({ value, most = 160, mono = false, none = "–" }) {
   if (value === null || value === undefined || value === "") return html`<span class="muted">${none}</span>`;
   const shown = pieces(value, most);
   const cut = String(value).length > most;
-  return html`<bdi class=${`given${mono ? " given-mono" : ""}`} title=${cut ? plain(value, 1000) : undefined}>
-    ${shown.map((one) => (one.unseen ? html`<span class="unseen">${one.text}</span>` : mono ? words(one.text) : one.text))}</bdi>`;
+  const name = mono || !/\s/.test(String(value));
+  return html`<bdi class=${`given${name ? " given-name" : ""}${mono ? " given-mono" : ""}`} title=${cut ? plain(value, 1000) : undefined}>
+    ${shown.map((one) => (one.unseen ? html`<span class="unseen">${one.text}</span>` : name ? words(one.text) : one.text))}</bdi>`;
+}
+
+/** Who brought a revision: "by" a person or a program, or "from disk". @param {{who: string, most?: number}} given */
+export function By({ who, most = 40 }) {
+  return who === "disk" ? "from disk" : html`by <${Given} value=${who} most=${most} />`;
 }
 
 /** A short name does not break, a longer one after its slashes and underscores; a word too long for a line where it must. */

@@ -7,7 +7,7 @@ import { Badge } from "../parts/badge.js";
 import { Button } from "../parts/button.js";
 import { Difference } from "../parts/difference.js";
 import { Editor } from "../parts/editor.js";
-import { Given } from "../parts/given.js";
+import { By, Given } from "../parts/given.js";
 import { Icon } from "../parts/icon.js";
 import { Failure, Loading, Notice } from "../parts/notice.js";
 import { Tabs } from "../parts/tabs.js";
@@ -57,7 +57,7 @@ export function PolicyView() {
     await dryRun().catch(() => {});
   };
   const stale = changed && draft.get().etag !== `"${live.revision}"`;
-  return html`<div class="head"><h1>Policy</h1><span class="head-sub">revision ${live.revision} in force since <${Moment} at=${live.loaded} />, by <${Given} value=${live.who} most=${40} />${live.note && html`: <${Given} value=${live.note} most=${80} />`}</span></div>
+  return html`<div class="head"><h1>Policy</h1><span class="head-sub">revision ${live.revision} in force since <${Moment} at=${live.loaded} />, <${By} who=${live.who} />${live.note && html`: <${Given} value=${live.note} most=${80} />`}</span></div>
     <${Standing} live=${live} stale=${stale} showDiff=${() => setTab("diff")} />
     <div class="policy-grid">
       <section class="panel" aria-label="Text of the policy">
