@@ -2,10 +2,10 @@
 
 A publisher sees one connection of the relay for any number of subscribers. An action client, though, waits until the
 topics it sends goals and cancellations on are connected to *its server*, which it knows by the `callerid` of the
-status messages (actionlib, `wait_for_server`). For these topics every subscriber that is served gets a presence: one
-more connection to the publisher, under the subscriber's own `callerid`, whose messages are thrown away. It is opened
-only after the subscriber is served, so that what the publisher then sends does reach it. These topics carry a message
-now and then, so that sending it once more costs nothing.
+status messages (actionlib, `wait_for_server`). For these topics a subscriber that is served (of a host the first
+sixteen names) gets a presence: one more connection to the publisher, under the subscriber's own `callerid`, whose
+messages are thrown away. It is opened only after the subscriber is served, so that what the publisher then sends does
+reach it. These topics carry a message now and then, so that sending it once more costs nothing.
 """
 
 from functools import partial

@@ -38,9 +38,14 @@ from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.headers import to_subscriber
 from appliance.relay.connections.memory import HostShare
 
+_SEEN_OF_A_HOST = 16  # subscribers that a publisher may see by name: each is a connection to it more
+
 
 class Member(Protocol):
     """A subscriber, as its topic sees it."""
+
+    host: str
+    """The address it comes from."""
 
     caller_id: str
     """The caller id that it gives: a claim."""
@@ -434,7 +439,12 @@ class RelayedTopic:
             self.upstream.announce(self._names, self._header.get("type", ""))
 
     def _names(self) -> frozenset[str]:
-        return frozenset(member.caller_id for member in self._served)
+        of_host: dict[str, set[str]] = {}
+        for member in self._served:
+            names = of_host.setdefault(member.host, set())
+            if len(names) < _SEEN_OF_A_HOST:
+                names.add(member.caller_id)
+        return frozenset().union(*of_host.values())
 
     def _each(self) -> tuple[Member, ...]:
         """Those that are served, however many of them end meanwhile."""

@@ -56,8 +56,9 @@ class RecordedUpstream:
 class RecordedMember:
     """A subscriber that takes everything until it is told that it is behind."""
 
-    def __init__(self, *, fits: bool = True, caller_id: str = "/listener") -> None:
+    def __init__(self, *, fits: bool = True, caller_id: str = "/listener", host: str = "10.0.0.2") -> None:
         self.caller_id = caller_id
+        self.host = host
         self.header: Mapping[str, str] = {}
         self.received = b""
         self.missed = False
@@ -492,6 +493,18 @@ def test_the_upstream_hears_who_is_served() -> None:
     assert upstream.announced == (["/one", "/other"], "actionlib/TestActionGoal")
     topic.leave(one)
     assert upstream.announced == (["/other"], "actionlib/TestActionGoal")
+
+
+def test_a_host_with_hundreds_of_names_is_seen_by_a_few() -> None:
+    """Each is one more connection to the publisher; another host's subscriber is seen whoever was there first."""
+    scene = Story()
+    for number in range(300):
+        scene.topic.join(RecordedMember(caller_id=f"/guest_{number}", host="10.0.0.66"))
+    scene.topic.upstream_opened({"type": "actionlib_msgs/GoalID", "md5sum": "*"})
+    scene.topic.join(RecordedMember(caller_id="/server"))
+    names, _type = scene.upstream.announced
+    assert len(names) == 17
+    assert {"/server", "/guest_0"} < set(names)
 
 
 def test_the_delay_of_messages_is_counted_for_those_who_are_served() -> None:
