@@ -19,7 +19,7 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from appliance.api.problems import ProblemError
+from appliance.api.problems import ProblemError, too_many
 from appliance.api.rates import Buckets, peer_key
 from appliance.channel.messages import Asked, TokenKept
 from appliance.config import is_loopback
@@ -133,9 +133,5 @@ class Doorkeeper:
 def _require_patience(failures: Buckets, host: str) -> None:
     seconds = failures.wait(host, time.monotonic())
     if seconds:
-        raise ProblemError(
-            429,
-            "too-many-failures",
-            "too many requests of this host came without a good token",
-            retry_after=int(seconds) + 1,
-        )
+        text = "too many requests of this host came without a good token"
+        raise too_many("too-many-failures", text, seconds)

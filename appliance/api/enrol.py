@@ -22,7 +22,7 @@ from msgspec.structs import asdict
 from appliance.api.hosts import SLOW_SECONDS, OneName
 from appliance.api.hosts_models import Enrolled, Enrolment, Renewal
 from appliance.api.kits import Wishes, kit_of
-from appliance.api.problems import ProblemError
+from appliance.api.problems import ProblemError, too_many
 from appliance.api.rates import Buckets
 from appliance.api.roles import answered
 from appliance.api.routing import Responses, Routes, answer, body, content, file
@@ -136,12 +136,7 @@ class _Patience:
         if self._one.touched(peer, now):
             seconds = max(seconds, self._all.wait(_ALL, now))
         if seconds:
-            raise ProblemError(
-                429,
-                "too-many-failures",
-                "too many wrong enrolment tokens were brought",
-                retry_after=int(seconds) + 1,
-            )
+            raise too_many("too-many-failures", "too many wrong enrolment tokens were brought", seconds)
 
     def failed(self, peer: str) -> None:
         """A wrong token was brought."""

@@ -28,7 +28,7 @@ from appliance.api.access import Bearer, Doorkeeper
 from appliance.api.console import is_console
 from appliance.api.dry_runs import is_dry
 from appliance.api.journal import Journal
-from appliance.api.problems import REASON, ProblemError, defect
+from appliance.api.problems import REASON, ProblemError, defect, too_many
 from appliance.api.rates import Buckets
 from appliance.channel.messages import Asked
 from appliance.config import ApiLimits
@@ -107,9 +107,7 @@ class Gate:
         rate = self._page_rate if is_console(scope["path"]) else self._rate
         wait = rate.take(host, time.monotonic())
         if wait:
-            raise ProblemError(
-                429, "too-many-requests", "too many requests of this host", retry_after=int(wait) + 1
-            )
+            raise too_many("too-many-requests", "too many requests of this host", wait)
         headers = Headers(scope=scope)
         self._check_host(headers)
         _check_origin(scope, headers)

@@ -16,12 +16,12 @@ from appliance.api.control import ControlLink
 from appliance.api.dry_runs import DryRun
 from appliance.api.monitor_judgement import findings_of, judge, refusal
 from appliance.api.monitor_models import NewSpecifications, NewText, Replaced, Switch, SwitchMany
-from appliance.api.monitors import UNKNOWN, OneName
+from appliance.api.monitors import UNKNOWN, OneName, unknown_monitor
 from appliance.api.policy_changes import Confirm
 from appliance.api.policy_models import Rollback
 from appliance.api.preconditions import IfMatch, etag, expected_tag
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Admin, Operator, answered, ask
+from appliance.api.roles import Admin, Operator, answered, ask, problem_of
 from appliance.api.routing import ETAG, Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services
 from appliance.channel import admin
@@ -107,9 +107,7 @@ def _add_revisions(router: Routes, control: ControlLink) -> None:
     ) -> Tagged[Replaced]:
         """Take what the folder has now; what it does not have stays, unless an admin says `prune`."""
         if prune and bearer.role < Role.ADMIN:
-            raise ProblemError(
-                403, "not-for-this-role", "removing what the folder does not have is for admins"
-            )
+            raise problem_of("forbidden", "removing what the folder does not have is for admins")
         order = admin.MonitorReload(_expected(if_match), prune, confirm_within)
         return await _replaced(control, order, bearer)
 
@@ -206,8 +204,7 @@ async def _file_of(control: ControlLink, name: str, bearer: Bearer) -> str:
     if name in (loaded.files or {}):
         return name
     if name not in files:
-        known = ", ".join(files) or "none is loaded"
-        raise ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
+        raise unknown_monitor(name, loaded)
     return files[name]
 
 
@@ -227,9 +224,7 @@ def _stale(text: str, tag: str) -> ProblemError:
 
 def _may_load(bearer: Bearer, *, dry_run: bool) -> None:
     if not dry_run and bearer.role < Role.ADMIN:
-        raise ProblemError(
-            403, "not-for-this-role", "loading specifications is for admins; operators may use dry_run=1"
-        )
+        raise problem_of("forbidden", "loading specifications is for admins; operators may use dry_run=1")
 
 
 def _expected(if_match: str | None, *, dry_run: bool = False) -> str | None:

@@ -40,8 +40,7 @@ class _Looking:
         loaded = await ask(self._services.control, MonitorsWanted(texts=True), bearer)
         row = next((monitor for monitor in loaded.monitors if monitor.name == name), None)
         if row is None:
-            known = ", ".join(monitor.name for monitor in loaded.monitors) or "none is loaded"
-            raise ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
+            raise unknown_monitor(name, loaded)
         return loaded, row
 
     async def compiled(self, loaded: Monitors, name: str) -> Any:
@@ -52,6 +51,12 @@ class _Looking:
     def warnings(self, file: str) -> Any:
         """The lint of a file of what was compiled last."""
         return self._compiler.warnings(file)
+
+
+def unknown_monitor(name: str, loaded: Monitors) -> ProblemError:
+    """Why a monitor is not found, and which there are."""
+    known = ", ".join(monitor.name for monitor in loaded.monitors) or "none is loaded"
+    return ProblemError(404, "unknown", f"no monitor is named {name}; there are: {known}")
 
 
 def routes(services: Services) -> Routes:

@@ -15,7 +15,7 @@ from appliance.api.judgement import judge_change
 from appliance.api.policy_models import PolicyText, Report, Rollback
 from appliance.api.preconditions import IfMatch, expected_revision
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Operator, ask
+from appliance.api.roles import Operator, ask, problem_of
 from appliance.api.routing import Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services
 from appliance.channel import admin
@@ -54,9 +54,7 @@ def routes(services: Services) -> Routes:
         A text with an error changes nothing: the answer (422) has every finding with its line and column.
         """
         if not dry_run and bearer.role < Role.ADMIN:
-            raise ProblemError(
-                403, "not-for-this-role", "loading a policy is for admins; operators may use dry_run=1"
-            )
+            raise problem_of("forbidden", "loading a policy is for admins; operators may use dry_run=1")
         expected = None if dry_run and if_match is None else expected_revision(if_match)
         order = admin.PolicyLoad(posted.text, posted.note, confirm_within, expected, posted.signature)
         return tagged(await _load(services, order, bearer, dry_run=dry_run))

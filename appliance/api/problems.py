@@ -87,6 +87,11 @@ class ProblemError(Exception):
         return Response(msgspec.json.encode(problem), self.status, self.headers, MEDIA_TYPE)
 
 
+def too_many(kind: str, detail: str, seconds: float) -> ProblemError:
+    """Who asks too often is told (429) after how many seconds to try again."""
+    return ProblemError(429, kind, detail, retry_after=int(seconds) + 1)
+
+
 def defect(error: Exception) -> ProblemError:
     """What a client is told of a defect of ours: its kind, nothing of what it was about."""
     return ProblemError(500, "defect", f"a defect of rosrv, please report it: {type(error).__name__}")
