@@ -1,4 +1,4 @@
-"""Who is asking: recognises bearer tokens and knows what each role may do.
+"""Who is asking: recognises bearer tokens.
 
 Invariants:
 
@@ -10,7 +10,6 @@ Invariants:
 """
 
 import asyncio
-import enum
 import hashlib
 import hmac
 import secrets
@@ -18,9 +17,11 @@ import time
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import cast
 
 from appliance.api.problems import ProblemError, too_many
 from appliance.api.rates import Buckets, peer_key
+from appliance.channel.answers.tokens import TokenRole
 from appliance.channel.messages import Asked, TokenKept
 from appliance.config import is_loopback
 from appliance.order_proof import reading_hash, reading_id
@@ -29,15 +30,6 @@ from appliance.store.tokens import is_secret, parse_token
 
 _KNOWN_SECONDS = 900.0
 _MOST_KNOWN = 1024
-
-
-class Role(enum.IntEnum):
-    """What a token may do; each role may do all that those before it may, but what is for investigators."""
-
-    VIEWER = 1  # look
-    INVESTIGATOR = 2  # also fetch the messages of recordings, which nobody else may
-    OPERATOR = 3  # take the file's policy, or one that was in force before
-    ADMIN = 4  # bring new rules into force
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +41,7 @@ class Bearer:
 
     id: str
     name: str
-    role: Role
+    role: TokenRole
     expires: float
     shown: str
     asked: Asked | None = None
@@ -98,7 +90,7 @@ class Doorkeeper:
         ):
             if time.time() < kept.expires:
                 self._remember(peer_key(host))
-                return Bearer(kept.id, kept.name, Role[kept.role.upper()], kept.expires, text)
+                return Bearer(kept.id, kept.name, cast(TokenRole, kept.role), kept.expires, text)
             raise self._refusal("the token has expired: ask for another one (rosrv token add)")
         failures = self._unknown if kept is None else self._wrong
         _require_patience(failures, host)

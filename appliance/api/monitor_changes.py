@@ -11,7 +11,7 @@ from fastapi import Query
 from msgspec.structs import asdict
 from pydantic import StringConstraints
 
-from appliance.api.access import Bearer, Role
+from appliance.api.access import Bearer
 from appliance.api.control import ControlLink
 from appliance.api.dry_runs import DryRun
 from appliance.api.monitor_judgement import findings_of, judge, refusal
@@ -28,6 +28,7 @@ from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
 from appliance.channel.answers import monitors as answers
 from appliance.channel.answers.monitors import MonitorsConfirmed, Switched
+from appliance.channel.answers.tokens import may
 
 _COMPILE_SECONDS = 40.0  # of RVMaster and then of the relay
 Prune = Annotated[bool, Query(description="also remove what the folder does not have")]
@@ -106,7 +107,7 @@ def _add_revisions(router: Routes, control: ControlLink) -> None:
         bearer: Operator, *, if_match: IfMatch = None, prune: Prune = False, confirm_within: Confirm = None
     ) -> Tagged[Replaced]:
         """Take what the folder has now; what it does not have stays, unless an admin says `prune`."""
-        if prune and bearer.role < Role.ADMIN:
+        if prune and not may(bearer.role, "admin"):
             raise problem_of("forbidden", "removing what the folder does not have is for admins")
         order = admin.MonitorReload(_expected(if_match), prune, confirm_within)
         return await _replaced(control, order, bearer)
@@ -223,7 +224,7 @@ def _stale(text: str, tag: str) -> ProblemError:
 
 
 def _may_load(bearer: Bearer, *, dry_run: bool) -> None:
-    if not dry_run and bearer.role < Role.ADMIN:
+    if not dry_run and not may(bearer.role, "admin"):
         raise problem_of("forbidden", "loading specifications is for admins; operators may use dry_run=1")
 
 

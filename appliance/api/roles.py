@@ -1,11 +1,11 @@
 """What a route asks of who calls it: a role, and what every other route asks the same way."""
 
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 from fastapi import Depends, Request, Security
 from fastapi.security import HTTPBearer
 
-from appliance.api.access import Bearer, Role
+from appliance.api.access import Bearer
 from appliance.api.control import ControlLink
 from appliance.api.gate import BEARER
 from appliance.api.problems import ProblemError
@@ -19,39 +19,36 @@ _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token
 class _Requires:
     """A dependency: the bearer, whose role must be at least this one."""
 
-    def __init__(self, role: Role) -> None:
-        self.least = cast(TokenRole, role.name.lower())
+    def __init__(self, least: TokenRole) -> None:
+        self.least = least
 
     def __call__(self, request: Request, _token: Annotated[Any, Security(_SCHEME)]) -> Bearer:
         bearer: Bearer = request.scope[BEARER]
-        if not may(bearer.role.name.lower(), self.least):
-            raise ProblemError(
-                403,
-                "not-for-this-role",
-                f"this is for {self.least}s; the token {bearer.name} has the role {bearer.role.name.lower()}",
-            )
+        if not may(bearer.role, self.least):
+            text = f"this is for {self.least}s; the token {bearer.name} has the role {bearer.role}"
+            raise problem_of("forbidden", text)
         return bearer
 
 
-VIEWER = Depends(_Requires(Role.VIEWER))
+VIEWER = Depends(_Requires("viewer"))
 """For `dependencies=` of a route that asks for the role and nothing more of who calls."""
 
-OPERATOR = Depends(_Requires(Role.OPERATOR))
+OPERATOR = Depends(_Requires("operator"))
 Viewer = Annotated[Bearer, VIEWER]
-Investigator = Annotated[Bearer, Depends(_Requires(Role.INVESTIGATOR))]
+Investigator = Annotated[Bearer, Depends(_Requires("investigator"))]
 Operator = Annotated[Bearer, OPERATOR]
-Admin = Annotated[Bearer, Depends(_Requires(Role.ADMIN))]
+Admin = Annotated[Bearer, Depends(_Requires("admin"))]
 
 
 def reads_contents(bearer: Bearer) -> bool:
     """Whether who calls may read what single messages said in the records of monitors: all but viewers."""
-    return bearer.role > Role.VIEWER
+    return bearer.role != "viewer"
 
 
 def _no_viewer(bearer: Viewer) -> Bearer:
     if not reads_contents(bearer):
         text = f"this is for investigators, operators and admins; the token {bearer.name} is a viewer's"
-        raise ProblemError(403, "not-for-this-role", text)
+        raise problem_of("forbidden", text)
     return bearer
 
 

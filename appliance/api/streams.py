@@ -14,8 +14,9 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
-from appliance.api.access import Bearer, Role
+from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
+from appliance.channel.answers.tokens import TokenRole
 from appliance.shares.pool import Pool, Standing
 from appliance.shares.table import Share
 
@@ -32,7 +33,7 @@ class Streams:
     """The places of one kind: `tokens` and `peers` are their shares, `whole` is how many there are."""
 
     def __init__(self, tokens: Share, peers: Share, whole: int) -> None:
-        self.roles: dict[str, Role] = {}
+        self.roles: dict[str, TokenRole] = {}
         part = whole / tokens.bounds.whole
         self._tokens: Pool[str] = Pool(
             "of these", tokens.bounds.sized(whole, max(1, int(tokens.bounds.host * part))), self._standing
@@ -63,7 +64,7 @@ class Streams:
         return give_back
 
     def _standing(self, token: str) -> Standing:
-        return Standing.NAMED if self.roles[token] is Role.VIEWER else Standing.REGISTERED
+        return Standing.NAMED if self.roles[token] == "viewer" else Standing.REGISTERED
 
     def _forget(self, token: str) -> None:
         if not self._tokens.held(token):

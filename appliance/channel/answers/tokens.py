@@ -7,6 +7,9 @@ import msgspec
 from appliance.channel.answers.field_docs import Moment, told
 
 TokenRole = Literal["viewer", "investigator", "operator", "admin"]
+"""Viewers look; investigators also fetch the messages of recordings, which nobody else may; operators take the file's
+policy, or one that was in force before; admins bring new rules into force."""
+
 _RANKS: dict[str, int] = {"viewer": 1, "investigator": 1, "operator": 2, "admin": 3}
 
 

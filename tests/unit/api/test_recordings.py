@@ -10,7 +10,7 @@ import pytest
 from starlette.responses import StreamingResponse
 
 from appliance.api import recordings
-from appliance.api.access import Bearer, Role
+from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
 from appliance.api.services import Services
 from appliance.channel.admin import AdminAnswer
@@ -20,7 +20,7 @@ from appliance.recorder.mcap import as_mcap
 from tests.support.answers import example
 from tests.unit.recorder.test_bag import HEADER, SECOND, body
 
-_EVE = Bearer("eve", "eve", Role.INVESTIGATOR, 1e12, "shown")
+_EVE = Bearer("eve", "eve", "investigator", 1e12, "shown")
 
 
 @pytest.mark.parametrize("mcap", [False, True])
