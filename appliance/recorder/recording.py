@@ -27,6 +27,7 @@ from appliance.recorder.ring_reader import MOST_MESSAGES, Found, Place, RingRead
 from appliance.recorder.shelf import ABOUT, BAG, PROGRESS
 from appliance.ros.log_message import ERROR, INFO, TYPE, WARN, log_message
 from appliance.ros.standard import standard_definitions
+from appliance.whole_files import write_whole
 
 RECORDS, LOG = "/rosrv/records", "/rosrv/log"
 MOST_TRIGGERS = 200
@@ -188,14 +189,8 @@ class RecordingInProgress:
             complete=not why_not,
             why_not=why_not,
         )
-        with (self._folder / ABOUT).open("wb") as about:
-            about.write(msgspec.json.format(msgspec.json.encode(recording)) + b"\n")
-            about.flush()
-            os.fchmod(about.fileno(), 0o640)
-            os.fsync(about.fileno())
-        folder = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
-        os.fsync(folder)
-        os.close(folder)
+        about = msgspec.json.format(msgspec.json.encode(recording)) + b"\n"
+        write_whole(self._folder / ABOUT, about, 0o640)
         return recording
 
     def _missing(self) -> str:
