@@ -45,6 +45,24 @@ _SHORT_NAMES: dict[str, KeyPath] = {
     "ROSRV_CA_PASSPHRASE_FILE": ("ipsec", "ca_passphrase_file"),
     "ROSRV_RELAY": ("relaying",),  # as --relay; with a table it is the section, like any other
 }
+_WANTED = {
+    "bool": "true or false",
+    "byte": "a size, for example 500MB or 2GiB",
+    "dataclass": "a section: its keys stand on the lines below it, indented",
+    "finite": "a number",
+    "float": "a number",
+    "greater_than": "more than {gt:g}",
+    "greater_than_equal": "at least {ge:g}",
+    "int": "a whole number",
+    "ip": "a network, for example 192.168.1.0/24",
+    "less_than": "less than {lt:g}",
+    "less_than_equal": "at most {le:g}",
+    "list": "a list, for example [a, b]",
+    "literal": "{expected}",
+    "path": "the path of a file or folder",
+    "string": "a text; a number or true is one in quotes",
+}
+"""What a value must be, by the kind of pydantic's errors, or the first word of that."""
 _FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
 _Section = typing.TypeVar("_Section", bound="DataclassInstance")
 
@@ -156,7 +174,8 @@ class _Gathered:
                 try:
                     value = yaml.safe_load(value)
                 except yaml.YAMLError as error:
-                    self._mistakes.append(Mistake(name, f"is not YAML: {error}"))
+                    problem = error.problem if isinstance(error, yaml.MarkedYAMLError) else error
+                    self._mistakes.append(Mistake(name, f"is not YAML: {problem}"))
                     continue
             if name in _SHORT_NAMES and not isinstance(value, dict):
                 path = _SHORT_NAMES[name]
@@ -218,8 +237,9 @@ class _Gathered:
             return Mistake(place, f"{_dotted(path)} must be given")
         if kind == "value_error" and context:  # a sentence of ours, which names the value where that helps
             return Mistake(place, f"{_about(path, place)}{context['error']}")
-        text = f"{text[:1].lower()}{text[1:]}, not {self._value_at(path)!r}"
-        return Mistake(place, f"{_about(path, place)}{text}")
+        wanted = _WANTED.get(kind) or _WANTED.get(kind.partition("_")[0])
+        text = f"must be {wanted.format(**context or {})}" if wanted else f"{text[:1].lower()}{text[1:]}"
+        return Mistake(place, f"{_about(path, place)}{text}, not {self._value_at(path)!r}")
 
     def _place_of(self, path: KeyPath) -> str:
         for length in range(len(path), 0, -1):

@@ -1,5 +1,7 @@
 """Tests of `appliance.config_sources`."""
 
+import re
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -49,7 +51,7 @@ def test_all_mistakes_are_told_at_once_each_with_its_place(file: Path) -> None:
         one.startswith(f"{file}:6: audit.durability: ") and "'strict' or 'batched'" in one for one in found
     )
     assert any(one.startswith("ROSRV_RELAYS: relays: ") for one in found)
-    assert any(one.startswith("--isolation: input ") and "'vm'" in one for one in found)
+    assert any(one.startswith("--isolation: must be 'container'") and "'vm'" in one for one in found)
     assert len(found) == 6
 
 
@@ -68,6 +70,32 @@ def test_a_wrong_entry_of_a_list_has_its_line(file: Path) -> None:
     found = mistakes(file)
     assert [one.split(": ")[0] for one in found] == [f"{file}:3", f"{file}:5"]
     assert found[1].endswith("did you mean address?")
+
+
+@pytest.mark.parametrize(
+    "value", ["perhaps", 5.5, -1, None, [1], {"a": 1}, ["x"], "", 10**30, float("nan"), "5 parsecs"]
+)
+def test_what_a_value_must_be_is_said_in_our_words(value: Any) -> None:
+    """No key has a wrong value that is told in those of a library, or in those of Python."""
+    settings = asdict(Settings())
+    given = [{key: value} for key in settings]
+    given += [
+        {key: {below: value}}
+        for key, section in settings.items()
+        if isinstance(section, dict)
+        for below in section
+    ]
+    told = []
+    for flags in given:
+        with suppress(ConfigError):
+            resolve(None, {}, flags)
+            continue
+        told += [one.partition(", not ")[0] for one in mistakes(None, {}, flags)]
+    assert [
+        one
+        for one in told
+        if re.search(r"input|valid|instance|class|\bpars(e|ing)\b|integer|boolean|dictionary", one)
+    ] == []
 
 
 def test_a_key_given_twice_is_a_mistake(file: Path) -> None:
