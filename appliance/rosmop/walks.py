@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, Protocol
 from appliance.rosmop.compile.program import groups
 from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, SOONER, TOLD, Feed, FeedModule, module_of
+from appliance.rosmop.ir.kept import KeptMessage
 from appliance.rosmop.ir.layout import POSITION, ROOM, SURE, UNDO, Cells
 from appliance.rosmop.ir.output import HEAD
 from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
@@ -123,15 +124,19 @@ class Home:
         self._cells = struct.Struct(
             "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in cells.variables.values())
         )
-        self._texts = [(self._names.index(name), buffer) for name, buffer in cells.texts.items()]
+        self._texts = [
+            (place, cells.texts[address])
+            for place, (address, kind) in enumerate(cells.variables.values())
+            if isinstance(kind, kinds.String)
+        ]
         self._vectors = [
             (self._names.index(name), buffer, _element_code(cells.variables[name][1]))
             for name, buffer in cells.vectors.items()
         ]
-        self._records = [
-            (name, slice(at, at + cells.sizes[name]), values.encoder(kind), values.decoder(kind))
+        self._records = {
+            name: KeptMessage(values, kind, at, {each: cells.texts[each] for each in cells.inner[name]})
             for name, (at, kind) in cells.records.items()
-        ]
+        }
         self._generation = cells.generation
         self._source, self._until = cells.source, cells.until
         self._clocks = [(running[number], address) for number, address in cells.clocks.items()]
@@ -153,17 +158,15 @@ class Home:
     def _enter(self) -> None:
         states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
         values = [self._namespace[name] for name in self._names]
-        if self._texts:
+        if self._generation:
             _LENGTH.pack_into(self._memory, self._generation, 0)
-            for place, buffer in self._texts:
-                values[place] = self._entered(values[place], buffer)
+        for place, buffer in self._texts:
+            values[place] = self._entered(values[place], buffer)
         for place, buffer, code in self._vectors:
             values[place] = self._entered_vector(values[place], buffer, code)
         self._cells.pack_into(self._memory, self._base, *states, *values)
-        for name, where, encode, _ in self._records:
-            raw = bytearray()
-            encode(self._namespace[name], raw)
-            self._memory[where] = raw.ljust(where.stop - where.start, b"\0")
+        for name, kept in self._records.items():
+            kept.enter(self._memory, self._namespace[name], self._entered)
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
         for running, address in self._clocks:
@@ -221,8 +224,8 @@ class Home:
                 if count == BEYOND
                 else [*struct.unpack_from(f"<{count}{code}", self._memory, at)]
             )
-        for name, where, _, decode in self._records:
-            found[name] = decode(self._memory, where.start)[0]
+        for name, kept in self._records.items():
+            found[name] = kept.left(self._memory, self._namespace[name])
         self._namespace.update(found)
 
 

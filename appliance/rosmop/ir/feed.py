@@ -254,7 +254,7 @@ class _Walk:
         assigned = sorted(
             {name for written in functions for name in written.assigned}.difference(cells.noted)
         )
-        self._settles = not set(cells.kept).isdisjoint(assigned)
+        self._settles = any(cells.texts_of(name) for name in assigned)
         self._undo = tuple(
             (address, cells.vectors[name] + 2 * ROOM if name in cells.vectors else writer.take(8))
             for name in assigned

@@ -74,12 +74,14 @@ class Cells:
     """Where it stands (i64) when the next is due that Python knows of: an earlier deadline is told."""
     variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
     """Where each stands, and its type; in the order of the places."""
-    texts: dict[str, int] = field(default_factory=dict)
-    """Where strings may be put when there is 0 (i32) at `generation`, by the variable that holds them (`texts.py`)."""
+    texts: dict[int, int] = field(default_factory=dict)
+    """Where strings may be put when there is 0 (i32) at `generation`, by where that is noted (`texts.py`)."""
     records: dict[str, tuple[int, kinds.Record]] = field(default_factory=dict)
     """Where each variable that is a message stands, and its type."""
     sizes: dict[str, int] = field(default_factory=dict)
     """The bytes of each of these, a multiple of 8."""
+    inner: dict[str, Sequence[int]] = field(default_factory=dict)
+    """Where it is noted in each of these where its strings are."""
     generation: int = 0
     settle: int = 0
     """The number of the function that puts them there."""
@@ -89,9 +91,16 @@ class Cells:
     """
 
     @property
-    def kept(self) -> Sequence[str]:
-        """The variables that hold strings."""
-        return [name for name, (_, kind) in self.variables.items() if isinstance(kind, kinds.String)]
+    def kept(self) -> Sequence[int]:
+        """Where it is noted where strings are."""
+        return [at for name in (*self.variables, *self.records) for at in self.texts_of(name)]
+
+    def texts_of(self, name: str) -> Sequence[int]:
+        """The same of one variable."""
+        if name in self.records:
+            return self.inner[name]
+        address, kind = self.variables[name]
+        return (address,) if isinstance(kind, kinds.String) else ()
 
     def address(self, name: str, kind: Type) -> int:
         """Where a variable stands."""
@@ -199,8 +208,13 @@ class Layout:
         if name not in cells.records:
             if not isinstance(kind, kinds.Record):
                 raise NotScalarError(str(kind))
-            self.copied(kind)
-            cells.records[name] = (self.made(kind), kind)
+            if any(True for _ in self.arrays(kind)):
+                raise NotScalarError(str(kind))  # in Python it may have more elements, or fewer
+            begin = self.made(kind)
+            cells.records[name] = (begin, kind)
+            cells.inner[name] = [
+                begin + at for at, leaf in self.leaves(kind) if isinstance(leaf, kinds.String)
+            ]
             cells.sizes[name] = len(self.places[-1])
         return cells.records[name][0]
 

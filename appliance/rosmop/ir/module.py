@@ -2,7 +2,7 @@
 
 Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
 has a fixed size (`places.py`); strings are kept (`texts.py`), vectors of numbers are kept, made and changed
-(`vectors.py`); messages without arrays of any length are made and published, and kept, too, if they have no strings or
+(`vectors.py`); messages without arrays of any length are made and published, and kept, too, if they have no
 arrays (`records.py`).
 
 `Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.

@@ -1,7 +1,7 @@
 """Messages that are made or kept: fields that are put into them, copies, and what is published of them.
 
 Each has its own part of the memory and stands there as it is sent, but of a string stands its address and length; so
-what has arrays of any length is beyond. One that is kept has no strings either.
+what has arrays of any length is beyond. One that is kept has no arrays at all, and its strings as `texts.py` has them.
 
 Whatever is put there has one encoding only: what has several in the message that it comes from (a truth, a time with
 too many nanoseconds) is written anew, and a message that puts a NaN there is left. So what is published is copied.
@@ -13,7 +13,7 @@ from appliance.rosmop.ir import form
 from appliance.rosmop.ir.layout import LINES, MOST_MADE, POSITION, SAID, NotScalarError, machine_type
 from appliance.rosmop.ir.output import HEAD, Line, Publication
 from appliance.rosmop.ir.places import root, root_of
-from appliance.rosmop.ir.texts import MOST_KEPT
+from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
 from appliance.rosmop.ir.values import struct_code, struct_size
 from appliance.rosmop.ir.vectors import Vectors
 from appliance.rosmop.ir.wasm import COMPARE, F32, F64, I32, I64, STORE, constant, unsigned
@@ -77,8 +77,9 @@ class Records(Vectors):
             return super()._elements(node)
         first, place = self._place(node.base)
         name, at = f"text {len(self._locals)}", self._layout.offset(node.base.type, node.number)
-        code = first + place + self._set(name)
         begin, length = (self._get(name) + b"\x28\x00" + unsigned(at + more) for more in (0, 4))
+        unknown = length + constant(I32, BEYOND) + b"\x46"
+        code = first + place + self._set(name) + self._when(unknown, self._elsewhere)
         return code, begin, length + b"\xad"
 
     def _assigned_record(self, node: form.Assign) -> bytes:
@@ -86,12 +87,12 @@ class Records(Vectors):
         if node.name in self._layout.shared:
             at = self._layout.record(node.name, node.type)
             self._assigned.add(node.name)
-            return self._put_value(constant(I32, at), 0, node.type, node.value)
+            return self._put_value(constant(I32, at), 0, node.type, node.value, kept=True)
         name = f"place of {node.name}"
         if node.name not in self._messages:
             return b"".join(self._place(node.value)) + self._set(name)
         code = constant(I32, self._layout.made(node.type)) + self._set(name)
-        return code + self._put_value(self._get(name), 0, node.type, node.value)
+        return code + self._put_value(self._get(name), 0, node.type, node.value, kept=False)
 
     # What is put into one
 
@@ -109,26 +110,31 @@ class Records(Vectors):
     def _change(self, node: form.Call) -> bytes:
         """Put a value into a field, or into an element of an array of fixed length."""
         base, where, value = node.arguments
-        if root_of(base) in self._layout.shared:
+        kept = root_of(base) in self._layout.shared
+        if kept:
             self._assigned.add(root_of(base))
         if node.function == "a_slot":
             assert isinstance(where, form.Literal)  # noqa: S101  the number of a field
             number = int(where.value or 0)
             first, place = self._place(base)
             kind, offset = self._layout.field(base.type, number), self._layout.offset(base.type, number)
-            return first + self._put_value(place, offset, kind, value)
+            return first + self._put_value(place, offset, kind, value, kept=kept)
         name = f"element {len(self._locals)}"
         kind, _ = self._layout.element(base.type)
         address = self._address_of(form.Call(value.type, "l_element", (base, where), node.site))
-        return address + self._set(name) + self._put_value(self._get(name), 0, kind, value)
+        return address + self._set(name) + self._put_value(self._get(name), 0, kind, value, kept=kept)
 
-    def _put_value(self, place: bytes, offset: int, kind: Type, value: form.Expression) -> bytes:
-        """Put a value of this type so many bytes behind a place."""
+    def _put_value(
+        self, place: bytes, offset: int, kind: Type, value: form.Expression, *, kept: bool
+    ) -> bytes:
+        """Put a value of this type so many bytes behind a place; `kept`: in a variable of the set."""
         if isinstance(kind, kinds.Record | kinds.Vector):
-            return self._put_whole(place, offset, kind, value)
+            return self._put_whole(place, offset, kind, value, kept=kept)
         if isinstance(kind, kinds.String):
             first, begin, length = self._elements(value)
-            code = first + place + begin + b"\x36\x00" + unsigned(offset)
+            long = length + constant(I64, MOST_KEPT) + b"\x56"
+            code = first + (self._when(long, self._elsewhere) if kept else b"")
+            code += place + begin + b"\x36\x00" + unsigned(offset)
             return code + place + length + b"\xa7\x36\x00" + unsigned(offset + 4)
         if struct_code(kind) != struct_code(value.type):
             raise NotScalarError(str(value.type))
@@ -148,7 +154,9 @@ class Records(Vectors):
             code, value = self._parts_of(kind, value)
         return code + place + value + store
 
-    def _put_whole(self, place: bytes, offset: int, kind: Type, value: form.Expression) -> bytes:
+    def _put_whole(
+        self, place: bytes, offset: int, kind: Type, value: form.Expression, *, kept: bool
+    ) -> bytes:
         """A message, or an array of fixed length: zeros, or a copy."""
         if value.type != kind:
             raise NotScalarError(str(value.type))
@@ -169,6 +177,10 @@ class Records(Vectors):
             raise NotScalarError("two names of one message")
         source = f"source {len(self._locals)}"
         code += b"".join(self._place(value)) + self._set(source)
+        for at, leaf in self._layout.leaves(kind):
+            if kept and isinstance(leaf, kinds.String):
+                long = self._get(source) + b"\x28\x00" + unsigned(at + 4) + constant(I32, MOST_KEPT) + b"\x4b"
+                code += self._when(long, self._elsewhere)
         return code + self._copy_of(place, offset, kind, source, own=own)
 
     def _copy_of(self, place: bytes, offset: int, kind: Type, source: str, *, own: bool) -> bytes:

@@ -195,12 +195,11 @@ def settling(layout: Layout, cells: Cells) -> bytes:
     """
     half = MOST_KEPT * len(cells.kept)
     cells.generation, begin = layout.take(8), layout.take(2 * half)
-    cells.texts = {name: begin + place * MOST_KEPT for place, name in enumerate(cells.kept)}
+    cells.texts = {address: begin + place * MOST_KEPT for place, address in enumerate(cells.kept)}
     other, target = b"\x20\x00", b"\x20\x01"
     flip = constant(I32, half) + load(I32, cells.generation) + b"\x6b\x21\x00"
     code = []
-    for name, begin in cells.texts.items():
-        address = cells.variables[name][0]
+    for address, begin in cells.texts.items():
         size = load(I32, address + 4)
         code += [
             size, constant(I32, MOST_KEPT), b"\x4d", IF, NOTHING,

@@ -150,7 +150,7 @@ class Values:
         if isinstance(kind, kinds.Vector):
             return self._decoder_of_vectors(kind)
         if not isinstance(kind, kinds.Record):
-            numbers = _unpacker([struct_code(kind) or ""])
+            numbers = unpacker([struct_code(kind) or ""])
 
             def number(buffer: wire.Buffer, start: int) -> tuple[Any, int]:
                 (value,), end = numbers(buffer, start)
@@ -158,7 +158,7 @@ class Values:
 
             return number
         parts = [
-            (True, _unpacker([struct_code(field) or "" for field in run]))
+            (True, unpacker([struct_code(field) or "" for field in run]))
             if fixed
             else (False, self.decoder(run[0]))
             for fixed, run in self._runs(kind)
@@ -198,12 +198,12 @@ class Values:
         if isinstance(kind, kinds.Vector):
             return self._encoder_of_vectors(kind)
         if not isinstance(kind, kinds.Record):
-            pack_one = _packer([struct_code(kind) or ""])
+            pack_one = packer([struct_code(kind) or ""])
             return lambda value, out: out.extend(pack_one((value,)))
         parts: list[tuple[int, int, Any, Any]] = []
         at = 0
         for fixed, run in self._runs(kind):
-            pack = _packer([struct_code(field) or "" for field in run]) if fixed else None
+            pack = packer([struct_code(field) or "" for field in run]) if fixed else None
             parts.append((at, at + len(run), pack, None if fixed else self.encoder(run[0])))
             at += len(run)
 
@@ -255,8 +255,8 @@ def zero_of(kind: Type) -> bool | float | bytes | None:
     return b"" if isinstance(kind, kinds.String | kinds.Characters) else None
 
 
-def _unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[Any], int]]:
-    """Numbers with these `struct` codes, one after the other, and where they end; of two parts, nanoseconds."""
+def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[Any], int]]:
+    """Finds numbers with these `struct` codes, one after the other, and where they end; of two parts, nanoseconds."""
     plain = struct.Struct("<" + "".join(codes))
     unpack, size = plain.unpack_from, plain.size
     if all(len(code) == 1 for code in codes):
@@ -271,7 +271,7 @@ def _unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequen
     return numbers
 
 
-def _packer(codes: Sequence[str]) -> Callable[[Sequence[Any]], bytes]:
+def packer(codes: Sequence[str]) -> Callable[[Sequence[Any]], bytes]:
     """The bytes of such numbers."""
     pack = struct.Struct("<" + "".join(codes)).pack
     if all(len(code) == 1 for code in codes):

@@ -107,7 +107,8 @@ class Validation:
         self._clock = clock
         self._patience = patience
         self.codes = functions_of(module.code)
-        kept = [own.variables[name][0] for own in module.cells for name in (*own.kept, *own.vectors)]
+        kept = [at for own in module.cells for at in own.kept]
+        kept += [own.variables[name][0] for own in module.cells for name in own.vectors]
         self._strings = [range(at, at + 8) for at in kept]
         self._strings += [range(at, at + len(raw)) for raw, at in module.strings.items()]
         self._strings += module.rooms

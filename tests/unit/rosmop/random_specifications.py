@@ -83,7 +83,7 @@ class Specifications:
         return (
             f"s{number}() {{ int total = 0; double level = 1.5; bool seen = false; std::string last;\n"
             f"std::vector<int> all; std::vector<double> window; double slots[3] = {{1}};\n"
-            f"geometry_msgs::Twist told; std_msgs::Bool flag; {helper}\n"
+            f"geometry_msgs::Twist told; std_msgs::Bool flag; std_msgs::String word; {helper}\n"
             + "\n".join([*events, tick, *properties])
             + "\n}"
         )
@@ -204,6 +204,8 @@ class Specifications:
             f"told.linear.x = {value}; told.angular = told.linear; PUBLISH(/told, geometry_msgs/Twist, told);",
             "PUBLISH(/linear, geometry_msgs/Vector3, told.linear); total += told.angular.x;",
             f"{{ geometry_msgs::Twist m = told; m.linear.y = {value}; told = m; }}",
+            f"word.data = {text}; PUBLISH(/text, std_msgs/String, word);",
+            f"if (word.data != {text}) {{ last = word.data; }} PUBLISH(/text, std_msgs/String, word);",
             f"flag.data = {value}; PUBLISH(/text2, std_msgs/Bool, flag);",
         ]
 

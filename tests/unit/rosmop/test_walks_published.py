@@ -53,6 +53,13 @@ PUBLISHED = {
     " told = one; one.angular.x = c;"
     " PUBLISH(/a, geometry_msgs/Twist, told); two.linear = told.linear;"
     " PUBLISH(/a, geometry_msgs/Twist, two);",
+    "kept with strings": "PUBLISH(/a, std_msgs/String, word); word.data = f; PUBLISH(/a, std_msgs/String, word);"
+    ' if (c == 1) { word.data = "stop"; } if (c == 2) { last = word.data; } if (c == 3) { word.data = last; }'
+    " if (c == 5) { head.frame_id = word.data; head.seq = n; } if (c == 36) { n += head.frame_id.size(); }"
+    " std_msgs::Header h = head; h.stamp.sec = n; if (c == 0) { other = h; } if (c == 2) { head = other; }"
+    " if (word.data == head.frame_id) { n += 100; } if (c == 3 && n > 70) { word.data += last; }"
+    ' ROS_INFO("%s %s", h.frame_id.c_str(), word.data.c_str()); PUBLISH(/b, std_msgs/Header, other);'
+    " PUBLISH(/b, std_msgs/Header, h);",
     "arrays of fixed length": "geometry_msgs::PoseWithCovariance p; p.covariance[c] = x;"
     " p.covariance[35 - c] = n;"
     " for (double one : p.covariance) { n += one > 1; } geometry_msgs::PoseWithCovariance q = p;"
@@ -75,7 +82,8 @@ PUBLISHED = {
     " PUBLISH(/a, std_msgs/String, m); if (c == 1) { n += sin(x);"
     " } if (c == 3) { PUBLISH(/m, own/Stamped, MESSAGE); }",
 }
-KEPT = """std::string last; geometry_msgs::Twist told;
+KEPT = """std::string last; geometry_msgs::Twist told; std_msgs::String word; std_msgs::Header head;
+    std_msgs::Header other;
     void say(int i) { std_msgs::Int32 m; m.data = i; PUBLISH(/said, std_msgs/Int32, m); n += m.data; }
     double far(const geometry_msgs::Vector3& v) { PUBLISH(/v, geometry_msgs/Vector3, v); return v.x * 2; }
     void keep(geometry_msgs::Vector3 v) { told.linear = v; told.linear.z = n; }"""
@@ -149,9 +157,8 @@ def test_long_strings_a_thousand_times() -> None:
 
 def test_without_fuel_the_message_at_hand_publishes_nothing_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     """Wherever it ends: what is kept is as it was, and the engine publishes all of that message."""
-    text = of_stamped(
-        "for (int i = 0; i < 9; i++) { told.linear.x += i; say(i); } last = f; " + PUBLISHED["strings"], KEPT
-    )
+    body = "for (int i = 0; i < 9; i++) { told.linear.x += i; say(i); } last = f; other.frame_id = word.data;"
+    text = of_stamped(f"{body} word.data = f; {PUBLISHED['strings']}", KEPT)
     together = 0
     for fuel in range(900, 9000, 450):
         monkeypatch.setattr(walks, "FUEL", fuel)
@@ -219,13 +226,13 @@ def test_on_every_kind_of_message() -> None:
     [
         "std_msgs::Int32MultiArray m; PUBLISH(/a, std_msgs/Int32MultiArray, m);",
         "own::Plain m; PUBLISH(/a, own/Plain, m);",
-        "PUBLISH(/a, std_msgs/String, text);",
+        "PUBLISH(/a, geometry_msgs/PoseWithCovariance, pose);",
         "PUBLISH(/a, own/Stamped, MESSAGE);",
     ],
 )
 def test_what_is_beyond_is_the_engines(body: str) -> None:
-    """Arrays of any length, strings in messages that are kept, `MESSAGE`."""
-    fed = Fed(of_stamped(body, "std_msgs::String text;"))
+    """Arrays of any length, arrays in messages that are kept, `MESSAGE`."""
+    fed = Fed(of_stamped(body, "geometry_msgs::PoseWithCovariance pose;"))
     fed.check([STAMPED] * 3, "/stamped")
     assert fed.monitors.walker("/stamped") is None
     assert MOST_MADE < LINES

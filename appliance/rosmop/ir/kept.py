@@ -1,0 +1,61 @@
+"""Messages that variables keep, as values of Python and as they stand in the memory of a module (`records.py`)."""
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from appliance.rosmop.ir.texts import BEYOND
+from appliance.rosmop.ir.values import Values, packer, struct_code, unpacker
+from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
+
+_ADDRESS = 0xFFFFFFFF
+
+
+class KeptMessage:
+    """One, of numbers, times and strings; `texts` are where these may be put, by where they are noted."""
+
+    def __init__(self, values: Values, kind: kinds.Record, begin: int, texts: Mapping[int, int]) -> None:
+        self._values = values
+        self._kind = kind
+        self._begin = begin
+        leaves = [*self._kinds(kind)]
+        codes = [struct_code(leaf) or "Q" for leaf in leaves]
+        self._pack, self._unpack = packer(codes), unpacker(codes)
+        buffers = iter([texts[at] for at in sorted(texts)])
+        self._texts = [
+            (number, next(buffers)) for number, leaf in enumerate(leaves) if isinstance(leaf, kinds.String)
+        ]
+
+    def enter(self, memory: memoryview, value: Any, entered: Callable[[bytes, int], int]) -> None:
+        """Put it into the memory; `entered` does that with a string, and says what is noted of it."""
+        leaves = [*self._leaves(self._kind, value)]
+        for number, buffer in self._texts:
+            leaves[number] = entered(leaves[number], buffer)
+        raw = self._pack(leaves)
+        memory[self._begin : self._begin + len(raw)] = raw
+
+    def left(self, memory: memoryview, before: Any) -> Any:
+        """The value that stands there; what is not there is as it was before."""
+        leaves, old = [*self._unpack(memory, self._begin)[0]], [*self._leaves(self._kind, before)]
+        for number, _ in self._texts:
+            at, size = leaves[number] & _ADDRESS, leaves[number] >> 32
+            leaves[number] = old[number] if size == BEYOND else bytes(memory[at : at + size])
+        return self._built(self._kind, iter(leaves))
+
+    def _kinds(self, kind: Type) -> Iterator[Type]:
+        for inner in self._values.fields(kind) if isinstance(kind, kinds.Record) else ():
+            yield from self._kinds(inner)
+        if not isinstance(kind, kinds.Record):
+            yield kind
+
+    def _leaves(self, kind: Type, value: Any) -> Iterator[Any]:
+        if not isinstance(kind, kinds.Record):
+            yield value
+            return
+        for inner, part in zip(self._values.fields(kind), value, strict=True):
+            yield from self._leaves(inner, part)
+
+    def _built(self, kind: Type, leaves: Iterator[Any]) -> Any:
+        if not isinstance(kind, kinds.Record):
+            return next(leaves)
+        return [self._built(inner, leaves) for inner in self._values.fields(kind)]
