@@ -20,7 +20,7 @@ from appliance.rosmop.compile.program import groups
 from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, SOONER, TOLD, Feed, FeedModule, module_of
 from appliance.rosmop.ir.kept import KeptMessage
-from appliance.rosmop.ir.layout import POSITION, ROOM, SURE, UNDO, Cells
+from appliance.rosmop.ir.layout import POSITION, REST, ROOM, SURE, UNDO, Cells
 from appliance.rosmop.ir.output import HEAD
 from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
 from appliance.rosmop.ir.values import Values, struct_code
@@ -134,7 +134,9 @@ class Home:
             for name, buffer in cells.vectors.items()
         ]
         self._records = {
-            name: KeptMessage(values, kind, at, {each: cells.texts[each] for each in cells.inner[name]})
+            name: KeptMessage(
+                values, kind, at, cells.known[name], {each: cells.texts[each] for each in cells.inner[name]}
+            )
             for name, (at, kind) in cells.records.items()
         }
         self._generation = cells.generation
@@ -436,7 +438,11 @@ class Walker:
         area = self._memory[self._frames : self._frames + size]
         area[4:] = frame[4:size]
         _LENGTH.pack_into(area, 0, size - 4)
-        walked = self.walk(area, 0, 0, [], time_ns, prepared)
+        _TIME.pack_into(self._memory, REST, len(frame) - size)
+        try:
+            walked = self.walk(area, 0, 0, [], time_ns, prepared)
+        finally:
+            _TIME.pack_into(self._memory, REST, 0)
         if prepared.changed != before:
             frame[4:size] = area[4:]
         return walked

@@ -1,5 +1,6 @@
 """Messages that variables keep, as values of Python and as they stand in the memory of a module (`records.py`)."""
 
+import struct
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -9,15 +10,21 @@ from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
 _ADDRESS = 0xFFFFFFFF
+_TRUTH = struct.Struct("<q")
 
 
 class KeptMessage:
-    """One, of numbers, times and strings; `texts` are where these may be put, by where they are noted."""
+    """One, of numbers, times and strings; `texts` are where these may be put, by where they are noted. Whether it is
+    there stands at `known`: one with a time that no message can have is not.
+    """
 
-    def __init__(self, values: Values, kind: kinds.Record, begin: int, texts: Mapping[int, int]) -> None:
+    def __init__(
+        self, values: Values, kind: kinds.Record, begin: int, known: int, texts: Mapping[int, int]
+    ) -> None:
         self._values = values
         self._kind = kind
         self._begin = begin
+        self._known = known
         leaves = [*self._kinds(kind)]
         codes = [struct_code(leaf) or "Q" for leaf in leaves]
         self._pack, self._unpack = packer(codes), unpacker(codes)
@@ -31,11 +38,18 @@ class KeptMessage:
         leaves = [*self._leaves(self._kind, value)]
         for number, buffer in self._texts:
             leaves[number] = entered(leaves[number], buffer)
-        raw = self._pack(leaves)
+        try:
+            raw = self._pack(leaves)
+        except struct.error:
+            _TRUTH.pack_into(memory, self._known, False)
+            return
         memory[self._begin : self._begin + len(raw)] = raw
+        _TRUTH.pack_into(memory, self._known, True)
 
     def left(self, memory: memoryview, before: Any) -> Any:
         """The value that stands there; what is not there is as it was before."""
+        if not _TRUTH.unpack_from(memory, self._known)[0]:
+            return before
         leaves, old = [*self._unpack(memory, self._begin)[0]], [*self._leaves(self._kind, before)]
         for number, _ in self._texts:
             at, size = leaves[number] & _ADDRESS, leaves[number] >> 32

@@ -14,9 +14,9 @@ from appliance.rosmop.ir.wasm import F32, F64, I32, I64
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
-POSITION, UNDO, SAID, NOW, SURE, FIRST = 0, 8, 12, 16, 24, 32
-"""Where it stands which frame is looked at, where the log and the lines end, the time, and where the lines end of the
-messages before; and what is given out begins.
+POSITION, UNDO, SAID, NOW, SURE, REST, FIRST = 0, 8, 12, 16, 24, 32, 40
+"""Where it stands which frame is looked at, where the log and the lines end, the time, where the lines end of the
+messages before, and how many bytes the message has behind those that are shown (i64); and what is given out begins.
 """
 
 LINES = 64 << 10
@@ -82,6 +82,8 @@ class Cells:
     """The bytes of each of these, a multiple of 8."""
     inner: dict[str, Sequence[int]] = field(default_factory=dict)
     """Where it is noted in each of these where its strings are."""
+    known: dict[str, int] = field(default_factory=dict)
+    """Where it stands (i64) whether each of these is here: Python may have a time that no message can have."""
     generation: int = 0
     settle: int = 0
     """The number of the function that puts them there."""
@@ -216,6 +218,8 @@ class Layout:
                 begin + at for at, leaf in self.leaves(kind) if isinstance(leaf, kinds.String)
             ]
             cells.sizes[name] = len(self.places[-1])
+            cells.known[name] = self.take(8)
+            self.places.append(range(cells.known[name], cells.known[name] + 8))
         return cells.records[name][0]
 
     def publication(self, context: str, topic: str) -> int:

@@ -12,9 +12,9 @@ arrays (`records.py`).
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
   it is taken back. Within what it calls it is a trap. Beyond are strings that are made or changed, vectors of anything
   but numbers, of more than `ROOM` bytes, of the message that are changed, handed back or by reference, or compared,
-  `MESSAGE`, messages of more than `MOST_MADE` bytes or with what is beyond, what is published with a string of more
-  than `MOST_KEPT`, or first of its kind of a second, recursion, `sin` and its like. An event of which no message can
-  come past such a place has no module: `NotScalarError` names what is beyond.
+  messages (and `MESSAGE`) of more than `MOST_MADE` bytes or with what is beyond, what is published with a string of
+  more than `MOST_KEPT`, or first of its kind of a second, recursion, `sin` and its like. An event of which no message
+  can come past such a place has no module: `NotScalarError` names what is beyond.
 - A line of output, and a message that is published, is noted behind those before, where `SAID` points, and the message
   at hand stands at `POSITION` (`output.py`).
 - Before a field is written, what stood there is noted in the log (address, size, bytes; 16 bytes each) that `UNDO`
@@ -297,11 +297,12 @@ class _Body(Records):
         """Nothing is made here, but it costs the same."""
         if node.size is not None:
             return self._allocated(constant(I64, node.size))
-        many = self._get("size") + constant(I32, form.CHARGED) + b"\x4b"
-        return self._when(many, lambda: self._allocated(self._get("size") + b"\xad"))
+        many = self._length() + constant(I64, form.CHARGED) + b"\x56"
+        return self._when(many, lambda: self._allocated(self._length()))
 
-    def _pending(self, _node: form.Pending) -> bytes:
+    def _pending(self, node: form.Pending) -> bytes:
         """Only `Whole` asks for it."""
+        self._assigned_fields[node.name] = node.writes
         return b""
 
     def _drop(self, _node: form.Drop) -> bytes:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.arithmetic import Arithmetic
-from appliance.rosmop.ir.layout import NotScalarError, machine_type
+from appliance.rosmop.ir.layout import REST, NotScalarError, machine_type
 from appliance.rosmop.ir.values import struct_code, struct_size
 from appliance.rosmop.ir.wasm import I32, I64, LOAD, constant, unsigned
 from appliance.rosmop.runtime.times import BILLION
@@ -28,6 +28,10 @@ class Places(Arithmetic):
         """A position, in 64 bits: the lengths in a message are not to be trusted."""
         offset = constant(I64, at.offset)
         return offset if at.base is None else self._get(at.base, I64) + offset + b"\x7c"
+
+    def _length(self) -> bytes:
+        """The bytes of all of the message, in 64 bits."""
+        return self._get("size") + b"\xad" + self._cell(0x29, REST) + b"\x7c"
 
     def _within(self, at: form.Spot, size: int) -> bytes:
         """A fault unless so many bytes of the message stand there."""

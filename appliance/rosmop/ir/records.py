@@ -7,7 +7,8 @@ Whatever is put there has one encoding only: what has several in the message tha
 too many nanoseconds) is written anew, and a message that puts a NaN there is left. So what is published is copied.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.layout import LINES, MOST_MADE, POSITION, SAID, NotScalarError, machine_type
@@ -28,13 +29,15 @@ _STORES = {4: 0x36, 2: 0x3B, 1: 0x3A, 8: 0x37}
 
 
 class Records(Vectors):
-    """Writes what makes messages."""
+    """Writes what makes messages. `_assigned_fields` are those that `Whole` has, by the names of what is pending."""
 
+    _assigned_fields: dict[str, Sequence[form.Write]]
     _messages: frozenset[str] = frozenset()
     """The local variables that are messages with a place of their own; of others it is that of what they are."""
 
     def _own_places(self, function: form.Function | form.Skipper) -> None:
         """Find out which local variables have a place of their own: whatever may differ from where it came from."""
+        self._assigned_fields = {}
         given = function.parameters if isinstance(function, form.Function) else ()
         inner = [*form.nodes(function.body)]
         assigned = [
@@ -63,11 +66,15 @@ class Records(Vectors):
 
     def _place(self, node: form.Expression) -> tuple[bytes, bytes]:
         if isinstance(node, form.Read) and node.name in self._layout.shared:
-            return b"", constant(I32, self._layout.record(node.name, node.type))
+            place = constant(I32, self._layout.record(node.name, node.type))
+            return self._if_known(node.name), place
         if isinstance(node, form.Copy) and root_of(node) in self._layout.shared:
             raise NotScalarError(
                 "a copy of a message that is kept"
             )  # that may be changed while this is looked at
+        if isinstance(node, form.Whole):
+            place = constant(I32, self._layout.made(node.type))
+            return self._put_message(place, 0, node, kept=False), place
         return super()._place(node)
 
     def _elements(self, node: form.Expression) -> tuple[bytes, bytes, bytes]:
@@ -82,12 +89,18 @@ class Records(Vectors):
         code = first + place + self._set(name) + self._when(unknown, self._elsewhere)
         return code, begin, length + b"\xad"
 
+    def _if_known(self, name: str) -> bytes:
+        """The message is left where a variable is not here."""
+        known = self._cell(0x29, self._layout.shared[name].known[name])
+        return self._when(known + b"\x50", self._elsewhere)
+
     def _assigned_record(self, node: form.Assign) -> bytes:
         """Give a message to a variable."""
         if node.name in self._layout.shared:
             at = self._layout.record(node.name, node.type)
             self._assigned.add(node.name)
-            return self._put_value(constant(I32, at), 0, node.type, node.value, kept=True)
+            put = self._put_value(constant(I32, at), 0, node.type, node.value, kept=True)
+            return self._if_known(node.name) + put
         name = f"place of {node.name}"
         if node.name not in self._messages:
             return b"".join(self._place(node.value)) + self._set(name)
@@ -160,6 +173,8 @@ class Records(Vectors):
         """A message, or an array of fixed length: zeros, or a copy."""
         if value.type != kind:
             raise NotScalarError(str(value.type))
+        if isinstance(value, form.Whole):
+            return self._put_message(place, offset, value, kept=kept)
         size = self._layout.extent(kind)
         if isinstance(value, form.Zero):
             return b"".join(
@@ -202,6 +217,48 @@ class Records(Vectors):
             for at, leaf in self._layout.leaves(kind)
         )
 
+    def _put_message(self, place: bytes, offset: int, node: form.Whole, *, kept: bool) -> bytes:
+        """The message at hand, with the fields that were assigned."""
+        if node.pending not in self._assigned_fields:
+            raise NotScalarError("MESSAGE")
+        code, name, at = self._allocated(self._length()), f"within {len(self._locals)}", form.Spot(None, 0)
+        for to, leaf in self._layout.leaves(node.type):
+            if isinstance(leaf, kinds.String):
+                code += self._put_text_at(place, offset + to, at, name, kept=kept)
+                at = form.Spot(name, 0)
+                continue
+            size = self._layout.size(leaf)
+            base = self._get("at") + (b"" if at.base is None else self._get(at.base, I64) + b"\xa7\x6a")
+            code += self._within(at, size)
+            code += self._put_number(place, offset + to, leaf, self._loaded(base, at.offset, leaf))
+            at = at.plus(size)
+        for write in self._assigned_fields[node.pending]:
+            kind: Type = node.type
+            to = offset
+            for number in write.path:
+                if not isinstance(number, int):
+                    raise NotScalarError("a part of a time that was assigned")
+                if isinstance(kind, kinds.Record):
+                    kind, to = self._layout.field(kind, number), to + self._layout.offset(kind, number)
+                else:
+                    kind, size = self._layout.element(kind)
+                    to += number * size
+            put = partial(self._put_value, place, to, kind, write.value, kept=kept)
+            code += self._when(self._get(write.flag), put)
+        return code
+
+    def _put_text_at(self, place: bytes, offset: int, at: form.Spot, name: str, *, kept: bool) -> bytes:
+        """The string of the message at a position, and the position behind it."""
+        begin, length = f"begin {name}", f"length {name}"
+        code = self._within(at, 4) + self._position(at.plus(4)) + self._set(begin, I64)
+        code += b"".join(self._at(at, 0x35)) + self._set(length, I64)
+        code += self._get(begin, I64) + self._get(length, I64) + b"\x7c" + self._set(name, I64)
+        code += self._within(form.Spot(name, 0), 0)
+        if kept:
+            code += self._when(self._get(length, I64) + constant(I64, MOST_KEPT) + b"\x56", self._elsewhere)
+        code += place + self._get("at") + self._get(begin, I64) + b"\xa7\x6a\x36\x00" + unsigned(offset)
+        return code + place + self._get(length, I64) + b"\xa7\x36\x00" + unsigned(offset + 4)
+
     # What is published
 
     def _noted_line(self, line: Line | Publication, cost: bytes) -> bytes:
@@ -233,7 +290,7 @@ class Records(Vectors):
             long = length + constant(I64, MOST_KEPT) + b"\x56"
             code, cost = code + self._when(long, self._elsewhere), cost + length + b"\x7c"
         code += self._noted_line(publication, cost)
-        own = self._is_own(root_of(node.value))
+        own = isinstance(node.value, form.Whole) or self._is_own(root_of(node.value))
         return code + self._copy_of(self._get("line"), HEAD.size, kind, source, own=own)
 
 

@@ -39,6 +39,7 @@ from appliance.rosmop.prove.terms import (
     as_bits,
     both,
     either,
+    integer,
     opposite,
 )
 from appliance.rosmop.runtime.context import BUDGET
@@ -51,7 +52,7 @@ IN_PYTHON = "no module: messages of this topic are judged in Python"
 PATIENCE = 1.0
 """Seconds for each event."""
 
-_NOW = 16  # where the time stands in the module
+_NOW, _REST = 16, 32  # where the time stands in the module, and how much of the message is not shown
 _HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE = 1, 2, 4, 8
 _LATEST = 1 << 62
 
@@ -199,7 +200,7 @@ class Validation:
         """What every event may begin with; the same as the module's cells; and what is known of it."""
         now, size = z3.BitVec("now", 64), z3.BitVec("size", 32)
         known = [now >= 0, now < _LATEST, z3.ULE(size, AREA)]
-        cells: dict[int, Term] = {_NOW: now}
+        cells: dict[int, Term] = {_NOW: now, _REST: integer(0, 64)}
         variables: dict[str, Term] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():

@@ -53,7 +53,8 @@ PUBLISHED = {
     " told = one; one.angular.x = c;"
     " PUBLISH(/a, geometry_msgs/Twist, told); two.linear = told.linear;"
     " PUBLISH(/a, geometry_msgs/Twist, two);",
-    "kept with strings": "PUBLISH(/a, std_msgs/String, word); word.data = f; PUBLISH(/a, std_msgs/String, word);"
+    "kept with strings": "PUBLISH(/a, std_msgs/String, word); word.data = f;"
+    " PUBLISH(/a, std_msgs/String, word);"
     ' if (c == 1) { word.data = "stop"; } if (c == 2) { last = word.data; } if (c == 3) { word.data = last; }'
     " if (c == 5) { head.frame_id = word.data; head.seq = n; } if (c == 36) { n += head.frame_id.size(); }"
     " std_msgs::Header h = head; h.stamp.sec = n; if (c == 0) { other = h; } if (c == 2) { head = other; }"
@@ -221,6 +222,66 @@ def test_on_every_kind_of_message() -> None:
     assert fed.came["published together"] > 50
 
 
+def test_a_time_that_no_message_can_have_is_kept_by_the_engine() -> None:
+    """The message has too many seconds and nanoseconds; whoever looks at what is kept of it sees the same."""
+    fed = Fed("""s() { std_msgs::Time m; std_msgs::Int32 other; ros::Time last;
+        event e(ros::Time t, int c) /plain own/Plain '{when:t, count:c}' { other.data = c;
+        if (c == 1) { m.data = t; } if (c == 2) { last = m.data; }
+        if (c == 3) { PUBLISH(/a, std_msgs/Time, m); } if (c == 4) { m = std_msgs::Time(); } } }""")
+    far = plain(1)[:18] + struct.pack("<II", 2**32 - 1, 2**32 - 1) + plain(1)[26:]
+    for body in (plain(1), far, plain(3), far, plain(4), far, plain(1)):
+        fed.check([plain(2), body, plain(2), plain(0), plain(3)])
+    assert fed.came["fault"] > 2
+    assert fed.came["together"] > 4
+
+
+COPIED = {
+    "kept": "last = MESSAGE; n += last.twist.linear.y; if (last.header.frame_id == f) { n++; }",
+    "with what was assigned": "x = n; if (x > 3) { s = 7; } last = MESSAGE; x = last.twist.linear.x + 1;"
+    " PUBLISH(/a, geometry_msgs/TwistStamped, MESSAGE);",
+    "published": "PUBLISH(/a, geometry_msgs/TwistStamped, MESSAGE); if (x > 2) { x = 2; }"
+    " geometry_msgs::TwistStamped m = MESSAGE; m.header.seq = n; PUBLISH(/a, geometry_msgs/TwistStamped, m);",
+    "a part": "n += MESSAGE.header.seq; geometry_msgs::Twist t = MESSAGE.twist; t.linear.x = n;"
+    " PUBLISH(/t, geometry_msgs/Twist, t);",
+    "after another event": "PUBLISH(/a, geometry_msgs/TwistStamped, MESSAGE); } event e2(double z) /s"
+    " geometry_msgs/TwistStamped '{twist.angular.z:z}' { z = z + 1;"
+    " } event e3() /s geometry_msgs/TwistStamped '{}' {"
+    " PUBLISH(/a, geometry_msgs/TwistStamped, MESSAGE); last = MESSAGE;",
+}
+
+
+@pytest.mark.parametrize("name", COPIED)
+def test_the_whole_message(name: str) -> None:
+    """As changed so far; cut after each byte, with bytes behind it, lengths that lie, strings of every length."""
+    fed = Fed(f"""s() {{ int n = 0; geometry_msgs::TwistStamped last;
+        event e(std::string f, double x, unsigned int s) /s geometry_msgs/TwistStamped
+        '{{header.frame_id:f, twist.linear.x:x, header.seq:s}}' {{ n++; {COPIED[name]} }} }}""")
+    for time, frame in enumerate(
+        (b"", b"base", b"a\0b", b"x" * MOST_KEPT, b"y" * (MOST_KEPT + 1), b"z" * 9000)
+    ):
+        body = struct.pack("<IIII", 7, 2**32 - 1, 5, len(frame)) + frame + struct.pack("<6d", 4.5, *range(5))
+        fed.publishing = time != 1
+        lying = [body[:12] + struct.pack("<I", length) + body[16:] for length in (1, 2**31, 2**32 - 1)]
+        fed.check([body, *lying, body + b"more", body, body[:-1], body], "/s", time)
+        many = body[:4] + struct.pack("<II", 2**32 - 1, 2**32 - 1) + body[12:]
+        fed.check([body, many, body[:-8] + struct.pack("<d", VALUES[time]), body], "/s", time)
+        if len(frame) < 10:
+            for end in range(len(body)):
+                fed.check([body, body[:end], body], "/s", time)
+    assert fed.came["together"] > 50
+
+
+def test_a_long_message_costs_what_all_of_it_costs() -> None:
+    """Though only its beginning is shown: an array, or all, of more than a specification may hold is a fault."""
+    array = "s() { int n = 0; event e(double[] v) /stamped own/Stamped '{values:v}' { n += v.size(); } }"
+    whole = "s() { std_msgs::Int32 m; event e() /i std_msgs/Int32 '{}' { m = MESSAGE; } }"
+    for text, topic, body in (array, "/stamped", STAMPED), (whole, "/i", bytes(4)):
+        fed = Fed(text)
+        fed.check([body, body + bytes(1 << 18), body + bytes(17 << 20), body], topic)
+        assert fed.came["fault"] == 1
+        assert fed.came["together"] > 0
+
+
 @pytest.mark.parametrize(
     "body",
     [
@@ -228,10 +289,11 @@ def test_on_every_kind_of_message() -> None:
         "own::Plain m; PUBLISH(/a, own/Plain, m);",
         "PUBLISH(/a, geometry_msgs/PoseWithCovariance, pose);",
         "PUBLISH(/a, own/Stamped, MESSAGE);",
+        "std_msgs::Header h; h.stamp = t; n += MESSAGE.names.size(); PUBLISH(/a, std_msgs/Header, h);",
     ],
 )
 def test_what_is_beyond_is_the_engines(body: str) -> None:
-    """Arrays of any length, arrays in messages that are kept, `MESSAGE`."""
+    """Arrays of any length, also in `MESSAGE`, arrays in messages that are kept."""
     fed = Fed(of_stamped(body, "geometry_msgs::PoseWithCovariance pose;"))
     fed.check([STAMPED] * 3, "/stamped")
     assert fed.monitors.walker("/stamped") is None

@@ -28,7 +28,7 @@ SHIPPED = {
     },
     "obstacle_avoidance": {
         "obstacleAvoidance.speed": EQUAL, "obstacleAvoidance.scan": "not loop-free",
-        "obstacleAvoidance.drive": IN_PYTHON,
+        "obstacleAvoidance.drive": "uses a message that is made, kept or published",
     },
     "safe_triggering": {"safeTrigger.checkPosition": "not loop-free", "safeTrigger.safeTrigger": EQUAL},
     "safe_zone": {"safeZone.odometry": IN_PYTHON, "safeZone.gps": IN_PYTHON, "safeZone.drive": EQUAL},
