@@ -10,6 +10,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,14 @@ def _group_of(verbs: Verbs) -> type[TyperGroup]:
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
             self.commands = {name: _command_of(verb, name) for name, verb in verbs.items()}
+
+        def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+            """The verb; one that is none and near to none is told which there are."""
+            name = args[0]
+            if name not in self.commands and name[:1] != "-" and not get_close_matches(name, self.commands):
+                shown = [verb for verb, command in self.commands.items() if not command.hidden]
+                ctx.fail(f"No such command {name!r}; there are: {', '.join(shown)}.")
+            return super().resolve_command(ctx, args)
 
     return _Lazy
 

@@ -111,6 +111,15 @@ def test_a_mistyped_verb_is_told_the_nearest(
     assert f"Did you mean '{meant}'?" in text
 
 
+def test_a_verb_near_to_none_is_told_which_there_are(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As `rostopic list` has it, where the verbs of `topic` are others."""
+    status, text = said_by(monkeypatch, capsys, "topic", "list")
+    assert status == 2
+    assert "No such command 'list'; there are: echo, info." in text
+
+
 @pytest.mark.parametrize("verb", [("config", "show"), ("policy", "check", "/dev/null"), ("--help",)])
 @pytest.mark.parametrize(("output", "status"), [("> /dev/full", 2), (">&-", 0), ("<&- >&- 2>&-", 0)])
 def test_an_output_that_takes_nothing(verb: tuple[str, ...], output: str, status: int) -> None:
