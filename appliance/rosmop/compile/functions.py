@@ -47,9 +47,11 @@ def _shared_variable(
             declaration.position,
             "a shared variable needs a type; `auto` is for local ones, and for constants that are written down",
         )
+    value = declarator.value if automatic or (declarator.is_array and declarator.size is None) else None
+    if declarator.is_array and value is None and isinstance(declarator.value, tree.Elements):
+        value = tree.Elements(declarator.value.position, ())
     kind, _ = initial(scope, declaration.type, tree.Declarator(
-        declarator.position, declarator.name, size=declarator.size, is_array=declarator.is_array,
-        value=declarator.value if automatic or (declarator.is_array and declarator.size is None) else None,
+        declarator.position, declarator.name, size=declarator.size, is_array=declarator.is_array, value=value,
     ))  # fmt: skip
     return Variable(
         declarator.name,

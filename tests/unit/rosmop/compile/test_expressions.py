@@ -256,6 +256,13 @@ def test_a_fault_stands_where_the_expression_does() -> None:
     assert fault.values == {"q": 3, "x": 7}
 
 
+def test_a_fault_shows_the_elements_of_an_array_of_characters() -> None:
+    """Numbers, as of any other array."""
+    (fault,) = act("x = 1 / (f[x] - 5);", before="char f[4] = {4, 5};", data=1).faults
+    assert fault.text == "division by zero"
+    assert fault.values == {"f": [4, 5, 0, 0], "x": 1}
+
+
 REFUSED = [
     ('x = "a";', 3, 5, "std::string cannot become int; write `std::stod(…)` or `std::stoi(…)`"),
     ("std::string s = 5;", 3, 17, "int cannot become std::string; write `std::to_string(…)`"),
