@@ -43,7 +43,7 @@ from appliance.rosmop.ir.output import BYTES, HEAD, Line, is_text
 from appliance.rosmop.ir.records import Records
 from appliance.rosmop.ir.texts import mismatch, settling
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
-from appliance.rosmop.ir.vectors import OF_VECTORS, made_in
+from appliance.rosmop.ir.vectors import OF_VECTORS, made_in, sorting
 from appliance.rosmop.ir.wasm import (
     COMPARE,
     DROP,
@@ -61,6 +61,7 @@ from appliance.rosmop.ir.wasm import (
 )
 from appliance.rosmop.runtime.wire import FEW
 from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
 
 HAPPENED, DROPPED, CHANGED, RESET = 1, 2, 4, 16
 
@@ -125,6 +126,12 @@ class Writer(Layout):
         if ("mismatch",) not in self._numbers:
             self._numbers["mismatch",] = self._added((I32, I32, I32), mismatch())
         return self._numbers["mismatch",].number
+
+    def sorting(self, element: Type) -> int:
+        """The number of the function that sorts elements of this type."""
+        if ("sorting", element) not in self._numbers:
+            self._numbers["sorting", element] = self._added((I32, I32), sorting(element))
+        return self._numbers["sorting", element].number
 
     def settling(self, cells: Cells) -> int:
         """The number of the function that copies the strings of variables, which must all be known."""
@@ -199,6 +206,9 @@ class _Body(Records):
 
     def _mismatch(self) -> int:
         return self._writer.mismatch()
+
+    def _sorting(self, element: Type) -> int:
+        return self._writer.sorting(element)
 
     # Statements
 

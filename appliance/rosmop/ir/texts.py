@@ -162,7 +162,7 @@ def _function(made: int, *code: bytes) -> bytes:
     return unsigned(len(whole)) + whole
 
 
-def _turns(leave: bytes, *turn: bytes) -> bytes:
+def turns(leave: bytes, *turn: bytes) -> bytes:
     """A loop that ends when `leave` is true, or a turn leaves its block."""
     return b"\x02\x40\x03\x40" + leave + b"\x0d\x01" + b"".join(turn) + b"\x0c\x00" + END + END
 
@@ -181,8 +181,8 @@ def mismatch() -> bytes:
     few = size + at + b"\x6b" + constant(I32, 8) + b"\x49"
     return _function(
         1,
-        _turns(few, compared(b"\x29\x52"), on(8)),
-        _turns(at + size + b"\x46", compared(b"\x2d\x47"), on(1)),
+        turns(few, compared(b"\x29\x52"), on(8)),
+        turns(at + size + b"\x46", compared(b"\x2d\x47"), on(1)),
         at,
     )
 

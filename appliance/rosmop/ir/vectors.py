@@ -9,22 +9,43 @@ A local variable that is changed, or holds what may change meanwhile, has a plac
 copied from: in the message.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.layout import ROOM, NotScalarError, machine_type
+from appliance.rosmop.ir.layout import ROOM, NotScalarError, is_signed, machine_type
 from appliance.rosmop.ir.places import root_of
-from appliance.rosmop.ir.texts import Texts
+from appliance.rosmop.ir.texts import Texts, turns
 from appliance.rosmop.ir.values import struct_code, struct_size
-from appliance.rosmop.ir.wasm import F32, F64, I32, I64, SELECT, STORE, constant
+from appliance.rosmop.ir.wasm import (
+    COMPARE,
+    END,
+    F32,
+    F64,
+    I32,
+    I64,
+    IF,
+    LOAD,
+    NOTHING,
+    RETURN,
+    SELECT,
+    STORE,
+    constant,
+    row,
+    unsigned,
+)
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
 _WRAP, _ADD, _SUB, _SAME = b"\xa7", b"\x7c", b"\x7d", b"\x46"
 _OVER, _AT_LEAST = b"\x56", b"\x5a"  # without a sign
 _COPY, _FILL = b"\xfc\x0a\x00\x00", b"\xfc\x0b\x00"
+
+
+MOST_SORTED = 64
+"""Elements that are sorted at once."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +71,10 @@ class Vectors(Texts):
 
     _made: frozenset[str] = frozenset()
     """The local variables that have a place of their own."""
+
+    @abstractmethod
+    def _sorting(self, element: Type) -> int:
+        """The number of the function that `sorting` writes."""
 
     def _room(self, node: form.Read | form.Assign) -> _Room:
         kind, cells = node.type, self._layout.shared.get(node.name)
@@ -112,8 +137,7 @@ class Vectors(Texts):
         return self._place_in(room) + self._bytes(room, count) + b"\x6a"
 
     def _stored(self, room: _Room, address: bytes, value: bytes) -> bytes:
-        opcode = {F32: 0x38, F64: 0x39}.get(machine_type(room.element), STORE[room.size])
-        return address + value + bytes((opcode, 0, 0))
+        return address + value + bytes((_stores(machine_type(room.element), room.size), 0, 0))
 
     def _given(self, node: form.Expression) -> tuple[bytes, bytes]:
         """What puts a number into a local variable, and what gets it."""
@@ -276,6 +300,17 @@ class Vectors(Texts):
         code += self._stored(room, self._behind(room, at), value)
         return code + self._counted(room, count + constant(I64, 1) + _ADD) + constant(I32, 0)
 
+    def _sort(self, node: form.Call) -> bytes:
+        room, code, (first, last) = self._opened(node)
+        many = last + first + _SUB
+        code += self._within_span(first, last, self._count_in(room))
+        code += self._when(many + constant(I64, MOST_SORTED) + _OVER, self._elsewhere)
+        code += self._spend(many + constant(I64, 64) + many + b"\x79" + _SUB + b"\x7e") + self._changing(room)
+        self._brief = False
+        call = b"\x10" + unsigned(self._sorting(room.element))
+        code += self._when(self._behind(room, first) + self._behind(room, last) + call, self._elsewhere)
+        return code + constant(I32, 0)
+
     def _within_span(self, first: bytes, last: bytes, count: bytes) -> bytes:
         """The message is left unless 0 <= first <= last <= count."""
         return self._when(first + last + _OVER + last + count + _OVER + b"\x72", self._elsewhere)
@@ -286,6 +321,7 @@ OF_VECTORS: Mapping[str, Callable[[Vectors, form.Call], bytes]] = MappingProxyTy
         "a_put": Vectors._put,
         "k_erase": Vectors._erase,
         "k_insert": Vectors._insert,
+        "k_sort": Vectors._sort,
         "l_append": Vectors._append,
         "l_clear": Vectors._clear,
         "l_pop": Vectors._pop,
@@ -293,6 +329,33 @@ OF_VECTORS: Mapping[str, Callable[[Vectors, form.Call], bytes]] = MappingProxyTy
     }
 )
 """What writes each function that changes a vector."""
+
+
+def sorting(element: Type) -> bytes:
+    """A function of two addresses (i32), between which elements are put into order, equal ones as they were; it returns
+    whether there is one that has no order.
+    """
+    codes, machine = struct_code(element) or "", machine_type(element)
+    size = struct_size(codes)
+    more = COMPARE[machine][">"] + (machine in (I32, I64) and not is_signed(element))
+    first, end, at, to, value = (b"\x20" + unsigned(local) for local in range(5))
+    set_at, set_to, set_value = (b"\x21" + unsigned(local) for local in (2, 3, 4))
+    load, store = bytes((LOAD[codes], 0, 0)), bytes((_stores(machine, size), 0, 0))
+    before = to + constant(I32, size) + b"\x6b"
+    unordered = (
+        value + value + bytes((COMPARE[machine]["!="],)) + IF + NOTHING + constant(I32, 1) + RETURN + END
+    )
+    above = before + load + value + bytes((more,)) + b"\x45"
+    moved = turns(to + first + _SAME + b"\x0d\x01" + above, to + before + load + store, before + set_to)
+    each = at + load + set_value + unordered + at + set_to + moved + to + value + store
+    ordered = turns(at + end + _SAME, each, at + constant(I32, size) + b"\x6a" + set_at)
+    made = row([unsigned(2) + bytes((I32,)), unsigned(1) + bytes((machine,))])
+    whole = made + first + set_at + ordered + constant(I32, 0) + END
+    return unsigned(len(whole)) + whole
+
+
+def _stores(machine: int, size: int) -> int:
+    return {F32: 0x38, F64: 0x39}.get(machine, STORE[size])
 
 
 def made_in(body: Sequence[form.Statement], shared: Mapping[str, object]) -> frozenset[str]:

@@ -187,7 +187,7 @@ class Specifications:
         if depth < 2:
             choices += ["return;", "DROP;"] * 2
         if depth < 2 and random.random() < 0.3:
-            choices += ['ROS_WARN("said %d", total);', "std::sort(all.begin(), all.end());",
+            choices += ['ROS_WARN("said %d", total);', "std::reverse(all.begin(), all.end());",
                         "for (int i = 0; i < 3; i++) { total += i; }"]  # fmt: skip
             choices += [f'{name} = "other";' for name in texts]
         return random.choice(choices)

@@ -13,6 +13,7 @@ from appliance.rosmop.ir import layout
 from appliance.rosmop.ir.feed import module_of
 from appliance.rosmop.ir.layout import ROOM
 from appliance.rosmop.ir.values import Values
+from appliance.rosmop.ir.vectors import MOST_SORTED
 from appliance.rosmop.syntax.errors import SpecificationError
 from tests.unit.rosmop.test_walks import Fed, plain
 
@@ -20,7 +21,7 @@ SOME = settings(max_examples=60, suppress_health_check=list(HealthCheck))
 MOST = ROOM // 8
 """Numbers of 64 bits that have room."""
 
-KINDS = ("double", "float", "int", "long", "unsigned int", "uint8_t", "int16_t", "uint64_t", "bool")
+KINDS = ("double", "float", "int", "long", "unsigned int", "int8_t", "uint8_t", "int16_t", "uint64_t", "bool")
 
 
 def stamped(values: tuple[float, ...] = (), count: int = 0) -> bytes:
@@ -118,6 +119,7 @@ TAKEN = (
     "std::vector<double> t = values; t.push_back(x); n = t.size() + values.size();",
     "std::vector<double> t(5); std::vector<double> u(x, 2.5); n = t[0] + u.size(); a = u;",
     "double g[3] = {x}; n += g[0] + g[2]; g[1] = n; a = g;",
+    "b.push_back(-x); std::sort(b.begin(), b.end()); n = b[1]; std::sort(b.begin() + 1, b.end() - 1);",
     "keep(values); n += least(a); again();", "a = b = values; n = a.at(0);",
 )  # fmt: skip
 
@@ -132,7 +134,7 @@ def test_nothing_of_that_is_for_the_engine(body: str) -> None:
 
 
 BEYOND = (
-    "std::sort(a.begin(), a.end());", "if (a == b) { n++; }", "values[0] = x;", "a = made();", "grow(a);",
+    "std::reverse(b.begin(), b.end());", "if (a == b) { n++; }", "values[0] = x;", "a = made();", "grow(a);",
     "for (auto one : b) { b.push_back(one); if (n++ > 5) { break; } }", "b[size()] = 1;", "w[0].push_back(x);",
     "n = b[(b = a)[0]];", "a = x ? b : d;", "t.push_back(when);",
 )  # fmt: skip
@@ -165,6 +167,24 @@ def test_every_kind_of_number(kind: str) -> None:
         fed.check([plain(x=x) for x in (*limits, float("inf"), float("nan"))], time=time)
         fed.state()
     assert fed.came == {"together": 3, "passed": 45}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_few_are_sorted_in_the_module(kind: str) -> None:
+    """Those that are equal stay in their order; where one is no number, or there are more, it is for the engine."""
+    text = kept(
+        "a.clear(); for (auto one : values) { a.push_back(one); } std::sort(a.begin(), a.end()); n = a[0] * 3;",
+        kind=kind,
+    )
+    random = Random(kind)  # noqa: S311  draws examples, not keys
+    some = (0.0, -0.0, 1.5, -7.25, 300.0, -1e300, 1e300, float("inf"), float("-inf"), 2.0**63, -1.0, 255.0)
+    fed = Fed(text)
+    for size in (1, 2, 3, 5, 17, MOST_SORTED):
+        fed.check([stamped(tuple(random.choices(some, k=size))) for _ in range(5)], "/stamped")
+    assert fed.came == {"together": 6, "passed": 30}
+    fed.check([stamped((1.0, 0.0) * MOST_SORTED)], "/stamped")
+    fed.check([stamped((1.0, float("nan"), 0.5, -3.0, 2.0))], "/stamped")
+    assert fed.came["together"] == (6 if kind in ("double", "float") else 7)
 
 
 @pytest.mark.parametrize("body", ["d.push_back(x);", "d.insert(d.begin(), x);", "d.resize(d.size() + 1);"])
@@ -243,6 +263,7 @@ def test_vectors_survive_wherever_the_module_is_stopped(monkeypatch: pytest.Monk
         "b = a;", "a.insert(a.begin() + 5, 1); a.pop_back();", "a.erase(a.begin() + 7); a.push_back(1);",
         "a.resize(0); a.resize(700);", "std::vector<double> t(601); n += t[0];", "auto t = a; t[0] = 1;",
         "std::vector<double> t(601, 1.0); n += t[0];", "n += a.size(); b = {1, 2}; b.clear();",
+        "std::sort(a.begin(), a.begin() + 63);", "std::sort(a.end() - 64, a.end()); std::sort(a.end(), a.end());",
         "a.erase(a.begin(), a.begin() + 70); a.resize(601);", "keep(a); n += least(a);",
     ],
 )  # fmt: skip

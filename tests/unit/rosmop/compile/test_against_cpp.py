@@ -90,6 +90,7 @@ def vector_program(random: Random) -> str:
                     f"if (!{a}.empty()) {{ {a}.erase({a}.begin() + {k} % {a}.size()); }}",
                     f"{a}.erase({a}.begin() + {a}.size() / 2, {a}.end());",
                     f"{a}.resize({k});",
+                    f"std::sort({a}.begin(), {a}.end());",
                     f"{a} = {b};",
                     f"{a} = {{{x}, total, {k}}};",
                     f"{a}.clear();",
