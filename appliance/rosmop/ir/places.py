@@ -167,13 +167,13 @@ class Places(Arithmetic):
 
     @contextmanager
     def _apart(self, *looked_at: form.Expression) -> Iterator[None]:
-        """What is written here does not change the vectors that are looked at; raises `NotScalarError` if it does."""
-        names = {root_of(node) for node in looked_at if isinstance(node.type, kinds.Vector)}
+        """What is written here does not change what is looked at; raises `NotScalarError` if it does."""
+        names = {root_of(node) for node in looked_at if isinstance(node.type, kinds.Vector | kinds.Record)}
         before, self._assigned = self._assigned, set()
         try:
             yield
             if not names.isdisjoint(self._assigned):
-                raise NotScalarError("a vector that changes while it is looked at")
+                raise NotScalarError("a vector or message that changes while it is looked at")
         finally:
             self._assigned |= before
 

@@ -122,10 +122,15 @@ class Records(Vectors):
 
     def _change(self, node: form.Call) -> bytes:
         """Put a value into a field, or into an element of an array of fixed length."""
-        base, where, value = node.arguments
+        base = node.arguments[0]
         kept = root_of(base) in self._layout.shared
         if kept:
             self._assigned.add(root_of(base))
+        with self._apart(base):
+            return self._put_part(node, kept=kept)
+
+    def _put_part(self, node: form.Call, *, kept: bool) -> bytes:
+        base, where, value = node.arguments
         if node.function == "a_slot":
             assert isinstance(where, form.Literal)  # noqa: S101  the number of a field
             number = int(where.value or 0)

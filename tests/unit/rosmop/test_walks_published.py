@@ -298,3 +298,21 @@ def test_what_is_beyond_is_the_engines(body: str) -> None:
     fed.check([STAMPED] * 3, "/stamped")
     assert fed.monitors.walker("/stamped") is None
     assert MOST_MADE < LINES
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "n = first(p);",
+        "p.covariance[0] = renewed();",
+        "n = p.covariance[renewed()];",
+    ],
+)
+def test_a_message_that_is_given_anew_while_it_is_looked_at_is_the_engines(body: str) -> None:
+    """There who looks at it goes on with what it was."""
+    before = """geometry_msgs::PoseWithCovariance p; geometry_msgs::PoseWithCovariance q; double n = 0;
+        int renewed() { p = q; return 1; }
+        double first(const geometry_msgs::PoseWithCovariance& given) { p = q; return given.covariance[0]; }"""
+    fed = Fed(event(f"p.covariance[0] = x; q.covariance[0] = x + 1; {body}", "double x", "x:x", before))
+    for time in range(3):
+        fed.check([plain(x=3.0), plain(x=4.0)], time=time)
