@@ -31,6 +31,12 @@ class Agenda:
             for monitor in monitors
         )
 
+    def let_go(self) -> None:
+        """The set is gone: its monitors have no part any more that has them."""
+        for monitor in self._monitors:
+            monitor.steps, monitor.timers, monitor.home = (), (), None
+        self._monitors = ()
+
     def has_come(self, time_ns: int) -> bool:
         """Whether something is due at this time."""
         return self.due is not None and self.due <= time_ns

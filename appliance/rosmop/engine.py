@@ -19,6 +19,7 @@ Theory of operation:
 """
 
 import math
+import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
@@ -139,6 +140,8 @@ class MonitorSet:
             for left, right in (comparison.when_true, comparison.when_false):
                 compiled.namespace |= {left: math.inf, right: 0.0}
         self._index()
+        # What is replaced goes at once: a garbage collector that had to look for it would hold up all messages.
+        weakref.finalize(self, self._agenda.let_go).atexit = False
 
     @classmethod
     def load(

@@ -46,6 +46,12 @@ def compiled(message: SpecificationsStated) -> Result:
         return [str(error)]
 
 
+def prepare() -> None:
+    """Make what every specification needs: the parser, ROS's own definitions, the library of modules."""
+    text = "prepare() { event e() /t std_msgs/Empty '{}' { } }"
+    compiled(SpecificationsStated(0, [("prepare.rv", text)], {}, {}, restarted=False))
+
+
 @cache
 def _standard() -> Definitions:
     return standard_definitions()

@@ -80,7 +80,7 @@ class Compiler:
     def compile(message: SpecificationsStated) -> Result:
         """The set that these specifications make, or what is wrong with them."""
         try:  # it is loaded late, for that takes half a second of a small machine
-            result: Result = late.load("appliance.relay.monitors.compilation").compiled(message)
+            result: Result = late.load("appliance.relay.monitors.compilation", "prepare").compiled(message)
         except Exception as error:  # noqa: BLE001  a defect of the compiler is a reason to refuse, no more
             return [f"a defect of rosrv, please report it: {type(error).__name__}: {error}"]
         return result

@@ -50,11 +50,11 @@ class Values:
 
     def __init__(self, messages: Messages) -> None:
         self._messages = messages
-        self._made: dict[tuple[Callable[[Type], Any], Type], Callable[..., Any]] = {}
+        self._made: dict[tuple[Callable[[Values, Any], Any], Type], Callable[..., Any]] = {}
 
-    def _once(self, make: Callable[[Any], Callable[..., Any]], kind: Type) -> Callable[..., Any]:
+    def _once(self, make: Callable[["Values", Any], Callable[..., Any]], kind: Type) -> Callable[..., Any]:
         if (make, kind) not in self._made:
-            self._made[make, kind] = make(kind)
+            self._made[make, kind] = make(self, kind)
         return self._made[make, kind]
 
     def fields(self, kind: kinds.Record) -> list[Type]:
@@ -86,7 +86,7 @@ class Values:
 
     def measure(self, kind: Type) -> Callable[[Any], int]:
         """A function that says how many bytes a value holds."""
-        return self._once(self._measure, kind)
+        return self._once(Values._measure, kind)
 
     def _measure(self, kind: Type) -> Callable[[Any], int]:
         if isinstance(kind, kinds.String | kinds.Characters):
@@ -110,7 +110,7 @@ class Values:
 
     def maker(self, kind: Type) -> Callable[[], Any]:
         """A function that makes a zero value (of void: None)."""
-        return self._once(self._maker, kind)
+        return self._once(Values._maker, kind)
 
     def _maker(self, kind: Type) -> Callable[[], Any]:
         if isinstance(kind, kinds.Vector):
@@ -124,7 +124,7 @@ class Values:
 
     def copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
         """A function that copies a value with all that is in it, charged: from context, value and site."""
-        return self._once(self._copier, kind)
+        return self._once(Values._copier, kind)
 
     def _copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
         if isinstance(kind, kinds.Record):
@@ -144,7 +144,7 @@ class Values:
 
     def decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
         """A function that finds the value at a position, and where it ends."""
-        return wire.text if isinstance(kind, kinds.String) else self._once(self._decoder, kind)
+        return wire.text if isinstance(kind, kinds.String) else self._once(Values._decoder, kind)
 
     def _decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
         if isinstance(kind, kinds.Vector):
@@ -192,7 +192,7 @@ class Values:
 
     def encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
         """A function that appends the bytes of a value."""
-        return wire.put_text if isinstance(kind, kinds.String) else self._once(self._encoder, kind)
+        return wire.put_text if isinstance(kind, kinds.String) else self._once(Values._encoder, kind)
 
     def _encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
         if isinstance(kind, kinds.Vector):

@@ -109,8 +109,11 @@ class Context:
         self.throttled: dict[int, int] = {}
         self._allocated = 0
         self._measures = measures  # of the variables of the specifications, by name
-        self.live: Callable[[], list[Mapping[str, object]]] = self._generated
-        """Says which variables have values, once for those that specifications share and once for each call."""
+        self.live: Callable[[], list[Mapping[str, object]]] | None = None
+        """Says which variables have values, once for those that specifications share and once for each call.
+
+        None: those of generated code have.
+        """
         self._pending = 0
 
     def begin(self) -> None:
@@ -166,7 +169,7 @@ class Context:
 
     def _measure(self, size: int, site: int) -> None:
         held = size + sum(len(message.data) for message in self.turn.published)
-        held += sum(map(self._held, self.live()))
+        held += sum(map(self._held, (self.live or self._generated)()))
         self._allocated = 0
         self.spend(held // (BYTES_PER_INSTRUCTION * 16), site)
         if held > MAX_BYTES:
