@@ -24,6 +24,7 @@ CERTIFICATE = "certificate.pem"
 KEY = "key.pem"
 _DAYS = 825
 _RENEW_DAYS = 30
+_TOO_EARLY = datetime.datetime(2025, 1, 1, tzinfo=datetime.UTC)  # before this is no clock right
 _HOST_NAME_LIMIT = 64
 
 
@@ -32,25 +33,45 @@ def tls_context(home: Path, names: Iterable[str], now: datetime.datetime) -> ssl
 
     Raises `OSError`, `ValueError` and `ssl.SSLError` when what is kept cannot be used.
     """
-    certificate, key = home / CERTIFICATE, home / KEY
-    wanted = [*dict.fromkeys([*names, "localhost", "127.0.0.1", "::1", socket.gethostname()])]
-    if not (certificate.exists() and key.exists() and _still_good(certificate, wanted, now)):
-        _make(certificate, key, wanted, now)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     context.set_alpn_protocols(["http/1.1"])
-    context.load_cert_chain(certificate, key)
+    _make_if_needed(home, names, now)
+    context.load_cert_chain(home / CERTIFICATE, home / KEY)
     return context
+
+
+def renew(context: ssl.SSLContext, home: Path, names: Iterable[str], now: datetime.datetime) -> bool:
+    """Whether new connections have a new certificate: it ends soon, or the clock was wrong when it was made.
+
+    Raises what `tls_context` does.
+    """
+    made = _make_if_needed(home, names, now)
+    if made:
+        context.load_cert_chain(home / CERTIFICATE, home / KEY)
+    return made
+
+
+def _make_if_needed(home: Path, names: Iterable[str], now: datetime.datetime) -> bool:
+    certificate, key = home / CERTIFICATE, home / KEY
+    wanted = [*dict.fromkeys([*names, "localhost", "127.0.0.1", "::1", socket.gethostname()])]
+    try:
+        if certificate.exists() and key.exists() and _still_good(certificate, wanted, now):
+            return False
+        _make(certificate, key, wanted, now)
+    except ValueError as error:
+        raise ValueError(
+            f"{home}: {CERTIFICATE} or {KEY} is damaged: restore both from a backup, or remove them: then hosts and"
+            f" clients do not know this appliance until they are told the new ones ({error})"
+        ) from error
+    return True
 
 
 def _still_good(path: Path, names: Iterable[str], now: datetime.datetime) -> bool:
     certificate = x509.load_pem_x509_certificate(path.read_bytes())
     extension = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    in_time = (
-        certificate.not_valid_before_utc
-        <= now
-        < certificate.not_valid_after_utc - datetime.timedelta(days=_RENEW_DAYS)
-    )
+    ends = certificate.not_valid_after_utc - datetime.timedelta(days=_RENEW_DAYS)
+    in_time = now < _TOO_EARLY or certificate.not_valid_before_utc <= now < ends
     return in_time and {_general_name(name) for name in names} <= set(extension)
 
 

@@ -9,6 +9,7 @@ import asyncio
 import datetime
 import os
 import socket
+import ssl
 from concurrent.futures import ThreadPoolExecutor
 from ipaddress import ip_network
 from pathlib import Path
@@ -19,7 +20,7 @@ import uvloop
 
 from appliance.api.access import Doorkeeper
 from appliance.api.app import build_app
-from appliance.api.certificate import pin_of, tls_context
+from appliance.api.certificate import pin_of, renew, tls_context
 from appliance.api.control import ControlLink
 from appliance.api.etags import Unchanged
 from appliance.api.gate import Gate
@@ -33,6 +34,7 @@ from appliance.config import Settings, load_resolved
 
 _log = structlog.get_logger()
 _WITHOUT_CONTROL_SECONDS = 30.0
+_RENEW_SECONDS = 60.0
 _THREADS = 40
 
 
@@ -95,6 +97,8 @@ class _Api:
         self._await_control()
         self._say(messages.Ready({"tls": self._settings.api_tls}))
         running = [loop.create_task(self._flush()), loop.create_task(history.run())]
+        if context is not None:
+            running.append(loop.create_task(self._renew(context)))
         await self._stopping.wait()
         for task in running:
             task.cancel()
@@ -106,13 +110,25 @@ class _Api:
         self._stopping.set()
         self._given.set()
 
-    def _context(self) -> Any:
+    def _context(self) -> ssl.SSLContext:
+        return tls_context(*self._certified())
+
+    async def _renew(self, context: ssl.SSLContext) -> None:
+        while True:
+            await asyncio.sleep(_RENEW_SECONDS)
+            try:
+                if await asyncio.to_thread(renew, context, *self._certified()):
+                    _log.warning("REST has a new certificate, of the same key")
+            except (OSError, ValueError) as error:
+                _log.error("the certificate of REST cannot be renewed", reason=str(error))
+
+    def _certified(self) -> tuple[Path, list[str], datetime.datetime]:
+        """Where the certificate is kept, the names it is for, and the time."""
         address = self._settings.api_address
         names = [*self._settings.api_names]
         if address is not None and address[0] not in ("0.0.0.0", "::"):  # noqa: S104  compared only
             names.append(address[0])
-        now = datetime.datetime.now(datetime.UTC)
-        return tls_context(self._settings.state / "api", names, now)
+        return self._settings.state / "api", names, datetime.datetime.now(datetime.UTC)
 
     async def _flush(self) -> None:
         while True:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.api.certificate import CERTIFICATE, KEY, pin_of, tls_context
+from appliance.api.certificate import CERTIFICATE, KEY, pin_of, renew, tls_context
 
 NOW = datetime.datetime.now(datetime.UTC)
 
@@ -74,6 +74,19 @@ def test_a_new_one_is_made_for_a_new_name_or_before_it_ends(
     assert pin_of(tmp_path) == pin
 
 
+@pytest.mark.parametrize("wrong", [datetime.timedelta(days=-20_000), datetime.timedelta(days=3650)])
+def test_a_clock_that_is_put_right_is_followed(tmp_path: Path, wrong: datetime.timedelta) -> None:
+    """It was made in 1970, or in ten years: once the clock is right there is a good one, of the same key."""
+    context = tls_context(tmp_path, ["10.1.2.3"], NOW + wrong)
+    pin = pin_of(tmp_path)
+    assert shake_hands(context, tmp_path / CERTIFICATE, "10.1.2.3") not in ("TLSv1.2", "TLSv1.3")
+    assert renew(context, tmp_path, ["10.1.2.3"], NOW)
+    assert shake_hands(context, tmp_path / CERTIFICATE, "10.1.2.3") in ("TLSv1.2", "TLSv1.3")
+    for now in (NOW, datetime.datetime.fromtimestamp(0, datetime.UTC)):  # at the next start it is 1970 again
+        assert not renew(context, tmp_path, ["10.1.2.3"], now)
+    assert pin_of(tmp_path) == pin
+
+
 def test_a_pin_is_that_of_the_key(tmp_path: Path) -> None:
     """As curl takes it, and as openssl makes it from the certificate; another key has another."""
     tls_context(tmp_path, [], NOW)
@@ -92,5 +105,7 @@ def test_what_cannot_be_used_is_an_error(tmp_path: Path) -> None:
     """A damaged certificate is not silently replaced: somebody may have pinned it."""
     tls_context(tmp_path, [], NOW)
     (tmp_path / CERTIFICATE).write_text("-----BEGIN CERTIFICATE-----\nnonsense\n-----END CERTIFICATE-----\n")
-    with pytest.raises(ValueError, match=r".+"):
+    with pytest.raises(
+        ValueError, match=rf"{tmp_path}: certificate\.pem or key\.pem is damaged: restore both"
+    ):
         tls_context(tmp_path, [], NOW)
