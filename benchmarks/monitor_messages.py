@@ -144,6 +144,7 @@ def main() -> None:
     print(f"{'a handler each, 64 together':32} {batched(64, COMMAND, HANDLED):8.3f} µs")
     print(f"{'a line each, 64 together':32} {batched(64, COMMAND, SAID):8.3f} µs")
     print(f"{'published each, 64 together':32} {batched(64, COMMAND, PUBLISHED):8.3f} µs")
+    print(f"{'copied each, 64 together':32} {batched(64, COMMAND, WHOLE):8.3f} µs")
     scans = monitors(SCAN)
     loop = microseconds(lambda: scans.process("/scan", LASER, 1), MESSAGES // 20)
     print(f"{'a loop over 100 numbers, engine':32} {loop:8.2f} µs")
