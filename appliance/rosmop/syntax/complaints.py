@@ -109,7 +109,9 @@ _FORMS = tuple(
     )
 )
 """What stands before the text that is refused, and the form of what this was to be."""
-_PIECE = re.compile(r'//[^\n]*|/\*(?:[^*]|\*(?!/))*\*/|"(?:\\.|[^"\\\n])*"|\'\\?[^\n]\'|[{}]')
+_PIECE = re.compile(
+    r"""(?P<gap>\s+|//[^\n]*|/\*(?:[^*]|\*(?!/))*\*/)|"(?:\\.|[^"\\\n])*"|'\\?[^\n]'|[{}]|[^\s{}"'/]+|."""
+)
 _PLAIN = {"\u2212": "-", "\u2260": "!=", "\u2264": "<=", "\u2265": ">=", "\u00d7": "*", "\u00f7": "/", "\u2192": "->",
           "\u2227": "&&", "\u2228": "||", "\u00ac": "!", "\u2019": "'", "\u2018": "'", "\u201e": '"'}  # fmt: skip
 _HINTS = {
@@ -242,10 +244,8 @@ def _open_braces(text: str, offset: int) -> list[int]:
 
 def _code(text: str, offset: int) -> str:
     """The text before `offset`, to the end of the last thing that is no comment."""
-    before = text[:offset].rstrip()
-    begin = before.rfind("\n") + 1
-    code = begin + len(before[begin:].partition("//")[0].rstrip())
-    return before if code == len(before) else _code(before, code)
+    ends = (piece.end() for piece in _PIECE.finditer(text, 0, offset) if not piece["gap"])
+    return text[: max(ends, default=0)]
 
 
 def _at_end(text: str, accepted: Set[str]) -> tuple[int, str]:

@@ -252,7 +252,7 @@ _SHAPES = (
     _shape(r"\*\*", "write `pow(x, y)`", 2),
     _shape(
         r"(?<=[;{}\n])(?<!['\u2018\u2019\u00b4`]\{)\s*\w+\s*:(?!:)",
-        "there are no labels; use a loop, `break` or `continue`",
+        "there are no labels; use a loop, `break` or `continue` (or is a `}` missing in front of a property?)",
         2,
     ),
     _shape(

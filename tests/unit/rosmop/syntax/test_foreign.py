@@ -133,6 +133,12 @@ def test_an_open_brace_is_named() -> None:
     assert told.endswith("the `{` at 2:19 has no `}`"), (place, told)
 
 
+def test_a_place_behind_very_many_comments_is_found() -> None:
+    """However many lines of comments stand between what is right and what is not, and whatever quotes are in them."""
+    place, told = refused("s() { int x" + " // it's\n" * 5000 + "/* ' */ }")
+    assert (place, told) == (11, "expected `;` behind this, found `}` in line 5001")
+
+
 @pytest.mark.parametrize(
     "behind",
     [
