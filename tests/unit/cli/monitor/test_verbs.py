@@ -165,7 +165,7 @@ def test_everything_wrong_with_several_files_is_told_at_once(tmp_path: Path) -> 
     result = invoke("check", one, two, three, tmp_path / "d.rv")
     assert result.exit_code == 1
     assert [line.split(" error: ")[0] for line in result.stdout.splitlines()] == [
-        f"{one}:2:2:", f"{two}:1:11:", f"{three}:1:69:", f"{tmp_path / 'd.rv'}:2:2:", "4 errors: refused",
+        f"{one}:1:12:", f"{two}:1:11:", f"{three}:1:69:", f"{tmp_path / 'd.rv'}:2:2:", "4 errors: refused",
     ]  # fmt: skip
 
 
