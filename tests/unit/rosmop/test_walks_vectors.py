@@ -120,6 +120,7 @@ TAKEN = (
     "std::vector<double> t(5); std::vector<double> u(x, 2.5); n = t[0] + u.size(); a = u;",
     "double g[3] = {x}; n += g[0] + g[2]; g[1] = n; a = g;",
     "b.push_back(-x); std::sort(b.begin(), b.end()); n = b[1]; std::sort(b.begin() + 1, b.end() - 1);",
+    "auto t = b; auto u = t; t.push_back(x); n = u.size(); b = u;",
     "keep(values); n += least(a); again();", "a = b = values; n = a.at(0);",
 )  # fmt: skip
 
@@ -264,6 +265,7 @@ def test_vectors_survive_wherever_the_module_is_stopped(monkeypatch: pytest.Monk
         "a.resize(0); a.resize(700);", "std::vector<double> t(601); n += t[0];", "auto t = a; t[0] = 1;",
         "std::vector<double> t(601, 1.0); n += t[0];", "n += a.size(); b = {1, 2}; b.clear();",
         "std::sort(a.begin(), a.begin() + 63);", "std::sort(a.end() - 64, a.end()); std::sort(a.end(), a.end());",
+        "a.erase(a.begin(), a.begin() + 13);",
         "a.erase(a.begin(), a.begin() + 70); a.resize(601);", "keep(a); n += least(a);",
     ],
 )  # fmt: skip
