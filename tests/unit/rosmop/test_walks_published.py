@@ -235,6 +235,22 @@ def test_a_time_that_no_message_can_have_is_kept_by_the_engine() -> None:
     assert fed.came["together"] > 4
 
 
+def test_a_long_string_that_is_kept_is_not_the_modules() -> None:
+    """Whoever looks at it, or copies it, is for the engine until there is another."""
+    text = of_stamped(
+        """if (c == 1) { word.data = f; } if (c == 2) { n += word.data.size(); }
+        if (c == 3 && word.data == "abc") { n += 10; } if (c == 4) { other = word; }
+        if (c == 5) { std_msgs::String m = word; n += m.data.size(); }""",
+        "std_msgs::String word; std_msgs::String other;",
+    )
+    fed = Fed(text)
+    for size in (3, MOST_KEPT, MOST_KEPT + 1, 5000, 0):
+        for look in range(2, 6):
+            fed.check([stamped(b"x" * size, 1)], "/stamped")
+            fed.check([stamped(b"", 0), stamped(b"", look), stamped(b"", 0)], "/stamped")
+    assert fed.came["together"] > 12
+
+
 COPIED = {
     "kept": "last = MESSAGE; n += last.twist.linear.y; if (last.header.frame_id == f) { n++; }",
     "with what was assigned": "x = n; if (x > 3) { s = 7; } last = MESSAGE; x = last.twist.linear.x + 1;"
