@@ -15,7 +15,8 @@ import selectors
 import socket
 import struct
 import time
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from appliance.network.namespaces import NetworkError
@@ -68,7 +69,7 @@ def scan(address: str, ports: Iterable[int], seconds: float) -> ScanResult:
 
     Raises: NetworkError for an address that this machine cannot use, or an outcome that says nothing of a port.
     """
-    attempts, waiting = _Attempts(address, seconds), iter(ports)
+    attempts, waiting = _Attempts(address, seconds), deque(ports)
     with selectors.DefaultSelector() as selector:
         try:
             while attempts.start(selector, waiting):
@@ -91,11 +92,11 @@ class _Attempts:
         self._refused = self._silent = self._untried = 0
         self._obstacle = ""
 
-    def start(self, selector: selectors.BaseSelector, ports: Iterator[int]) -> bool:
-        """Start connections until AT_ONCE are under way; tell whether there are any."""
+    def start(self, selector: selectors.BaseSelector, ports: deque[int]) -> bool:
+        """Start connections until AT_ONCE are under way, or all that the process may have; whether there are any."""
         at_once = max(1, min(AT_ONCE, resource.getrlimit(resource.RLIMIT_NOFILE)[0] - _OTHER_FILES))
-        while len(self.pending) < at_once and (port := next(ports, None)) is not None:
-            client = self._socket()
+        while len(self.pending) < at_once and ports and (client := self._socket()) is not None:
+            port = ports.popleft()
             outcome = client.connect_ex((self._address, port))
             if outcome in _UNDER_WAY:
                 self.pending[client] = (port, time.monotonic() + self._seconds)
@@ -131,10 +132,13 @@ class _Attempts:
         else:
             raise NetworkError(f"scanning {self._address} port {port}: {os.strerror(outcome)}")
 
-    def _socket(self) -> socket.socket:
+    def _socket(self) -> socket.socket | None:
+        """A socket; None where there can be one only when a connection that is under way has ended."""
         try:
             client = socket.socket(self._family, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         except OSError as error:
+            if error.errno in (errno.EMFILE, errno.ENFILE) and self.pending:
+                return None
             raise NetworkError(f"scanning {self._address}: {error.strerror}") from error
         client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         return client

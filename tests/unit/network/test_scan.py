@@ -1,5 +1,6 @@
 """Tests of the port scan on loopback."""
 
+import contextlib
 import errno
 import os
 import resource
@@ -22,11 +23,13 @@ def test_open_and_refused_ports_are_told_apart() -> None:
 
 
 def test_few_files_make_a_scan_slower_and_no_error() -> None:
-    """A process that may open few files scans with fewer connections at once."""
+    """A process that may open few files, of which others are open, scans with fewer connections at once."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    open_now = max(int(entry.name) for entry in Path("/proc/self/fd").iterdir())
-    with socket.create_server(("127.0.0.1", 0), backlog=500) as server:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (open_now + 40, hard))
+    with socket.create_server(("127.0.0.1", 0), backlog=500) as server, contextlib.ExitStack() as others:
+        for _ in range(50):
+            others.enter_context(Path("/dev/null").open())
+        open_now = max(int(entry.name) for entry in Path("/proc/self/fd").iterdir())
+        resource.setrlimit(resource.RLIMIT_NOFILE, (open_now + 20, hard))
         try:
             result = scan("127.0.0.1", [server.getsockname()[1]] * 300, seconds=10)
         finally:

@@ -173,20 +173,32 @@ def test_no_struct_hides_what_is_around_it(data: st.DataObject) -> None:
 @pytest.mark.parametrize("before", [b"", b"<value>", b"<value><int>", LIST, LIST[:20]])
 def test_a_document_that_is_none_costs_no_more_than_its_length(piece: bytes, before: bytes) -> None:
     """What does not fit the pattern in its last byte is left to the walk at once: nothing is tried over and over."""
-    whole = dumped(["a"], None).partition(b"<value>")[0] + before + piece * (31_000 // len(piece)) + b"<"
-    begun = time.process_time()
-    assert usual_answer(whole, Limits()) is None
-    call = whole.replace(b"<methodResponse>", b"<methodCall><methodName>m</methodName>")
-    assert usual_call(call, Limits()) is None
+    short, long = (spoilt(before, piece, 1_000_000 // shorter) for shorter in (16, 1))
+    of_short, of_long = (min(seconds_to_leave(texts) for _ in range(3)) for texts in (short, long))
+    assert of_long < 64 * (of_short + 0.0005)  # 16 times as long; a quadratic pattern takes 256 times as long
+
+
+def spoilt(before: bytes, piece: bytes, size: int) -> list[bytes]:
+    """An answer, a call and multicalls, of which each fits until its last byte."""
+    some = piece * (size // 32 // len(piece))
+    whole = dumped(["a"], None).partition(b"<value>")[0] + before + some + b"<"
+    texts = [whole, whole.replace(b"<methodResponse>", b"<methodCall><methodName>m</methodName>")]
     part = b"<value><struct><member><name>methodName</name><value><string>a</string></value></member>"
     part += b"<member><name>params</name>" + LIST + b"</member></struct></value>"
-    for within in (part, part[: part.index(b"<data>") + 6] + piece * (31_000 // len(piece))):
-        several = whole.partition(b"<value>")[0] + LIST[:20] + within * (1_000_000 // len(within)) + b"<"
-        several = several.replace(
-            b"<methodResponse>", b"<methodCall><methodName>system.multicall</methodName>"
-        )
-        assert usual_call(several[:1_000_000], Limits()) is None
-    assert time.process_time() - begun < 0.2  # a quadratic pattern takes four times as long
+    for within in (part, part[: part.index(b"<data>") + 6] + some):
+        several = whole.partition(b"<value>")[0] + LIST[:20] + within * (size // len(within)) + b"<"
+        head = b"<methodCall><methodName>system.multicall</methodName>"
+        texts.append(several.replace(b"<methodResponse>", head)[:size])
+    return texts
+
+
+def seconds_to_leave(texts: list[bytes]) -> float:
+    """The processor time until each is known to be unusual."""
+    begun = time.thread_time()
+    answer, *calls = texts
+    assert usual_answer(answer, Limits()) is None
+    assert [usual_call(call, Limits()) for call in calls] == [None] * len(calls)
+    return time.thread_time() - begun
 
 
 def test_one_value_too_many_is_refused_however_short() -> None:
