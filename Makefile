@@ -15,7 +15,7 @@ LONG_UNIT := $(shell grep --invert-match '^\#' tests/long.txt)
 CONTAINERS := tests/system/containers
 FETCHING := tests/system/vm tests/system/test_examples.py tests/system/test_generated_client.py
 NAMESPACES := $(filter-out $(CONTAINERS) $(FETCHING),$(wildcard tests/system/test_*.py) $(patsubst %/.,%,$(wildcard tests/system/[a-z]*/.)))
-PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples' tests/unit)
+PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples\|^from hypothesis' tests/unit tests/integration)
 
 .PHONY: help setup demo check static unit test units nodes test-system system-machine system-containers system-namespaces test-package prove wheel package image site release bench clean
 

@@ -14,6 +14,7 @@ from appliance.network import links
 from appliance.network.namespaces import Namespace, has_privileges
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
+from tests.support.examples import examples
 from tests.support.nodes import RosSession, has_ros
 from tests.support.outside import outside
 from tests.support.requirements import need_root, needs
@@ -23,7 +24,7 @@ from tests.support.site import Site
 _LONGEST_STORY = 40_000  # characters; of a flood there are many more
 
 # How long an example takes says what else the machine does, and nothing of the product.
-settings.register_profile("no clock", deadline=None)
+settings.register_profile("no clock", deadline=None, max_examples=examples(100))
 settings.load_profile("no clock")
 
 

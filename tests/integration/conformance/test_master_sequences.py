@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.integration.conformance.side_by_side import TESTER, Api, BothMasters, ServiceApi, differences
+from tests.support.examples import examples
 
 Step = tuple[Any, ...]
 NODES = st.sampled_from(["/talker", "/ear", "/left/arm", "/left/hand"])
@@ -103,7 +104,7 @@ SEQUENCES = st.lists(
 
 
 @settings(
-    max_examples=80,
+    max_examples=examples(120),
     derandomize=True,
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],

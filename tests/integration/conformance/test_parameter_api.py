@@ -21,6 +21,7 @@ from tests.integration.conformance.side_by_side import (
     MasterSide,
     differences,
 )
+from tests.support.examples import examples
 
 Step = tuple[Any, ...]
 SEGMENTS = st.sampled_from(["arm", "speed", "max", "left"])
@@ -200,7 +201,7 @@ _WATCHES = st.tuples(
 
 
 @settings(
-    max_examples=40,
+    max_examples=examples(60),
     derandomize=True,
     database=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],

@@ -12,6 +12,7 @@ from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.wire import Message
 from appliance.rosmop.syntax.errors import SpecificationError
+from tests.support.examples import examples
 from tests.unit.rosmop.acting import definitions, load, message, refused
 from tests.unit.rosmop.random_specifications import Messages, Specifications
 from tests.unit.rosmop.random_specifications import definitions as random_definitions
@@ -250,7 +251,7 @@ def test_what_is_published_is_of_who_published_it() -> None:
 def test_changes_are_by_whom_a_comparison_of_all_bytes_finds() -> None:
     """Random monitors: the bytes before and after each event say who changed what, and whether anything is changed."""
     most = 0
-    for seed in range(60):
+    for seed in range(examples(60)):
         try:
             monitors = MonitorSet.load(
                 {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())},

@@ -343,7 +343,7 @@ def test_lines_of_output(name: str) -> None:
         event e(int c, double x, std::string f, ros::Time t, double y) /stamped own/Stamped
         '{{frame:f, x:x, when:t, count:c, values[0]:y}}' {{ {OUTPUT[name]} }} }}""")
     values = (0.0, -0.0, 1e300, -2.5, 1e-320, float("inf"), float("nan"))
-    for number, value in enumerate(values):
+    for number, value in enumerate(values[:2] if "paid" in name else values):  # each of those takes a budget
         frame = (b"", b"abc", "\xe4\n".encode(), b"\xff%s\0", b"x" * 5000)[number % 5]
         head = struct.pack("<I", len(frame)) + frame
         rest = struct.pack("<IId", 9, 8 + number, value)

@@ -15,9 +15,10 @@ from appliance.rosmop.ir.layout import ROOM
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.ir.vectors import MOST_SORTED
 from appliance.rosmop.syntax.errors import SpecificationError
+from tests.support.examples import examples
 from tests.unit.rosmop.test_walks import Fed, plain
 
-SOME = settings(max_examples=60, suppress_health_check=list(HealthCheck))
+SOME = settings(max_examples=examples(60), suppress_health_check=list(HealthCheck))
 MOST = ROOM // 8
 """Numbers of 64 bits that have room."""
 

@@ -22,6 +22,7 @@ from appliance.policy.model import Decision
 from appliance.ros.xmlrpc import Value, build_call, parse_response
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import HttpRequest, Peer
+from tests.support.examples import examples
 from tests.support.idle import idle
 from tests.support.parameters import mirror, put
 from tests.support.serving import serving
@@ -357,7 +358,7 @@ def test_a_multicall_is_as_its_parts_one_by_one() -> None:
         assert together.trail.decisions == alone.trail.decisions
         assert together.there.tree == together.parameters.tree == alone.there.tree
 
-    for seed in range(20):
+    for seed in range(examples(24)):
         play(partial(scene, random.Random(seed)))  # noqa: S311  the same calls in every run
 
 

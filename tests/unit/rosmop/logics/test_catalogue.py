@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from appliance.rosmop.logics.catalogue import LOGICS, compile_property
 from appliance.rosmop.logics.interface import FormulaError
 from appliance.rosmop.positions import Position
+from tests.support.examples import examples
 from tests.unit.rosmop.logics.driving import ABC, ORIGIN, compiled, refusal
 
 EXAMPLES = {
@@ -126,7 +127,7 @@ WORDS = [
 
 
 @pytest.mark.parametrize("logic", LOGICS)
-@settings(max_examples=300, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=examples(300), derandomize=True, suppress_health_check=list(HealthCheck))
 @given(words=st.lists(st.sampled_from(WORDS), max_size=14), tail=st.text(max_size=3))
 def test_any_text_is_compiled_or_refused(logic: str, words: list[str], tail: str) -> None:
     """Whatever the text, the answer is a property or findings inside the text; never another error."""
