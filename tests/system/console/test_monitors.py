@@ -1,10 +1,11 @@
 """Monitors: switched, read, written wrongly and rightly, replaced, removed."""
 
+import threading
 from collections.abc import Callable
 from typing import Any
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Route, expect
 
 from tests.support.appliance import Appliance
 from tests.system.console.reader import Reader
@@ -83,21 +84,31 @@ def test_a_switch_that_somebody_else_was_quicker_with_says_so(
 ) -> None:
     """What the page has not seen yet is not overwritten; then it shows what is."""
     reader = opened()
+    deaf = threading.Event()  # it hears nothing of what others do, nor what it has asked for by then
+
+    def tell(route: Route) -> None:
+        answer = route.fetch()
+        if deaf.is_set():
+            route.abort()
+        else:
+            route.fulfill(response=answer)
+
+    reader.page.route("**/v1/monitors", tell)
     page = reader.go("monitors")
     switch = page.get_by_role("switch", name="safeZone enabled")
     before = state(appliance, "safeZone")["enabled"]
     expect(switch).to_have_attribute("aria-checked", str(before).lower())
-    page.route("**/v1/live*", lambda route: route.abort())
-    page.route("**/v1/monitors", lambda route: route.abort())  # it hears nothing of what others do
+    deaf.set()
     appliance.rosrv("monitor", "disable" if before else "enable", "safeZone")
     other = state(appliance, "safeTrigger")["enabled"]
     page.get_by_role("switch", name="safeTrigger enabled").click()
     expect(reader.toast("Somebody else was quicker")).to_be_visible()
     assert state(appliance, "safeTrigger")["enabled"] is other
-    page.unroute("**/v1/monitors")
+    deaf.clear()
     page.reload()
     expect(switch).to_have_attribute("aria-checked", str(not before).lower())
     appliance.rosrv("monitor", "enable" if before else "disable", "safeZone")
+    page.unroute_all(behavior="wait")
 
 
 def test_a_specification_is_loaded_replaced_and_removed(
