@@ -29,10 +29,9 @@ ROOT = HERE.parents[1]
 BUILD = ROOT / "build" / "tests"
 
 
-# rospy ends in its signal handler. One that comes in the middle of `publish` waits for the lock that `publish` holds.
-_IN_ITS_OWN_WAY = re.compile(
-    r"Current thread.*in _closed_connection_callback.*in _ros_signal.*in publish", re.DOTALL
-)
+# rospy ends in its signal handler. One that comes in the middle of `publish` waits for a lock that `publish` holds, or
+# that another thread of rospy has, which waits for that one.
+_IN_ITS_OWN_WAY = re.compile(r"Current thread.*in signal_shutdown.*in _ros_signal.*in publish", re.DOTALL)
 
 
 class RosSession:
