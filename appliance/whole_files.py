@@ -1,6 +1,7 @@
 """Files that are there as a whole or not at all, whatever dies meanwhile."""
 
 import os
+import stat
 from pathlib import Path
 
 
@@ -25,3 +26,24 @@ def write_whole(path: Path, data: bytes, mode: int) -> None:
         os.fsync(folder)  # else the file before could come back with the power
     finally:
         os.close(folder)
+
+
+def write_where_told(path: Path, data: bytes) -> None:
+    """Write what somebody wants at a place of his choice. Raises `OSError`.
+
+    A file is replaced as a whole and keeps its mode and owner, also behind a link. What is no file (a pipe, a device),
+    or has an owner that this process cannot give it again, is written into.
+    """
+    try:
+        there = path.stat()
+    except FileNotFoundError:
+        write_whole(path, data, 0o644)
+        return
+    user, groups = os.geteuid(), {os.getegid(), *os.getgroups()}
+    keeps = user == 0 or (there.st_uid == user and there.st_gid in groups)
+    if not (keeps and stat.S_ISREG(there.st_mode)):
+        path.write_bytes(data)
+        return
+    place = path.resolve()
+    write_whole(place, data, stat.S_IMODE(there.st_mode))
+    os.chown(place, there.st_uid, there.st_gid)

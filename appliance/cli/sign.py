@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key, l
 from appliance.cli.output import Json, say, say_json, usage_error
 from appliance.site_keys import name_of, public_line
 from appliance.site_keys import sign as signature_of
-from appliance.whole_files import write_whole
+from appliance.whole_files import write_where_told
 
 _OPENSSH = b"-----BEGIN OPENSSH PRIVATE KEY-----"
 
@@ -34,7 +34,7 @@ def sign(
     for file, text in signatures.items():
         beside = file.with_name(f"{file.name}.sig")
         try:
-            write_whole(beside, text.encode(), 0o644)
+            write_where_told(beside, text.encode())
         except OSError as error:
             raise usage_error(f"cannot write {beside}: {error.strerror}", verb="rosrv sign") from error
         if as_json:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.whole_files import write_whole
+from appliance.whole_files import write_where_told, write_whole
 from tests.support.requirements import need_root
 
 
@@ -60,3 +60,24 @@ def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:
         assert not list(tmp_path.iterdir())  # what was begun takes no room
     finally:
         subprocess.run(["umount", "--lazy", tmp_path], check=True)
+
+
+def test_a_file_behind_a_link_keeps_its_mode_and_a_pipe_stays_one(tmp_path: Path) -> None:
+    """What somebody names is written where it is: nothing else takes the place of a link, a pipe or a device."""
+    file, link, pipe = tmp_path / "file", tmp_path / "link", tmp_path / "pipe"
+    file.write_text("before")
+    file.chmod(0o640)
+    link.symlink_to(file)
+    write_where_told(link, b"after")
+    assert link.is_symlink()
+    assert (file.read_bytes(), stat.S_IMODE(file.stat().st_mode)) == (b"after", 0o640)
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_where_told(pipe, b"through")
+        assert os.read(reader, 100) == b"through"
+    finally:
+        os.close(reader)
+    assert pipe.is_fifo()
+    write_where_told(tmp_path / "new", b"one")
+    assert (tmp_path / "new").read_bytes() == b"one"

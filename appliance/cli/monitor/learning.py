@@ -16,7 +16,7 @@ from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.ros.message_text import BUILTINS
 from appliance.ros.standard import standard_definitions
-from appliance.whole_files import write_whole
+from appliance.whole_files import write_where_told
 
 
 def learn_monitors(
@@ -102,7 +102,7 @@ def _write(out: Path, learnt: Learnt, recorded: Definitions) -> None:
     try:
         for path, text in files.items():
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, text.encode("utf-8", "surrogateescape"), 0o644)
+            write_where_told(path, text.encode("utf-8", "surrogateescape"))
     except OSError as error:
         raise usage_error(f"cannot write {out}: {error.strerror}") from error
 

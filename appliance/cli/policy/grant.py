@@ -1,7 +1,5 @@
 """`rosrv policy grant`: what would grant a request that was refused, as the smallest change of the policy in force."""
 
-import os
-import stat
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -17,7 +15,7 @@ from appliance.cli.output import printable, say, say_json, usage_error
 from appliance.cli.policy.in_force import say_loaded
 from appliance.cli.target import Appliance, speaks
 from appliance.cli.trials import ConfirmWithin, seconds_within
-from appliance.whole_files import write_whole
+from appliance.whole_files import write_where_told
 
 
 @speaks
@@ -88,15 +86,7 @@ def grant(
         raise typer.Exit(1)
     if write is not None:
         try:
-            there = write.stat() if write.exists() else None
-            place = write.resolve()
-            write_whole(
-                place,
-                _with_ends_of(place, found.text),
-                0o644 if there is None else stat.S_IMODE(there.st_mode),
-            )
-            if there is not None:
-                os.chown(place, there.st_uid, there.st_gid)
+            write_where_told(write, _with_ends_of(write, found.text))
         except OSError as error:
             raise usage_error(f"cannot write {write}: {error.strerror}") from None
     if load:
@@ -110,7 +100,7 @@ def grant(
 
 def _with_ends_of(file: Path, text: str) -> bytes:
     """The text with lines that end as those of the file that is there; what is in force has none but LF."""
-    ends = b"\r\n" if file.exists() and b"\r\n" in file.read_bytes() else b"\n"
+    ends = b"\r\n" if file.is_file() and b"\r\n" in file.read_bytes() else b"\n"
     return text.encode().replace(b"\n", ends)
 
 

@@ -161,16 +161,18 @@ def test_export(state: Path, tmp_path: Path) -> None:
     assert str(target) in again.stderr
 
 
-def test_an_export_that_does_not_fit_leaves_no_file(state: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("what", [[], ["--deny"]], ids=["amid it", "when its only piece is written"])
+def test_an_export_that_does_not_fit_leaves_no_file(state: Path, tmp_path: Path, what: list[str]) -> None:
     """A part of it would look like all there was, and stand in the way of the next."""
     need_root()
     disk = tmp_path / "disk"
     disk.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4k", "rosrv-export-test", disk], check=True)
     try:
-        done = rosrv("export", "--output", str(disk / "out.ndjson"), state=state)
+        (disk / "full").write_bytes(bytes(4096))
+        done = rosrv("export", *what, "--output", str(disk / "out.ndjson"), state=state)
         assert (done.returncode != 0, "No space left" in done.stderr) == (True, True), done.stderr
-        assert not list(disk.iterdir())
+        assert [one.name for one in disk.iterdir()] == ["full"]
     finally:
         subprocess.run(["umount", "--lazy", disk], check=True)
 
