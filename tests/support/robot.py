@@ -8,6 +8,7 @@ nodes would.
         robot.call("/base/planner", "registerPublisher", "/guarded", "std_msgs/String", robot.api("/base/planner"))
 """
 
+import contextlib
 import http.client
 import itertools
 import math
@@ -17,7 +18,6 @@ import struct
 import threading
 import xmlrpc.client
 from collections.abc import Iterator
-from contextlib import ExitStack
 from socketserver import BaseRequestHandler, ThreadingMixIn, ThreadingTCPServer
 from types import TracebackType
 from typing import Any, Self
@@ -88,7 +88,7 @@ class Robot:
         self._master_uri = master_uri
         self._machine = dict(nodes())
         self._machines: dict[str, _Machine] = {}
-        self._stack = ExitStack()
+        self._stack = contextlib.ExitStack()
 
     def api(self, node: str) -> str:
         """The URI of a node."""
@@ -126,7 +126,7 @@ class _Machine:
 
     def __init__(self, address: str) -> None:
         self._address = address
-        self._stack = ExitStack()
+        self._stack = contextlib.ExitStack()
         self._over = threading.Event()
 
     def __enter__(self) -> Self:
@@ -166,7 +166,7 @@ class _Machine:
         thread.start()
         self._stack.callback(connection.close)
         self._stack.callback(thread.join)
-        self._stack.callback(connection.shutdown, socket.SHUT_RDWR)
+        self._stack.callback(_end, connection)
 
 
 class _Api(ThreadingMixIn, SimpleXMLRPCServer):
@@ -204,6 +204,11 @@ _DEFINITIONS = standard_definitions()
 
 def _publish(connection: socket.socket, over: threading.Event) -> None:
     """Answer one subscriber, and send it the topic at its rate; without a rate there is silence until it ends."""
+    with contextlib.suppress(ConnectionError):  # it may go at any moment
+        _serve(connection, over)
+
+
+def _serve(connection: socket.socket, over: threading.Event) -> None:
     (size,) = _LENGTH.unpack(_exactly(connection, 4))
     topic = decode_header(_exactly(connection, size))["topic"]
     answer = {
@@ -215,13 +220,10 @@ def _publish(connection: socket.socket, over: threading.Event) -> None:
     if rate is None:
         connection.recv(1)
         return
-    try:
-        for number in itertools.count():
-            connection.sendall(encode_frame(struct.pack("<d", math.sin(number / rate))))
-            if over.wait(1 / rate):
-                return
-    except OSError:
-        return
+    for number in itertools.count():
+        connection.sendall(encode_frame(struct.pack("<d", math.sin(number / rate))))
+        if over.wait(1 / rate):
+            return
 
 
 def _exactly(connection: socket.socket, size: int) -> bytes:
@@ -235,6 +237,12 @@ def _exactly(connection: socket.socket, size: int) -> bytes:
 
 
 def _read(connection: socket.socket) -> None:
-    with connection:
+    """To its end: the appliance may be gone before the robot, and reset what was on its way."""
+    with contextlib.suppress(ConnectionError):
         while connection.recv(65536):
             pass
+
+
+def _end(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):  # the other side has ended it
+        connection.shutdown(socket.SHUT_RDWR)

@@ -22,6 +22,7 @@ from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT, Event, Process, ThisMachine
 from tests.support.rest import Rest
 from tests.support.tunnels import JoinedHost
+from tests.support.waiting import eventually
 
 MIDDLE, ROBOT, OCU, ATTACKER = "10.88.0.2", "10.88.0.10", "10.88.0.20", "10.88.0.66"
 MASTER = f"http://{MIDDLE}:11311"
@@ -117,6 +118,13 @@ class TunnelSite:
     def state(self, name: str = "ocu-1") -> str:
         """The state of a host by `rosrv host list`."""
         return next(str(row["state"]) for row in self.hosts() if row["name"] == name)
+
+    def is_up(self, name: str = "ocu-1") -> dict[str, Any]:
+        """Wait until a host's tunnel is up as the appliance knows it: the host itself knows it a moment before."""
+        return eventually(
+            lambda: next((one for one in self.hosts() if (one["name"], one["state"]) == (name, "up")), None),
+            f"the tunnel of {name} is up",
+        )
 
     def recorded(self, since: int, timeout: float = LONG, **fields: Any) -> Event:
         """The first audit record with these fields that came after `mark` was taken."""

@@ -23,7 +23,7 @@ def test_an_encrypted_ed25519_authority(tmp_path: Path) -> None:
             key = (site.appliance.state / "signer" / "ca.key").read_text()
             assert "ENCRYPTED PRIVATE KEY" in key
             with site.joined(site.kit()):
-                assert site.state() == "up"
+                site.is_up()
                 mark = site.mark
                 site.appliance.rosrv("host", "revoke", "ocu-1")
                 site.recorded(mark, event="tunnel down")

@@ -30,6 +30,7 @@ from tests.support.requirements import need_program, need_root
 from tests.support.script_host import ScriptHost
 from tests.support.tunnel_site import API, LONG, MASTER, MIDDLE, OCU, OWN, POLICY, TunnelSite
 from tests.support.tunnels import need_strongswan
+from tests.support.waiting import allowed
 
 CONFIG = f"""\
 api: 0.0.0.0:{API}
@@ -237,7 +238,7 @@ def test_everything_over_rest(site: TunnelSite, laptop: ScriptHost, tmp_path: Pa
     assert made.status == 201, made.body
     assert ask(lambda: rest.post("/v1/hosts", new, match=seen.etag)).status == 412
     join_kit(laptop, tmp_path / "kit", made.body)
-    assert ask(lambda: rest.get("/v1/hosts/re.st_e-D")).json["state"] == "up"
+    assert site.is_up("re.st_e-D") == ask(lambda: rest.get("/v1/hosts/re.st_e-D")).json
     later = ask(lambda: rest.get(f"/v1/hosts/re.st_e-D/kit?endpoint={MIDDLE}"))
     (tmp_path / "later.tar.gz").write_bytes(later.body)
     with tarfile.open(tmp_path / "later.tar.gz") as tar:
@@ -288,8 +289,7 @@ def test_a_short_life_is_renewed_in_time(site: TunnelSite, laptop: ScriptHost, t
     script = tmp_path / "join.sh"
     mark = site.mark
     laptop.run("sh", str(script), awaited(site, "brief", script, "--days", str(90 / 86_400)))
-    first = row(site, "brief")
-    assert first["state"] == "up"
+    first = site.is_up("brief")
     # The kit's script looks at the certificate, which is dated an hour back: its last third has begun already.
     assert "in force" in laptop.run("/etc/rosrv/renew.sh").stdout
     site.recorded(mark, event="host renewed")
@@ -320,14 +320,13 @@ def test_two_hundred_hosts_beside_a_tunnel(site: TunnelSite, laptop: ScriptHost,
     assert set(ask(enrol_many)) == {201}
     script = tmp_path / "join.sh"
     laptop.run("sh", str(script), awaited(site, "last", script))
-    found = row(site, "last")
-    assert found["state"] == "up"
+    site.is_up("last")
     assert len({one["address"] for one in site.hosts()}) == len(site.hosts())
     mark = site.mark
     site.appliance.rosrv("host", "revoke", "last")
     revoked = site.recorded(mark, event="host revoked")
     down = site.recorded(mark, event="tunnel down")
-    assert seconds_of(down) - seconds_of(revoked) < 1.0
+    assert seconds_of(down) - seconds_of(revoked) < allowed(1.0)
 
 
 def seconds_of(record: dict[str, Any]) -> float:
@@ -367,7 +366,7 @@ def test_revoked_in_the_middle_of_rekeying(site: TunnelSite, laptop: ScriptHost,
                 revoked = site.recorded(mark, event="host revoked")
                 closed = site.recorded(mark, event="connection closed")
                 down = site.recorded(mark, event="tunnel down")
-                assert max(seconds_of(closed), seconds_of(down)) - seconds_of(revoked) < 1.0
+                assert max(seconds_of(closed), seconds_of(down)) - seconds_of(revoked) < allowed(1.0)
                 heard = len(listener.seen(event="received"))
             # It goes on trying, each time from nothing: what it had begun before may wait for its answer for minutes.
             anew = "swanctl --terminate --ike rosrv --force; swanctl --initiate --child ros --timeout 2"

@@ -37,7 +37,7 @@ def test_tunnels_stand_with_thousands_of_revoked_certificates(tmp_path: Path) ->
             )
             assert refused["host"] == OCU
         with site.joined(present) as joined:
-            assert site.state() == "up"
+            site.is_up()
             takes_such_a_list_itself(joined, tmp_path)
             mark = site.mark
             site.appliance.rosrv("host", "revoke", "ocu-1")

@@ -147,7 +147,7 @@ def test_charon_that_dies_is_started_again(site: TunnelSite, joined: JoinedHost)
     site.recorded(mark, event="tunnel down")
     site.recorded(mark, event="tunnel up")
     assert site.appliance.pids("charon") != [before]
-    assert site.state() == "up"
+    site.is_up()
 
 
 def test_a_replaced_certificate_is_revoked(site: TunnelSite, kit: Path, joined: JoinedHost) -> None:

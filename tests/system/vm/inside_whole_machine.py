@@ -123,7 +123,7 @@ def test_a_host_joins_and_leaves_by_its_kit(lab: Lab, tmp_path: Path) -> None:
                 text=True,
             )
             assert "closed" in seen.communicate(timeout=LONG)[0]
-        assert site.state() == "up"
+        site.is_up()
         leaving = subprocess.run(
             [str(folder / "leave.sh")], capture_output=True, text=True, timeout=LONG, check=False
         )
