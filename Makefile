@@ -61,7 +61,8 @@ nodes: build/collected
 test-system: ## the whole product: demo, namespaces, tunnels, containers, a virtual machine, the console in a browser
 	@scripts/setup --system
 	TESTS_EXAMPLES=all $(PYTEST) $(LONG_PROOFS) $(PROPERTIES) -n auto --dist loadfile --quiet --durations=5
-	$(MAKE) --jobs=2 --keep-going --output-sync=target --no-print-directory system-machine system-containers system-namespaces
+	$(MAKE) --jobs=2 --keep-going --output-sync=target --no-print-directory system-machine system-containers
+	$(MAKE) --no-print-directory system-namespaces
 
 system-machine:
 	$(PYTEST) $(FETCHING) --quiet --durations=5

@@ -88,8 +88,20 @@ class Reader:
         """What the page says was done."""
         return self.page.locator(".toasts").get_by_text(text)
 
+    def settle(self) -> None:
+        """Wait until what the view shows is there, and no colour is on its way to another."""
+        expect(self.page.locator(".skeleton")).to_have_count(0)
+        self.page.wait_for_function(
+            "document.fonts.status === 'loaded' && document.getAnimations().every(one => one.playState !== 'running')"
+        )
+
+    def fits(self) -> None:
+        """Wait until the page is no wider than its window; fails when it stays wider."""
+        self.page.wait_for_function("document.documentElement.scrollWidth <= innerWidth")
+
     def axe(self) -> list[str]:
-        """What axe-core finds against WCAG 2.2 AA and its good practices."""
+        """What axe-core finds against WCAG 2.2 AA and its good practices, when the view stands still."""
+        self.settle()
         found = Axe().run(
             self.page,
             options={

@@ -66,6 +66,8 @@ def test_two_clicks_at_once_are_both_made(appliance: Appliance, opened: Callable
     names = ("safeZone", "safeTrigger")
     switches = [page.get_by_role("switch", name=f"{name} enabled") for name in names]
     before = [state(appliance, name)["enabled"] for name in names]
+    for switch, on in zip(switches, before, strict=True):
+        expect(switch).to_have_attribute("aria-checked", str(on).lower())
     for _ in range(2):
         wanted = [not one for one in before]
         page.evaluate(

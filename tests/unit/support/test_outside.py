@@ -63,3 +63,36 @@ def _exists(path: str, name: str) -> bool:
     return file.exists() and any(
         isinstance(node, ast.FunctionDef) and node.name == name for node in ast.parse(file.read_text()).body
     )
+
+
+def test_what_fails_beside_others_is_named_by_ci(tmp_path: Path) -> None:
+    """CI runs it once more by itself, and says so; what fails twice, many failures, and a broken file fail the run."""
+    for path, target in ((".venv", ROOT / ".venv"), ("ci", ROOT / ".ci")):
+        (tmp_path / path).symlink_to(target)
+    once = tmp_path / "test_once.py"
+    once.write_text(FAILS_ONCE.format(name="test_race", tried=str(tmp_path / "race")))
+    told = "unsteady: test_once.py::test_race failed beside other tests and passed by itself"
+    done = by_ci(tmp_path)
+    assert (done.returncode, told in done.stdout.splitlines()) == (0, True), done.stdout + done.stderr
+
+    (tmp_path / "race").unlink()
+    always = tmp_path / "test_always.py"
+    always.write_text("def test_defect():\n    assert 0\n")
+    done = by_ci(tmp_path)
+    assert (done.returncode, told in done.stdout) == (1, False), done.stdout + done.stderr
+
+    (tmp_path / "race").unlink()
+    always.write_text("import nothing_of_that_name\n")
+    assert by_ci(tmp_path).returncode in (1, 2)
+
+    always.unlink()
+    many = "".join(FAILS_ONCE.format(name=f"test_{n}", tried=str(tmp_path / str(n))) for n in range(6))
+    once.write_text(many)
+    assert by_ci(tmp_path).returncode == 1
+    assert (tmp_path / "0").read_text() == "x", "none was run again"
+
+
+def by_ci(folder: Path) -> "subprocess.CompletedProcess[str]":
+    """What CI makes of the tests there."""
+    command = ["ci/pytest", "-n2", "--dist=loadfile", "--import-mode=importlib", "."]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
