@@ -13,6 +13,9 @@ _GAP = r"(?:\s|\/\/[^\n]*\n|\/\*(?:[^*]|\*(?!\/))*\*\/)"
 _WORD = "(?:creation|static|unsynchronized|decentralized|perthread|suffix)"
 """What MOP writes before `event`."""
 
+_AT = r"@(?=(?:bc?|c)(?!\w))(?!\w+<GAP>*\{)"
+"""The `@` of an operator of `ptcaret`, which begins no handler."""
+
 _GRAMMAR = r"""
 file: (specification | using | ";")*
 using: "using" "namespace" NAME ";"
@@ -192,7 +195,7 @@ MESSAGE_TYPE.4: /[A-Za-z]\w*\/[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`{>\],&]|<
     | /[A-Za-z]\w*::[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`,]|<GAP>+(request|response)(?!\w))/
 DURATION: /(\d+(\.\d*)?|\.\d+)\s*[A-Za-z]*/
 QUOTE: /['\u2018\u2019\u00b4`]/
-FORMULA.9: /(?:(?!<NEXT>)[^@{}\/]|\/(?![\/*])|\/\/[^\n]*|\/\*(?:[^*]|\*(?!\/))*\*\/)+/
+FORMULA.9: /(?:(?!<NEXT>)[^@{}\/]|<AT>|\/(?![\/*])|\/\/[^\n]*|\/\*(?:[^*]|\*(?!\/))*\*\/)+/
 AT: "@"
 NUMBER: /(0[xX][0-9A-Fa-f]+|(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?)[uUlLfF]*/
 STRING: /"(\\.|[^"\\\n])*"|“(\\.|[^”\\\n])*”/
@@ -218,4 +221,6 @@ PREAMBLE.10: /#(\\\r?\n|[^\n])*/
 _NEXT = rf"(?<!\w)(?:(?i:{'|'.join(LOGICS)}|dl)\s*:(?!:)|(?:{_WORD}\s+)*event\s+[A-Za-z_]\w*\s*\()"
 """Where a formula ends that no handler follows: another property, or an event."""
 
-GRAMMAR = _GRAMMAR.replace("<NEXT>", _NEXT).replace("<GAP>", _GAP).replace("<WORD>", _WORD)
+GRAMMAR = (
+    _GRAMMAR.replace("<NEXT>", _NEXT).replace("<AT>", _AT).replace("<GAP>", _GAP).replace("<WORD>", _WORD)
+)

@@ -6,6 +6,7 @@ import pytest
 
 from appliance.rosmop.logics.interface import RunFaultError
 from appliance.rosmop.logics.ptcaret import MAX_DEPTH
+from appliance.rosmop.syntax.parser import parse
 from tests.unit.rosmop.logics.driving import compiled, refusal, seeded, told
 from tests.unit.rosmop.logics.temporal import Tree, draw
 
@@ -103,6 +104,19 @@ def test_derived_operators(text: str, tree: Tree) -> None:
     for _ in range(100):
         trace = [random.choice(EVENTS) for _ in range(12)]
         assert told(compiled("ptcaret", text, EVENTS), trace) == verdicts(tree, trace)
+
+
+IN_A_FILE = [*(text for text, _tree in DERIVED), "a => @b  a", "!@c a // @fail", "@b @c a"]
+BEHIND = {"": [], "@violation { } @c { }": ["violation", "c"], "// why\n@c /* {} */ { }": ["c"]}
+
+
+@pytest.mark.parametrize("text", IN_A_FILE)
+@pytest.mark.parametrize("behind", BEHIND)
+def test_a_formula_stands_in_a_file_as_it_is(text: str, behind: str) -> None:
+    """Its `@` begins no handler, and a handler's belongs to no formula."""
+    (found,) = parse(f"s() {{ ptcaret: {text}\n{behind} }}", "x.rv").specifications[0].properties
+    assert found.formula.removesuffix("// why").rstrip() == text
+    assert [handler.category for handler in found.handlers] == BEHIND[behind]
 
 
 def test_nobody_looks_into_a_call_that_has_returned() -> None:
