@@ -5,7 +5,8 @@ Invariants:
 1. What is served here is part of the program, but for the notice of the site and the time after which the page locks,
    and the same for everybody: it needs no token and knows no secret. What the page shows it asks of `/v1`, with the
    token its reader brings.
-2. Only files that were there at start are served, by an exact name: a path never reaches the file system.
+2. Only files that were there when the routes were made are served, by an exact name: a path never reaches the file
+   system.
 3. Its headers let the page load and connect to nothing but this origin, run no script but these files, and let no
    string become markup (Trusted Types).
 """
@@ -44,11 +45,6 @@ class _File(NamedTuple):
     body: bytes
     media_type: str
     etag: str
-
-
-def is_console(path: str) -> bool:
-    """Whether a path is one of the console's, which is served without a token."""
-    return path in ("/", "/console") or path.startswith("/console/")
 
 
 def routes(settings: Settings) -> APIRouter:

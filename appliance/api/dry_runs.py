@@ -1,13 +1,6 @@
 """Dry runs: what a change would do, without making it."""
 
-from typing import Annotated
-
-from fastapi import Query
-
-DryRun = Annotated[bool, Query(description="only say what it would do; for operators, without If-Match")]
 _NO = frozenset({b"", b"0", b"false", b"off", b"no", b"f", b"n"})
-
-
 _QUESTIONS = frozenset({"/v1/policy/explain", "/v1/policy/test"})
 
 

@@ -13,11 +13,10 @@ from pydantic import StringConstraints
 
 from appliance.api.access import Bearer
 from appliance.api.control import ControlLink
-from appliance.api.dry_runs import DryRun
 from appliance.api.monitor_judgement import findings_of, judge, refusal
 from appliance.api.monitor_models import NewSpecifications, NewText, Replaced, Switch, SwitchMany
 from appliance.api.monitors import UNKNOWN, OneName, unknown_monitor
-from appliance.api.policy_changes import Confirm
+from appliance.api.policy_changes import Confirm, DryRun
 from appliance.api.policy_models import Rollback
 from appliance.api.preconditions import IfMatch, etag, expected_tag
 from appliance.api.problems import ProblemError

@@ -10,7 +10,6 @@ from fastapi import Query
 from msgspec.structs import replace
 
 from appliance.api.access import Bearer
-from appliance.api.dry_runs import DryRun
 from appliance.api.judgement import judge_change
 from appliance.api.policy_models import PolicyText, Report, Rollback
 from appliance.api.preconditions import IfMatch, expected_revision
@@ -26,6 +25,7 @@ _CHANGES: Responses = {
     412: {"description": "Another policy is in force than If-Match names."},
     428: {"description": "If-Match is missing."},
 }
+DryRun = Annotated[bool, Query(description="only say what it would do; for operators, without If-Match")]
 Confirm = Annotated[
     float | None,
     Query(

@@ -2,7 +2,8 @@
 
 It ends when the supervisor says `Stop` or is gone. It outlives control: while there is none, calls that need it are
 answered 503. A control that does not come back, or that closed the link because of what it was sent, is answered by
-ending: the supervisor starts a fresh api with a fresh link.
+ending: the supervisor starts a fresh api with a fresh link. Routes and contract are made for the first request that
+passes the gate: where nobody asks REST, they would be most of what this process takes.
 """
 
 import asyncio
@@ -17,9 +18,10 @@ from typing import Any
 
 import structlog
 import uvloop
+from starlette.types import ASGIApp, Receive, Scope, Send
 
+from appliance import late
 from appliance.api.access import Doorkeeper
-from appliance.api.app import build_app
 from appliance.api.certificate import pin_of, renew, tls_context
 from appliance.api.control import ControlLink
 from appliance.api.etags import Unchanged
@@ -41,6 +43,25 @@ _THREADS = 40
 def main(lifeline_fd: int, config: Path) -> None:
     """Serve REST until the supervisor ends it."""
     uvloop.run(_Api(load_resolved(config), lifeline_fd).run())
+
+
+class _Application:
+    """The application, made when it is first called; ASGI."""
+
+    def __init__(self, services: Services) -> None:
+        self._services = services
+        self._made: ASGIApp | None = None
+        self._making = asyncio.Lock()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        async with self._making:
+            if self._made is None:
+                self._made = await asyncio.to_thread(self._make)
+        await self._made(scope, receive, send)
+
+    def _make(self) -> ASGIApp:
+        made: ASGIApp = late.load("appliance.api.app").build_app(self._services)
+        return made
 
 
 class _Api:
@@ -67,9 +88,8 @@ class _Api:
         services = Services(
             self._settings, self._control, self._doorkeeper, self._journal, self._stopping, history
         )
-        app = build_app(services)
         gate = Gate(
-            Unchanged(app),
+            Unchanged(_Application(services)),
             limits=self._settings.api_limits,
             doorkeeper=self._doorkeeper,
             journal=self._journal,

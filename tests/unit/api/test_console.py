@@ -11,7 +11,8 @@ import pytest
 from fastapi import FastAPI
 
 import appliance.api
-from appliance.api.console import VIEWS, is_console, routes
+from appliance.api.console import VIEWS, routes
+from appliance.api.gate import is_console
 from appliance.api.problems import ProblemError
 from appliance.config import Settings
 from appliance.policy.model import Category

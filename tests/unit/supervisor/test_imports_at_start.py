@@ -15,7 +15,7 @@ ENTRIES: Final = {role.name: role.entry.partition(":")[0] for role in ROLES if r
 _BARE = {"pydantic", "rosbags"}
 ALSO: Final = {
     "signer": _BARE, "relay": _BARE | {"cryptography"}, "control": _BARE, "charon": _BARE, "syslog": _BARE,
-    "recorder": {"pydantic"},
+    "recorder": {"pydantic"}, "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette"},
 }  # fmt: skip
 
 
