@@ -128,8 +128,10 @@ class Shared:
         self.functions[function.name] = function
         return Printer(self.module, self.values, function.context).function(function)
 
-    def foreign(self, own: SpecificationNames, name: str, position: Position) -> Variable | None:
-        """A variable of another specification."""
+    def foreign(
+        self, own: SpecificationNames, name: str, position: Position
+    ) -> tuple[Variable | None, str | None]:
+        """A variable of another specification, and which that is."""
         owners = [other for other in self.specifications if other is not own and name in other.variables]
         if len(owners) > 1:
             both = " and ".join(other.name for other in owners[:2])
@@ -137,14 +139,13 @@ class Shared:
                 position, f"{shown(name)} is a variable of {both}; give one of them another name"
             )
         if not owners:
-            return None
-        own.uses.add(owners[0].name)
+            return None, None
         variable = owners[0].variables[name]
         if variable.sliced:
             raise SpecificationError.at(
                 position, f"each slice of {owners[0].name} has its own {shown(name)}: others cannot see it"
             )
-        return variable
+        return variable, owners[0].name
 
 
 class Scope:
@@ -219,14 +220,20 @@ class Scope:
         return variable
 
     def find(self, name: str, position: Position) -> Variable | None:
-        """The variable of this name: local, of this specification, of another one."""
+        """The variable of this name, which the code uses: local, of this specification, of another one."""
+        variable, owner = self._known(name, position)
+        if owner is not None:
+            self.names.uses.add(owner)
+        return variable
+
+    def _known(self, name: str, position: Position) -> tuple[Variable | None, str | None]:
         for block in reversed(self._blocks):
             if name in block:
-                return block[name]
+                return block[name], None
         if name in self.below:
             raise SpecificationError.at(position, f"{shown(name)} is declared below; move its declaration up")
         own = self.names.variables.get(name)
-        return own or self.shared.foreign(self.names, name, position)
+        return (own, None) if own is not None else self.shared.foreign(self.names, name, position)
 
     def changes_anything(self) -> bool:
         """Whether what was written so far assigns something, itself or in a function that it calls."""
@@ -314,7 +321,7 @@ class Scope:
                 continue
             seen.add(name)
             try:
-                variable = self.find(name, node.position)
+                variable, _ = self._known(name, node.position)
             except SpecificationError:
                 continue
             if variable is not None and variable.alias is None:

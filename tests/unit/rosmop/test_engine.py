@@ -87,6 +87,25 @@ def test_monitors_share_variables() -> None:
     assert printed(monitors.process("/u", number(0), 2)) == ["42 2"]
 
 
+@pytest.mark.parametrize(
+    ("parameter", "when", "body"),
+    [
+        ("shared", "when (shared < 3)", ""),
+        ("shared", "", "shared = 1 / (shared - 3);"),
+        ("x", "", "int shared = 3, other = 1 / (shared - x); x = other;"),
+        ("x", "", "for (int shared = 3; shared < 5; shared += 2) { x++; }"),
+        ("x", "", "std::vector<int> all = {x}; for (int shared : all) { x = 1 / shared; }"),
+    ],
+)
+def test_a_name_of_its_own_is_no_use_of_the_others_variable(parameter: str, when: str, body: str) -> None:
+    """So the two are switched, tried, moved and removed apart; only where it means the other's is it a use."""
+    event = f"event e(int {parameter}) /t std_msgs/Int32 '{{data:{parameter}}}' {when} {{ {body} }}"
+    other = "other() { int shared = 0; event e() /u std_msgs/Empty '{}' { shared++; } }"
+    for text, uses in (("", set()), ("event f() /u std_msgs/Empty '{}' when (shared > 1) { }", {"other"})):
+        monitors = load(f"own() {{ {event} {text} }}", other=other)
+        assert monitors.monitor("own").code.uses == uses
+
+
 def test_a_name_that_two_others_declare_is_an_error() -> None:
     """Which one would be meant is not guessed; the same name in two specifications is a warning."""
     both = "a() { int n;" + on("/t") + "} b() { int n;" + on("/t") + "}"
