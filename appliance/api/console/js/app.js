@@ -2,10 +2,9 @@
 
 import { Door, Lock } from "./door.js";
 import { html, useEffect } from "./html.js";
-import { retry, start, stop, live } from "./live.js";
+import { start, stop } from "./live.js";
 import { Nav } from "./nav.js";
 import { startNotable, stopNotable } from "./notable.js";
-import { Icon } from "./parts/icon.js";
 import { Toasts, clearToasts } from "./parts/toast.js";
 import { place } from "./router.js";
 import { session } from "./session.js";
