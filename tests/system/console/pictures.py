@@ -153,6 +153,7 @@ def _one_topic(reader: Reader) -> None:
     expect(page.locator('[data-key="t/arm/command"]')).to_be_visible()
     page.get_by_label("Search the graph").press("Enter")
     expect(page.get_by_role("button", name="Look", exact=True)).to_be_visible()
+    page.get_by_role("list", name="Legend").scroll_into_view_if_needed()
     _take(page, "console-graph")
 
 
