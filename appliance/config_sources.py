@@ -26,6 +26,7 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from appliance.config import Settings
+from appliance.wrong_values import must_be
 
 if typing.TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -45,24 +46,6 @@ _SHORT_NAMES: dict[str, KeyPath] = {
     "ROSRV_CA_PASSPHRASE_FILE": ("ipsec", "ca_passphrase_file"),
     "ROSRV_RELAY": ("relaying",),  # as --relay; with a table it is the section, like any other
 }
-_WANTED = {
-    "bool": "true or false",
-    "byte": "a size, for example 500MB or 2GiB",
-    "dataclass": "a section: its keys stand on the lines below it, indented",
-    "finite": "a number",
-    "float": "a number",
-    "greater_than": "more than {gt:g}",
-    "greater_than_equal": "at least {ge:g}",
-    "int": "a whole number",
-    "ip": "a network, for example 192.168.1.0/24",
-    "less_than": "less than {lt:g}",
-    "less_than_equal": "at most {le:g}",
-    "list": "a list, for example [a, b]",
-    "literal": "{expected}",
-    "path": "the path of a file or folder",
-    "string": "a text; a number or true is one in quotes",
-}
-"""What a value must be, by the kind of pydantic's errors, or the first word of that."""
 _FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
 _Section = typing.TypeVar("_Section", bound="DataclassInstance")
 
@@ -191,9 +174,7 @@ class _Gathered:
             settings = read(self._values)
         except ValidationError as error:
             for detail in error.errors(include_url=False):
-                self._mistakes.append(
-                    self._mistake(detail["type"], detail["loc"], detail["msg"], detail.get("ctx"))
-                )
+                self._mistakes.append(self._mistake(detail))
             raise ConfigError(self._mistakes) from error
         if self._mistakes:
             raise ConfigError(self._mistakes)
@@ -227,7 +208,8 @@ class _Gathered:
                 self._places[*path, index] = f"{file}:{value.start_mark.line + 1}"
                 self._note_places(file, value, (*path, index))
 
-    def _mistake(self, kind: str, path: KeyPath, text: str, context: Any) -> Mistake:
+    def _mistake(self, error: Mapping[str, Any]) -> Mistake:
+        kind, path, context = error["type"], error["loc"], error.get("ctx")
         if kind == "invalid_key":
             path = (*path[:-1], str(path[-1]))
         place = self._place_of(path)
@@ -237,9 +219,8 @@ class _Gathered:
             return Mistake(place, f"{_dotted(path)} must be given")
         if kind == "value_error" and context:  # a sentence of ours, which names the value where that helps
             return Mistake(place, f"{_about(path, place)}{context['error']}")
-        wanted = _WANTED.get(kind) or _WANTED.get(kind.partition("_")[0])
-        text = f"must be {wanted.format(**context or {})}" if wanted else f"{text[:1].lower()}{text[1:]}"
-        return Mistake(place, f"{_about(path, place)}{text}, not {self._value_at(path)!r}")
+        wanted = must_be(error)
+        return Mistake(place, f"{_about(path, place)}must be {wanted}, not {self._value_at(path)!r}")
 
     def _place_of(self, path: KeyPath) -> str:
         for length in range(len(path), 0, -1):

@@ -28,8 +28,9 @@ from appliance.api import (
 from appliance.api.contract import contract_of
 from appliance.api.control import ControlAwayError
 from appliance.api.parameters import only_known
-from appliance.api.problems import REASON, BadInput, ProblemError, defect
+from appliance.api.problems import REASON, BadInput, ProblemError, bad_input, defect
 from appliance.api.services import Services
+from appliance.wrong_values import refusal
 
 _DESCRIPTION = """\
 The appliance's own interface for scripts and other programs. Every call but the health probes needs a bearer token
@@ -134,7 +135,5 @@ def _methods(request: Request) -> set[str]:
 
 async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)  # noqa: S101  registered for it
-    errors = error.errors()
-    bad = [BadInput(where=".".join(map(str, found["loc"])), text=str(found["msg"])) for found in errors]
-    detail = "; ".join(f"{problem.where}: {problem.text}" for problem in bad[:5])
-    return _answer(request, ProblemError(422, "bad-input", detail, errors=bad))
+    bad = [BadInput(where=".".join(map(str, found["loc"])), text=refusal(found)) for found in error.errors()]
+    return _answer(request, bad_input(bad))

@@ -2,8 +2,8 @@
 
 from fastapi import Request
 
-from appliance.api.problems import BadInput, ProblemError
-from appliance.policy.findings import meant
+from appliance.api.problems import BadInput, bad_input
+from appliance.wrong_values import meant
 
 _MOST_SHOWN = 5
 
@@ -28,5 +28,4 @@ async def only_known(request: Request) -> None:
             BadInput(where=f"query.{name}", text=f"there is no such parameter{meant(name, known)}")
             for name in unknown
         ]
-        detail = "; ".join(f"{problem.where}: {problem.text}" for problem in bad)
-        raise ProblemError(422, "bad-input", f"{detail}; {there_are}", errors=bad)
+        raise bad_input(bad, besides=f"; {there_are}")

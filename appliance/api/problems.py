@@ -92,6 +92,12 @@ def too_many(kind: str, detail: str, seconds: float) -> ProblemError:
     return ProblemError(429, kind, detail, retry_after=int(seconds) + 1)
 
 
+def bad_input(wrong: list[BadInput], *, besides: str = "") -> ProblemError:
+    """Each part of a request that makes no sense (422); `besides` ends the sentence for a person."""
+    detail = "; ".join(f"{problem.where}: {problem.text}" for problem in wrong[:5])
+    return ProblemError(422, "bad-input", detail + besides, errors=wrong)
+
+
 def defect(error: Exception) -> ProblemError:
     """What a client is told of a defect of ours: its kind, nothing of what it was about."""
     return ProblemError(500, "defect", f"a defect of rosrv, please report it: {type(error).__name__}")

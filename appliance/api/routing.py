@@ -4,6 +4,7 @@ A handler gives a struct, or `Tagged` with its ETag; the contract has the schema
 `Annotated[Kind, body(Kind)]`. Where an answer is something else, the handler gives a `Response`.
 """
 
+import enum
 import functools
 import json
 import re
@@ -16,14 +17,15 @@ from fastapi import APIRouter, Depends, Request, Response
 
 from appliance.api.moments import in_full
 from appliance.api.preconditions import etag
-from appliance.api.problems import BadInput, ProblemError
+from appliance.api.problems import BadInput, ProblemError, bad_input
+from appliance.wrong_values import body_refusal, meant
 
 A = TypeVar("A")
 Responses = dict[int | str, dict[str, Any]]
 ETAG = {"ETag": {"description": "what If-Match takes of the next change", "schema": {"type": "string"}}}
 _JSON = "application/json"
 _MOST_ERRORS = 50
-_PLACE = re.compile(r"(?s)(.*) - at `(?:key in )?\$(.*)`")
+_PLACE = re.compile(r"(?s)(.*) - at `(?:key` in `)?\$(.*)`")
 
 
 class Tagged(NamedTuple, Generic[A]):
@@ -98,7 +100,7 @@ class _Body:
         try:
             return msgspec.convert({"text": text}, self.kind)
         except msgspec.ValidationError as error:
-            raise _bad_input([error]) from None
+            raise bad_input([_bad(error)]) from None
 
     def _of_json(self, text: str) -> Any:
         try:
@@ -106,10 +108,10 @@ class _Body:
                 return msgspec.json.decode(text, type=self.kind)
             except msgspec.ValidationError as error:
                 # That was the first field that is wrong: behind it may be what is no JSON.
-                wrong = _all_wrong(msgspec.json.decode(text), self.kind) or [error]
+                wrong = _all_wrong(msgspec.json.decode(text), self.kind) or [_bad(error)]
         except (msgspec.DecodeError, RecursionError) as error:
             raise _not_json(text, error) from None
-        raise _bad_input(wrong)
+        raise bad_input(wrong)
 
     def schema(self) -> dict[str, Any]:
         """How the contract describes it."""
@@ -133,39 +135,42 @@ def _text(data: bytes) -> str:
         raise ProblemError(422, "bad-input", f"the body is not UTF-8 (byte {error.start})") from None
 
 
-def _all_wrong(given: Any, kind: Any) -> list[msgspec.ValidationError]:
+def _all_wrong(given: Any, kind: Any) -> list[BadInput]:
     """What is wrong with each field of a body, where msgspec ends with the first."""
     if not isinstance(given, dict):
         return []
     known = {field.encode_name: field for field in msgspec.structs.fields(kind)}
     wrong = [
-        msgspec.ValidationError(f"Object missing required field `{name}`")
+        BadInput("body", f"the field `{name}` must be given")
         for name, field in known.items()
         if field.required and name not in given
     ]
     for name, value in given.items():
         if name not in known:
-            wrong.append(msgspec.ValidationError(f"Object contains unknown field `{name[:100]}`"))
+            wrong.append(BadInput("body", f"there is no field `{name[:100]}`{meant(name, known)}"))
             continue
         try:
             msgspec.convert(value, known[name].type)
         except msgspec.ValidationError as error:
-            text, place = _parted(error)
-            wrong.append(msgspec.ValidationError(f"{text} - at `$.{name}{place}`"))
+            wrong.append(_bad(error, f"body.{name}", known[name].type))
     return wrong[:_MOST_ERRORS]
 
 
-def _parted(error: msgspec.ValidationError) -> tuple[str, str]:
-    """What is wrong, and where."""
+def _bad(error: msgspec.ValidationError, where: str = "body", kind: Any = None) -> BadInput:
+    """What is wrong with a part of a body of this kind, and where."""
     found = _PLACE.fullmatch(str(error))
-    return (found[1], found[2]) if found is not None else (str(error), "")
+    text, place = (str(error), "") if found is None else found.groups()
+    return BadInput(where + place, body_refusal(text, _choices(kind)))
 
 
-def _bad_input(errors: list[msgspec.ValidationError]) -> ProblemError:
-    bad = [BadInput(f"body{place}", text) for text, place in map(_parted, errors)]
-    return ProblemError(
-        422, "bad-input", "; ".join(f"{problem.where}: {problem.text}" for problem in bad[:5]), errors=bad
-    )
+def _choices(kind: Any) -> tuple[str, ...]:
+    """The texts that a value of this kind may be, where it is one of a few."""
+    parts = typing.get_args(kind)
+    if isinstance(kind, type) and issubclass(kind, enum.StrEnum):
+        return tuple(kind)
+    if typing.get_origin(kind) is typing.Literal:
+        return parts
+    return next(filter(None, map(_choices, parts)), ())
 
 
 def _not_json(text: str, error: Exception) -> ProblemError:

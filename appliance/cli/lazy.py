@@ -18,6 +18,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from appliance import late
+from appliance.wrong_values import refusal
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +120,15 @@ class _Deferred(TyperCommand):
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         """It is run, or completed: from here on it is the real one."""
-        return loaded(self._verb, str(self.name)).make_context(info_name, args, parent, **extra)
+        command = loaded(self._verb, str(self.name))
+        try:
+            return command.make_context(info_name, args, parent, **extra)
+        except typer.BadParameter as error:
+            # Of pydantic, which is not imported for this.
+            wrong: list[dict[str, Any]] = getattr(error.__cause__, "errors", list)()
+            if wrong:
+                error.message = refusal(wrong[0])
+            raise
 
 
 def loaded(verb: Verb, name: str) -> Any:

@@ -18,7 +18,8 @@ from typing import Any
 
 import yaml
 
-from appliance.policy.findings import meant, quoted
+from appliance.policy.findings import quoted
+from appliance.wrong_values import meant
 
 _LARGEST = 1 << 20
 _MOST_GROUPS = 32

@@ -3,13 +3,14 @@
 import ipaddress
 
 from appliance.policy.commands import ALIASES, COMMANDS, DECIDED_ELSEWHERE
-from appliance.policy.findings import meant, quoted
+from appliance.policy.findings import quoted
 from appliance.policy.hosts import Network, canonical_address
 from appliance.policy.keys import is_parameter_key
 from appliance.policy.model import Address, Category
 from appliance.policy.policy import Policy
 from appliance.policy.sections import PARAMETERS
 from appliance.ros.names import is_global_name
+from appliance.wrong_values import meant
 
 VERBS = {"use-node" if category is Category.NODE else category.value: category for category in Category}
 

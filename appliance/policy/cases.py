@@ -20,12 +20,13 @@ import yaml
 
 from appliance.policy.actions import BadWordError, find_hosts, parse_action
 from appliance.policy.compiler import compile_policy
-from appliance.policy.findings import Finding, Findings, Severity, meant, quoted
+from appliance.policy.findings import Finding, Findings, Severity, quoted
 from appliance.policy.hosts import canonical_address
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, needs_node, rights_of
 from appliance.ros.names import is_global_name
+from appliance.wrong_values import meant
 
 MAXIMUM_CHARACTERS = 1024 * 1024
 MAXIMUM_CHECKS = 100_000

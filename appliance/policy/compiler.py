@@ -7,7 +7,7 @@ so that what follows is judged as it would be once the error is mended.
 from collections.abc import Collection, Mapping
 
 from appliance.policy import sections
-from appliance.policy.findings import Findings, meant, nearest, quoted
+from appliance.policy.findings import Findings, quoted
 from appliance.policy.groups import Groups
 from appliance.policy.hosts import HostTable, Network
 from appliance.policy.limits import read_limits
@@ -17,6 +17,7 @@ from appliance.policy.policy import Policy
 from appliance.policy.reader import SectionText, read
 from appliance.policy.rules import RuleCompiler
 from appliance.policy.settings import read_monitor, read_options, read_ports
+from appliance.wrong_values import meant, nearest
 
 
 def compile_policy(

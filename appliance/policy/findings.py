@@ -4,13 +4,10 @@ Errors refuse the file, warnings (the lint) never do. All of them are found in o
 mended in one go.
 """
 
-import difflib
 import enum
-from collections.abc import Collection
 from dataclasses import dataclass
 
 MAXIMUM_FINDINGS = 200
-_MAXIMUM_CANDIDATES = 500
 
 
 class Severity(enum.StrEnum):
@@ -89,18 +86,3 @@ def quoted(text: str, limit: int = 60) -> str:
 
 def _escaped(character: str) -> str:
     return character.encode("unicode_escape").decode() if character != '"' else '\\"'
-
-
-def nearest(word: str, candidates: Collection[str]) -> str | None:
-    """The candidate that `word` was most likely meant to be."""
-    if len(candidates) > _MAXIMUM_CANDIDATES or len(word) > 100:
-        return None
-    folded = {candidate.casefold(): candidate for candidate in candidates}
-    near = difflib.get_close_matches(word.casefold(), list(folded), n=1, cutoff=0.6)
-    return folded[near[0]] if near else None
-
-
-def meant(word: str, candidates: Collection[str]) -> str:
-    """`; did you mean X?` for the nearest candidate, or nothing."""
-    found = nearest(word, candidates)
-    return f"; did you mean {found}?" if found else ""

@@ -5,10 +5,11 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
-from appliance.policy.findings import Findings, meant, quoted
+from appliance.policy.findings import Findings, quoted
 from appliance.policy.hosts import EVERYONE, Atom, HostTable, Network, canonical_network
 from appliance.policy.model import Address
 from appliance.policy.reader import Entry, SectionText, Word
+from appliance.wrong_values import meant
 
 ROBOT = "robot"
 _HOST = "host:"

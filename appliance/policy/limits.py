@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 
-from appliance.policy.findings import Findings, meant, quoted
+from appliance.policy.findings import Findings, quoted
 from appliance.policy.groups import Groups
 from appliance.policy.hosts import Atom
 from appliance.policy.keys import BadKeyError, Key, parse_key
@@ -22,6 +22,7 @@ from appliance.policy.model import Rule
 from appliance.policy.reader import Entry, SectionText, Word
 from appliance.policy.sections import DEFAULT, LIMITS
 from appliance.policy.tree import KeyTree
+from appliance.wrong_values import meant
 
 
 class Part(StrEnum):

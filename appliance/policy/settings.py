@@ -4,12 +4,13 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from appliance.policy.findings import Findings, meant, quoted
+from appliance.policy.findings import Findings, quoted
 from appliance.policy.model import TELLS
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.policy.reader import Entry, SectionText
 from appliance.policy.sections import DECIDERS
 from appliance.ros.names import is_global_name
+from appliance.wrong_values import meant
 
 TAKEOVERS = ("same-host", "granted")
 AT_ONCE = "[Options] takeover = granted"

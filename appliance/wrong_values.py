@@ -1,0 +1,115 @@
+"""What is wrong with a value, in words: what it must be, and which known one was meant.
+
+Values are read by pydantic (configuration, command line, parameters of REST) and msgspec (bodies of REST); what those
+say of a value is for programmers, and reaches nobody.
+"""
+
+import difflib
+import re
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+_MAXIMUM_CANDIDATES = 500
+_LONGEST_SHOWN = 100
+_MUST_BE = {
+    "array": "a list",
+    "bool": "true or false",
+    "byte": "a size, for example 500MB or 2GiB",
+    "dataclass": "a section: its keys stand on the lines below it, indented",
+    "enum": "{expected}",
+    "finite": "a number",
+    "float": "a number",
+    "greater_than": "more than {gt}",
+    "greater_than_equal": "at least {ge}",
+    "int": "a whole number",
+    "ip": "a network, for example 192.168.1.0/24",
+    "less_than": "less than {lt}",
+    "less_than_equal": "at most {le}",
+    "list": "a list, for example [a, b]",
+    "literal": "{expected}",
+    "null": "null",
+    "object": "an object",
+    "path": "the path of a file or folder",
+    "str": "a text",
+    "string": "a text; a number or true is one in quotes",
+    "string_pattern_mismatch": "a text that matches {pattern}",
+    "string_too_long": "{max_length} characters at most",
+    "string_too_short": "{min_length} characters at least",
+    "too_long": "{max_length} at most in number",
+    "too_short": "{min_length} at least in number",
+}
+"""What a value must be: by the kind of pydantic's errors, the first word of that, or a type in msgspec's."""
+_BOUNDS = {">=": "at least", "<=": "at most", ">": "more than", "<": "less than"}
+_PARTS = {"str": "characters", "array": "entries", "object": "fields"}
+_BODY: dict[str, Callable[..., str]] = {
+    r"Expected `(.*)`, got `(.*)`": lambda wanted, got: f"must be {_typed(wanted)}, not {_typed(got)}",
+    r"Expected `(.*)` of length ([<>]=) (\d+)": (
+        lambda what, bound, many: f"must have {_BOUNDS[bound]} {many} {_PARTS.get(what, 'parts')}"
+    ),
+    r"Expected `.*` ([<>]=?) (\S+)": lambda bound, limit: f"must be {_BOUNDS[bound]} {_plain(float(limit))}",
+    r"(?s)Expected `.*` matching regex '(.*?)(?:\(\?!.*)?'": lambda pattern: (
+        f"must be a text that matches {pattern}"
+    ),
+    r"(?s)Object missing required field `(.*)`": lambda name: f"the field `{name}` must be given",
+    r"(?s)Object contains unknown field `(.*)`": lambda name: f"there is no field `{name}`",
+    r"Number out of range": lambda: "must be a smaller number",
+}
+"""What msgspec says of a value, and what is said of it here."""
+
+
+def nearest(word: str, candidates: Collection[str]) -> str | None:
+    """The candidate that `word` was most likely meant to be."""
+    if len(candidates) > _MAXIMUM_CANDIDATES or len(word) > 100:
+        return None
+    folded = {candidate.casefold(): candidate for candidate in candidates}
+    near = difflib.get_close_matches(word.casefold(), list(folded), n=1, cutoff=0.6)
+    return folded[near[0]] if near else None
+
+
+def meant(word: str, candidates: Collection[str]) -> str:
+    """`; did you mean X?` for the nearest candidate, or nothing."""
+    found = nearest(word, candidates)
+    return f"; did you mean {found}?" if found else ""
+
+
+def must_be(error: Mapping[str, Any]) -> str:
+    """What a value must be, of one of pydantic's `errors()`."""
+    kind, context = str(error["type"]), error.get("ctx") or {}
+    wanted = _MUST_BE.get(kind) or _MUST_BE.get(kind.partition("_")[0]) or f"of another form ({kind})"
+    return wanted.format(**{name: _plain(value) for name, value in context.items()})
+
+
+def refusal(error: Mapping[str, Any]) -> str:
+    """What is wrong with a value of the command line or of a query, of one of pydantic's `errors()`."""
+    if error["type"] == "missing":
+        return "must be given"
+    if error["type"] == "value_error":  # a sentence of whoever reads it, which names the value
+        return str(error["ctx"]["error"])
+    return f"must be {must_be(error)}, not {_cut(repr(error['input']))}"
+
+
+def body_refusal(text: str, choices: Collection[str] = ()) -> str:
+    """What is wrong with a part of a body, of the text of msgspec's `ValidationError` without its place.
+
+    `choices`: the texts that the part may be, where it is one of a few.
+    """
+    no_choice = text.removeprefix("Invalid enum value ")
+    if no_choice != text:
+        return f"must be one of {', '.join(repr(str(one)) for one in choices)}, not {_cut(no_choice)}"
+    for pattern, said in _BODY.items():
+        if (found := re.fullmatch(pattern, text)) is not None:
+            return said(*found.groups())
+    return text
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _LONGEST_SHOWN else text[:_LONGEST_SHOWN] + "…"
+
+
+def _typed(types: str) -> str:
+    return " or ".join(_MUST_BE.get(one, one) for one in types.split(" | "))
+
+
+def _plain(value: Any) -> Any:
+    """A whole number without a fraction: libraries keep the bounds of a number as `1.0`."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value

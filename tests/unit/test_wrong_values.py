@@ -1,0 +1,125 @@
+"""No library's sentence about a wrong value reaches a user: not from the command line, REST or the configuration."""
+
+import asyncio
+import dataclasses
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi import FastAPI, Request
+from fastapi.routing import iter_route_contexts
+
+from appliance.api.problems import ProblemError
+from appliance.config import Settings
+from appliance.config_sources import ConfigError, resolve
+from appliance.wrong_values import refusal
+from tests.support.command import commands, rosrv
+from tests.unit.api.conftest import app  # noqa: F401  the fixture
+
+WRONG: list[Any] = [
+    "", "x", "x" * 5000, "\0", "-1", -1, 0, 1.5, 1e300, 1 << 62, True, None, [], ["x"], ["x"] * 2000, [[]],
+    {}, {"": 1}, {"x" * 5000: ""}, {"x": {}},
+]  # fmt: skip
+LIBRARY = re.compile(
+    r"Value error|\b[A-Z][a-z]+ should|unable to|Invalid enum|Expected `|Object [mc]|of another form|out of range"
+)
+
+
+def test_the_command_line_says_what_a_value_must_be() -> None:
+    """Of every option and argument of every verb that takes a number, or one of a few words."""
+    told = []
+    for verb, command in commands():
+        for one in command.params:
+            kind, name = one.type_descriptor, one.opts[0]
+            if not (kind.is_choice or kind.annotation in (int, float)):
+                continue
+            bounds = kind.parameter_info
+            beyond = {"-17": bounds.min, "99999999999": bounds.max}
+            for value in ["no-such", *(value for value, bound in beyond.items() if bound is not None)]:
+                done = rosrv(*verb.split(), f"{name}={value}" if name.startswith("-") else value)
+                told.append(done.stderr)
+                assert done.returncode == 2, (verb, value)
+                assert value in done.stderr, told[-1]
+    assert not [one for one in told if LIBRARY.search(one)]
+    assert len(told) > 30
+
+
+def test_rest_says_what_a_parameter_must_be(app: FastAPI) -> None:  # noqa: F811  the fixture
+    """Of each parameter of every path and query, and of each header."""
+    told = set()
+    for dependant in _dependants(app):
+        for field in [*dependant.query_params, *dependant.path_params, *dependant.header_params]:
+            for value in WRONG:
+                told |= {
+                    refusal(one) for one in field.validate(value, {}, loc=("query", field.name))[1] or ()
+                }
+    assert not [one for one in told if LIBRARY.search(one)]
+    assert any("'allow', 'deny' or 'would deny'" in one for one in told)
+    assert len(told) > 50
+
+
+def test_rest_says_what_a_body_must_be(app: FastAPI) -> None:  # noqa: F811  the fixture
+    """Of each field of every body, and of what is in it."""
+    told: set[str] = set()
+    for dependant in _dependants(app):
+        for reads in [one.call for one in dependant.dependencies if hasattr(one.call, "kind")]:
+            for name in [*reads.kind.__struct_fields__, "nmae"]:
+                for value in WRONG:
+                    told |= _said_of(reads, {name: value})
+            told |= _said_of(reads, [])
+    assert not [one for one in told if LIBRARY.search(one)]
+    assert "must be one of 'token', 'kit', not 'x'" in told
+    assert not [one for one in told if "one of ," in one or "(?!" in one or len(one) > 300]
+    assert "there is no field `nmae`; did you mean name?" in told
+    assert len(told) > 50
+
+
+@pytest.mark.filterwarnings("ignore:__int__ returned non-int")  # ipaddress makes a network of `true`
+def test_the_configuration_says_what_a_key_must_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each key of each section."""
+    monkeypatch.chdir(tmp_path)
+    told: set[str] = set()
+    for path in _keys(dataclasses.asdict(Settings())):
+        for value in WRONG:
+            given = value
+            for key in reversed(path[1:]):
+                given = {key: given}
+            try:
+                resolve(None, {}, {path[0]: given})
+            except ConfigError as error:
+                told |= {one.text for one in error.mistakes}
+    assert not [one for one in told if LIBRARY.search(one)]
+    assert len(told) > 300
+
+
+def _dependants(of: FastAPI) -> Iterator[Any]:
+    """What every route depends on, and what that does."""
+    found = [getattr(route.original_route, "dependant", None) for route in iter_route_contexts(of.routes)]
+    while found:
+        if (dependant := found.pop()) is not None:
+            yield dependant
+            found += dependant.dependencies
+
+
+def _said_of(reads: Any, value: Any) -> set[str]:
+    """What is said of a body."""
+
+    async def sent() -> dict[str, Any]:
+        return {"type": "http.request", "body": json.dumps(value).encode()}
+
+    headers = [(b"content-type", b"application/json")]
+    try:
+        asyncio.run(reads(Request({"type": "http", "headers": headers}, sent)))
+    except ProblemError as problem:
+        return {one.text for one in problem.errors or ()}
+    return set()
+
+
+def _keys(values: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    for key, value in values.items():
+        yield (key,)
+        if isinstance(value, dict):
+            yield from ((key, *below) for below in _keys(value))
