@@ -76,7 +76,8 @@ def mark(scope: Scope, target: Value) -> str | None:
     scope.changes = True
     if variable is None:
         return None
-    scope.changes_shared = scope.changes_shared or variable.shared
+    if variable.shared:
+        scope.changes_shared.add(variable.code)
     if not isinstance(target.place, VariablePlace) or target.place.variable.alias is not None:
         require_original(target)
     variable.assigned = variable.used = True
@@ -101,10 +102,6 @@ def _store_part(scope: Scope, place: Place, value: form.Expression) -> form.Expr
     """Strings and times do not change in place: the whole is stored anew."""
     assert isinstance(place, CharacterPlace | PartPlace)  # the last kinds of places
     inner, base = require_place(place.base, "an assignment"), place.base.form
-    if not place.base.pure:
-        raise SpecificationError.at(
-            place.base.position, "too much in one step; put the index into a variable first"
-        )
     if isinstance(place, PartPlace):
         part = form.Literal(kinds.VOID, place.part)
         return _store(scope, inner, form.Call(base.type, "a_part", (base, part, value), place.site))

@@ -4,14 +4,14 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from appliance.rosmop.compile import cursors, members
+from appliance.rosmop.compile import cursors, members, order
 from appliance.rosmop.compile.assignments import require_place, store
 from appliance.rosmop.compile.conversion import condition, convert, number
 from appliance.rosmop.compile.initializers import ValueOf, elements
 from appliance.rosmop.compile.invocation import Invocation
 from appliance.rosmop.compile.output import Stream, formatted
 from appliance.rosmop.compile.places import Value, path, root
-from appliance.rosmop.compile.scope import HelperFunction, Scope
+from appliance.rosmop.compile.scope import HelperFunction, Loan, Scope
 from appliance.rosmop.compile.standard_functions import LIBRARY, Arguments, find_function
 from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
@@ -31,8 +31,9 @@ def call(scope: Scope, node: tree.Call, value_of: ValueOf) -> Value:
     if isinstance(callee, tree.Member):
         base = value_of(scope, callee.base)
         arguments = [value_of(scope, argument) for argument in node.arguments]
+        first, base, arguments = order.of_member(scope, base, arguments)
         at = (node.position, scope.site(node))
-        return members.call(Invocation(scope, base, callee.name, arguments, at))
+        return order.after(first, members.call(Invocation(scope, base, callee.name, arguments, at)))
     if not isinstance(callee, tree.Name):
         raise SpecificationError.at(node.position, "only functions can be called")
     return _named(scope, node, callee.parts, value_of)
@@ -67,12 +68,13 @@ def _known(scope: Scope, node: tree.Call, parts: tuple[str, ...], value_of: Valu
             raise SpecificationError.at(node.position, "`now` takes no argument")
         return Value(form.Now(), node.position)
     if parts[0] == "std" and parts[-1] in cursors.ALGORITHMS:
-        values = [value_of(scope, argument) for argument in node.arguments]
-        return cursors.algorithm(scope, parts[-1], values, (node.position, scope.site(node)))
+        first, values = order.arguments(scope, [value_of(scope, argument) for argument in node.arguments])
+        at = (node.position, scope.site(node))
+        return order.after(first, cursors.algorithm(scope, parts[-1], values, at))
     library = find_function(parts)
     if library is not None:
-        values = [value_of(scope, argument) for argument in node.arguments]
-        return library(Arguments(scope, parts, values, node.position, scope.site(node)))
+        first, values = order.arguments(scope, [value_of(scope, argument) for argument in node.arguments])
+        return order.after(first, library(Arguments(scope, parts, values, node.position, scope.site(node))))
     return None
 
 
@@ -106,14 +108,17 @@ def _helper(scope: Scope, node: tree.Call, function: HelperFunction, value_of: V
             f"`{function.name}` takes {len(function.parameters)} argument(s), not {len(node.arguments)}",
         )
     scope.calls.add(function.name)
+    values = [value_of(scope, argument) for argument in node.arguments]
+    _check_references(scope, function, values)
+    first, values = order.arguments(scope, values)
     handed: list[form.Expression] = []
     targets: list[Value] = []
-    for argument, parameter in zip(node.arguments, function.parameters, strict=True):
-        value = value_of(scope, argument)
+    for argument, parameter, value in zip(node.arguments, function.parameters, values, strict=True):
         if parameter in function.references:
-            targets.append(_referenced(value, parameter.type, function))
-            _check_alone(targets, function)
-            handed.append(value.form)
+            before, target = order.settled(scope, value)
+            first += before
+            targets.append(target)
+            handed.append(target.form)
         elif parameter.constant and value.type == parameter.type:
             handed.append(value.form)
         else:
@@ -121,14 +126,32 @@ def _helper(scope: Scope, node: tree.Call, function: HelperFunction, value_of: V
     depth = scope.recursive if function.recursive else None
     call = form.Invoke(function.result, function.code, tuple(handed), depth)
     if not targets:
-        return Value(call, node.position, pure=False)
+        return order.after(first, Value(call, node.position))
     result = form.Read(kinds.VOID, scope.temporary())
     stores = [store(scope, target, form.Item(target.type, result, i)) for i, target in enumerate(targets, 1)]
     items = (form.Assign(kinds.VOID, result.name, call), *stores, form.Item(function.result, result, 0))
-    return Value(form.Sequence(function.result, items, -1), node.position, pure=False)
+    return order.after(first, Value(form.Sequence(function.result, items, -1), node.position))
 
 
-def _referenced(value: Value, kind: kinds.Type, function: HelperFunction) -> Value:
+def _check_references(scope: Scope, function: HelperFunction, values: Sequence[Value]) -> None:
+    """Refuse what a reference would see and a copy does not; of constants, note what the function may not change."""
+    handed: list[tuple[Value, bool]] = []
+    for parameter, value in zip(function.parameters, values, strict=True):
+        changes = parameter in function.references
+        if changes:
+            _check_referenced(value, parameter.type, function)
+        elif not parameter.constant or value.type != parameter.type or value.place is None:
+            continue
+        for other, other_changes in handed:
+            if changes or other_changes:
+                _check_apart(other, value, function)
+        handed.append((value, changes))
+        variable = root(value)
+        if not changes and variable is not None and variable.shared:
+            scope.names.lent.append(Loan(value.position, function.name, parameter, variable))
+
+
+def _check_referenced(value: Value, kind: kinds.Type, function: HelperFunction) -> None:
     require_place(value, f"a reference parameter of `{function.name}`")
     if value.type != kind:
         raise SpecificationError.at(
@@ -141,19 +164,16 @@ def _referenced(value: Value, kind: kinds.Type, function: HelperFunction) -> Val
             f"`{function.name}` names `{variable.name}` itself, and a reference is a copy until it returns;"
             " use one of the two ways",
         )
-    return value
 
 
-def _check_alone(targets: Sequence[Value], function: HelperFunction) -> None:
-    """Refuse the last reference if it shares something with another: one change would undo the other."""
-    *others, last = targets
-    for other in others:
-        if all(step == beside for step, beside in zip(path(other), path(last), strict=False)):
-            raise SpecificationError.at(
-                last.position,
-                f"`{path(last)[0]}` is handed to two references of `{function.name}`,"
-                " which are copies until it returns; hand over different variables",
-            )
+def _check_apart(one: Value, other: Value, function: HelperFunction) -> None:
+    """Refuse references that share something: one change would undo the other, or not be seen."""
+    if all(step == beside for step, beside in zip(path(one), path(other), strict=False)):
+        raise SpecificationError.at(
+            other.position,
+            f"`{path(other)[0]}` is handed to two references of `{function.name}`,"
+            " which are copies until it returns; hand over different variables",
+        )
 
 
 # Output
@@ -182,7 +202,7 @@ def _macro(scope: Scope, node: tree.Call, macro: re.Match[str], value_of: ValueO
     if guard is None:
         return value
     nothing = form.Literal(kinds.VOID, None)
-    return Value(form.Conditional(kinds.VOID, guard, value.form, nothing), node.position, pure=False)
+    return Value(form.Conditional(kinds.VOID, guard, value.form, nothing), node.position)
 
 
 def _log(
@@ -192,7 +212,7 @@ def _log(
         raise SpecificationError.at(node.position, "there is nothing to print; write a text")
     template, *rest = (value_of(scope, argument) for argument in arguments)
     line = form.Log(level, formatted(scope, template, rest), scope.site(node))
-    return Value(line, node.position, pure=False)
+    return Value(line, node.position)
 
 
 def _line(scope: Scope, node: tree.Call, value_of: ValueOf) -> Value:
@@ -200,7 +220,7 @@ def _line(scope: Scope, node: tree.Call, value_of: ValueOf) -> Value:
     if len(node.arguments) != 1:
         raise SpecificationError.at(node.position, f"`puts` takes 1 argument(s), not {len(node.arguments)}")
     text = convert(scope, value_of(scope, node.arguments[0]), kinds.STRING)
-    return Value(form.Log("INFO", text, scope.site(node)), node.position, pure=False)
+    return Value(form.Log("INFO", text, scope.site(node)), node.position)
 
 
 def stream_of(node: tree.Expression) -> str | None:
@@ -233,7 +253,7 @@ def streamed(
     pieces = [_piece(scope, stream, part, value_of) for part in reversed(parts)]
     site = scope.site(node)
     text = form.Join(tuple(piece for piece in pieces if piece is not None), site)
-    return Value(form.Log(level, text, site), node.position, pure=False)
+    return Value(form.Log(level, text, site), node.position)
 
 
 def _piece(scope: Scope, stream: Stream, part: tree.Expression, value_of: ValueOf) -> form.Expression | None:
@@ -272,7 +292,7 @@ def construct(
         return Value(form.Call(kind, "e_repeat", (count, character), site), position)
     if len(arguments) != 1 or len(values) != 1 or isinstance(kind, kinds.Void):
         raise SpecificationError.at(position, f"{kind} cannot be made from this")
-    return Value(convert(scope, values[0], kind), position, pure=values[0].pure)
+    return Value(convert(scope, values[0], kind), position)
 
 
 def _vector(

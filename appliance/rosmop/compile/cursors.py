@@ -33,12 +33,11 @@ def moved(operator: str, left: Value, right: Value, position: Position) -> Value
     """`begin + n`, `end - n`, `end - begin`; None if this is none of them."""
     if not isinstance(left.type, Cursor) or operator not in ("+", "-"):
         return None
-    pure = left.pure and right.pure
     if kinds.is_number(right.type):
         function, distance = "k_after" if operator == "+" else "k_before", number(right.form, kinds.LONG)
-        return Value(form.Call(left.type, function, (left.form, distance)), position, pure=pure)
+        return Value(form.Call(left.type, function, (left.form, distance)), position)
     if isinstance(right.type, Cursor) and operator == "-":
-        return Value(form.Call(kinds.LONG, "k_before", (left.form, right.form)), position, pure=pure)
+        return Value(form.Call(kinds.LONG, "k_before", (left.form, right.form)), position)
     return None
 
 
@@ -46,7 +45,7 @@ def begin_or_end(base: Value, name: str, position: Position) -> Value:
     """`v.begin()` or `v.end()`."""
     kind = Cursor(base)
     place = form.Literal(kind, 0) if name == "begin" else form.Call(kind, "l_len", (base.form,))
-    return Value(place, position, pure=base.pure)
+    return Value(place, position)
 
 
 def erase(scope: Scope, base: Value, cursors: Sequence[Value], at: tuple[Position, int]) -> Value:
@@ -114,4 +113,4 @@ def _index(base: Value, cursor: Value) -> form.Expression:
 
 def _changed(scope: Scope, base: Value, change: form.Expression, position: Position) -> Value:
     require_place(base, "this")
-    return Value(marked(mark(scope, base), change), position, pure=False)
+    return Value(marked(mark(scope, base), change), position)

@@ -4,7 +4,15 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from appliance.rosmop.compile import assignments, calls, initializers, members, operators, vector_members
+from appliance.rosmop.compile import (
+    assignments,
+    calls,
+    initializers,
+    members,
+    operators,
+    order,
+    vector_members,
+)
 from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
 from appliance.rosmop.compile.margins import noted
 from appliance.rosmop.compile.places import CharacterPlace, Value, Variable, VariablePlace
@@ -152,7 +160,7 @@ def read(variable: Variable, node: tree.Node) -> Value:
     variable.used = True
     if variable.alias is not None:
         alias = variable.alias
-        return Value(alias.form, node.position, VariablePlace(variable), owned=False, pure=alias.pure)
+        return Value(alias.form, node.position, VariablePlace(variable), owned=False)
     place, value = VariablePlace(variable), form.Read(variable.type, variable.code)
     return Value(value, node.position, place, owned=False, constant=variable.known)
 
@@ -189,16 +197,13 @@ def _unary(scope: Scope, node: tree.Unary) -> Value:
 def _step(scope: Scope, node: tree.Step) -> Value:
     target = value_of(scope, node.target)
     assignments.require_place(target, f"`{node.operator}`")
-    if not target.pure:
-        raise SpecificationError.at(
-            node.target.position, "too much in one step; put the index into a variable first"
-        )
+    first, target = ([], target) if target.pure else order.settled(scope, target)
     one = constant_value(node.position, kinds.INT, 1)
     operands = operators.Operands(scope, node.position, target, one, scope.site(node))
     changed = convert(scope, operators.binary(node.operator[0], operands), target.type)
     stored = assignments.store(scope, target, changed)
     before = form.Sequence(target.type, (target.form, stored), 0)
-    return Value(stored if node.prefix else before, node.position, pure=False)
+    return order.after(first, Value(stored if node.prefix else before, node.position))
 
 
 def _binary(scope: Scope, node: tree.Binary) -> Value:
@@ -214,12 +219,12 @@ def _binary(scope: Scope, node: tree.Binary) -> Value:
 
 
 def _assign(scope: Scope, node: tree.Assign) -> Value:
-    target, value = assignment(scope, node)
-    return Value(assignments.store(scope, target, value), node.position, owned=False, pure=False)
+    first, target, value = assignment(scope, node)
+    return order.after(first, Value(assignments.store(scope, target, value), node.position, owned=False))
 
 
-def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, form.Expression]:
-    """The target of an assignment, and the value it gets."""
+def assignment(scope: Scope, node: tree.Assign) -> tuple[order.First, Value, form.Expression]:
+    """What comes before an assignment, its target, and the value it gets."""
     whole = node.target
     while isinstance(whole, tree.Member | tree.Index):
         whole = whole.base
@@ -230,29 +235,26 @@ def assignment(scope: Scope, node: tree.Assign) -> tuple[Value, form.Expression]
         )
     target = value_of(scope, node.target)
     assignments.require_place(target, f"`{node.operator}`")
-    if node.operator == "=":
-        if isinstance(target.type, kinds.String) and not isinstance(node.value, tree.Elements):
-            return target, _character_or_text(scope, node.value)
-        if isinstance(target.type, kinds.Characters) and isinstance(node.value, tree.Name):
-            assignments.note_copy(target, value_of(scope, node.value))
-        return target, converted(scope, node.value, target.type)
-    if not target.pure:
-        raise SpecificationError.at(
-            node.target.position, "too much in one step; put the index into a variable first"
-        )
-    value = value_of(scope, node.value)
+    if node.operator == "=" and isinstance(node.value, tree.Elements):
+        return order.of_assignment(scope, target, elements(scope, node.value, target.type))
+    value, site = value_of(scope, node.value), scope.site(node.value)
+    if node.operator == "=" and (target.pure or kinds.is_number(target.type)):
+        return order.of_assignment(scope, target, _assigned(scope, target, value, site))
+    first, target, value = order.of_change(scope, target, value)
+    if node.operator == "=":  # of a class: C++ looks at what is assigned when all places are known
+        return first, target, _assigned(scope, target, value, site)
     operands = operators.Operands(scope, node.position, target, value, scope.site(node))
     if node.operator == "+=" and isinstance(target.type, kinds.String):
-        return target, operators.extended(operands).form
-    return target, convert(scope, operators.binary(node.operator[:-1], operands), target.type)
+        return first, target, operators.extended(operands).form
+    return first, target, convert(scope, operators.binary(node.operator[:-1], operands), target.type)
 
 
-def _character_or_text(scope: Scope, node: tree.Expression) -> form.Expression:
-    """What is assigned to a string: C++ takes a character, too."""
-    value = value_of(scope, node)
-    if isinstance(value.type, kinds.Integer) and value.type == kinds.CHAR:
+def _assigned(scope: Scope, target: Value, value: Value, site: int) -> form.Expression:
+    """What a place is given: C++ takes a character for a string, too."""
+    if isinstance(target.type, kinds.String) and value.type == kinds.CHAR:
         return form.Call(kinds.STRING, "t_byte", (value.form,))
-    return convert(scope, value, kinds.STRING)
+    assignments.note_copy(target, value)
+    return convert(scope, value, target.type, site)
 
 
 def _conditional(scope: Scope, node: tree.Conditional) -> Value:
@@ -275,27 +277,27 @@ def _either(scope: Scope, position: Position, tested: Value, yes: Value, no: Val
         raise SpecificationError.at(
             no.position, f"`?:` between {yes.type} and {no.type}; make them the same type"
         )
-    pure = tested.pure and yes.pure and no.pure
     chosen = form.Conditional(kind, test, *either)
-    return Value(chosen, position, owned=yes.owned and no.owned, pure=pure)
+    return Value(chosen, position, owned=yes.owned and no.owned)
 
 
 def _sequence(scope: Scope, node: tree.Sequence) -> Value:
     values = [value_of(scope, item) for item in node.items]
     all_of_them = form.Sequence(values[-1].type, tuple(value.form for value in values), -1)
-    return Value(all_of_them, node.position, owned=values[-1].owned, pure=False)
+    return Value(all_of_them, node.position, owned=values[-1].owned)
 
 
 def _index(scope: Scope, node: tree.Index) -> Value:
-    base, index = value_of(scope, node.base), value_of(scope, node.index)
+    indexed = value_of(scope, node.base), value_of(scope, node.index)
+    first, base, (index,) = order.of_member(scope, indexed[0], indexed[1:])
     site = scope.site(node)
     if isinstance(base.type, kinds.Vector):
-        return vector_members.element_value(base, index, node.position, site)
+        return order.after(first, vector_members.element_value(base, index, node.position, site))
     if isinstance(base.type, kinds.String | kinds.Characters):
         at = convert(scope, index, kinds.LONG)
         place = CharacterPlace(base, at, site) if base.place is not None else None
         character = form.Call(kinds.CHAR, "e_character", (base.form, at), site)
-        return Value(character, node.position, place, pure=base.pure and index.pure)
+        return order.after(first, Value(character, node.position, place))
     raise SpecificationError.at(node.position, f"{base.type} has no elements")
 
 
@@ -308,7 +310,7 @@ def _cast(scope: Scope, node: tree.Cast) -> Value:
     return folded(
         scope,
         (value_of(scope, node.operand),),
-        lambda value: Value(convert(scope, value, target), node.position, pure=value.pure),
+        lambda value: Value(convert(scope, value, target), node.position),
     )
 
 
@@ -326,7 +328,7 @@ def _construct(scope: Scope, node: tree.Construct) -> Value:
 def _new(scope: Scope, node: tree.NewCharacters) -> Value:
     size = convert(scope, value_of(scope, node.size), kinds.ULONG)
     zeros = (size, form.Literal(kinds.CHAR, 0))
-    return Value(form.Call(kinds.CHARACTERS, "e_repeat", zeros, scope.site(node)), node.position, pure=False)
+    return Value(form.Call(kinds.CHARACTERS, "e_repeat", zeros, scope.site(node)), node.position)
 
 
 def _limit(scope: Scope, node: tree.Limit) -> Value:

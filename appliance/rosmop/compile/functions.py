@@ -266,7 +266,7 @@ def compile_function(shared: Shared, names: SpecificationNames, function: Helper
         value = nothing if isinstance(function.result, kinds.Void) else form.Zero(function.result)
         handed = tuple(variable.code for variable in function.references)
         scope.add(form.Return(scope.lines.site, value, handed))
-    function.changes, function.calls = scope.changes_shared, frozenset(scope.calls)
+    function.changes, function.calls = frozenset(scope.changes_shared), frozenset(scope.calls)
     parameters = [variable.code for variable in function.parameters] + ["n"] * function.recursive
     shared.define(scope.function(function.code, tuple(parameters)))
 

@@ -56,13 +56,13 @@ class Invocation:
 
     def value(self, kind: kinds.Type, function: str, *arguments: form.Expression) -> Value:
         """The result, by a function of the form."""
-        return Value(self.called(kind, function, *arguments), self.position, pure=self.base.pure)
+        return Value(self.called(kind, function, *arguments), self.position)
 
     def changes(self, value: form.Expression) -> Value:
         """The result of a function that gives the base a new value."""
         require_place(self.base, f"`{self.name}`")
         stored = store(self.scope, self.base, value)
-        return Value(form.Discard(stored), self.position, pure=False)
+        return Value(form.Discard(stored), self.position)
 
     def changes_in_place(self, function: str, *arguments: form.Expression) -> Value:
         """The result of a function of the form that changes the vector itself."""
@@ -72,7 +72,7 @@ class Invocation:
                 self.position, f"`{self.name}`: an array of fixed length stays so long"
             )
         change = marked(mark(self.scope, self.base), self.called(kinds.VOID, function, *arguments))
-        return Value(change, self.position, pure=False)
+        return Value(change, self.position)
 
 
 Method = Callable[[Invocation], Value]

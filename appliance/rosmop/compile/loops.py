@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 from appliance.rosmop.compile.conversion import condition, convert, number
 from appliance.rosmop.compile.expressions import value_of
+from appliance.rosmop.compile.order import settled
 from appliance.rosmop.compile.places import Value, Variable
 from appliance.rosmop.compile.scope import Loop, Scope
 from appliance.rosmop.compile.vector_members import element_value
@@ -77,12 +78,17 @@ def write_for(scope: Scope, node: tree.For, write: Write) -> None:
 def write_range_for(scope: Scope, node: tree.RangeFor, write: Write) -> None:
     """`for (type name : values)`."""
     values = value_of(scope, node.values)
+    by_value = not node.type.reference or node.type.constant
+    if not by_value:
+        first, values = settled(scope, values)
+        for each in first:
+            scope.evaluate(each)
     if not isinstance(values.type, kinds.Vector | kinds.String):
         raise SpecificationError.at(values.position, f"{values.type} has no elements to go through")
     element = values.type.element if isinstance(values.type, kinds.Vector) else kinds.CHAR
     kind = element if node.type.name == ("auto",) else resolve(node.type, scope.messages)
     _enter(scope, node, Loop(None))
-    item = None if node.type.reference and not node.type.constant else scope.temporary()
+    item = scope.temporary() if by_value else None
     index = "" if item is not None else _first_index(scope, node, values, kind)
     with scope.block(), scope.nested() as statements:
         if item is None:
@@ -111,7 +117,7 @@ def _by_value(scope: Scope, node: tree.RangeFor, element: Type, kind: Type, item
 
 def _first_index(scope: Scope, node: tree.RangeFor, values: Value, kind: Type) -> str:
     """The name of an index that stands before the first element."""
-    if not isinstance(values.type, kinds.Vector) or values.place is None or not values.pure:
+    if not isinstance(values.type, kinds.Vector) or values.place is None:
         raise SpecificationError.at(
             node.values.position, "a reference goes through a vector variable; leave out the `&`"
         )

@@ -27,11 +27,11 @@ def field(scope: Scope, base: Value, name: str, position: Position, site: int) -
             raise SpecificationError.at(position, str(error)) from None
         place = SlotPlace(base, slot.index) if base.place is not None else None
         item = form.Item(slot.type, base.form, slot.index)
-        return Value(item, position, place, owned=base.owned, pure=base.pure)
+        return Value(item, position, place, owned=base.owned)
     if isinstance(base.type, kinds.Time | kinds.Duration) and name in ("sec", "nsec"):
         kind = kinds.UINT if isinstance(base.type, kinds.Time) else kinds.INT
         part = PartPlace(base, name, site) if base.place is not None else None
-        return Value(form.Call(kind, f"m_{name}", (base.form,)), position, part, pure=base.pure)
+        return Value(form.Call(kind, f"m_{name}", (base.form,)), position, part)
     members = methods_of(base.type)
     if name in members:
         raise SpecificationError.at(position, f"`{name}` is a function; write `.{name}(…)`")

@@ -1,6 +1,6 @@
 """Operators, with the types C++ gives their results."""
 
-from appliance.rosmop.compile import cursors
+from appliance.rosmop.compile import cursors, order
 from appliance.rosmop.compile.conversion import (
     condition,
     convert,
@@ -32,7 +32,7 @@ class Operands:
 
     def value(self, result: form.Expression) -> Value:
         """The result."""
-        return Value(result, self.position, pure=self.left.pure and self.right.pure)
+        return Value(result, self.position)
 
     def refused(self, operator: str, hint: str = "") -> SpecificationError:
         """The refusal of this operation."""
@@ -58,7 +58,8 @@ def binary(operator: str, operands: Operands) -> Value:
     if cursor is not None:
         return cursor
     if operator in ("==", "!=") and left == right and not isinstance(left, kinds.Void | cursors.Cursor):
-        return operands.value(form.Compare(operator, operands.left.form, operands.right.form, operands.site))
+        first, (one, other) = order.arguments(operands.scope, (operands.left, operands.right))
+        return order.after(first, operands.value(form.Compare(operator, one.form, other.form, operands.site)))
     raise operands.refused(operator, _hint(left, right))
 
 
@@ -166,15 +167,13 @@ def _sum(operator: str, left: Type, right: Type) -> Type | None:
 def unary(operator: str, operand: Value, position: Position, site: int) -> Value:
     """`!x`, `-x`, `+x`, `~x`."""
     if operator == "!":
-        return Value(form.Not(condition(operand)), position, pure=operand.pure)
+        return Value(form.Not(condition(operand)), position)
     if operator == "-" and operand.type == kinds.DURATION:
         nothing = form.Literal(kinds.DURATION, 0)
-        return Value(
-            form.Moment(kinds.DURATION, "-", nothing, operand.form, site), position, pure=operand.pure
-        )
+        return Value(form.Moment(kinds.DURATION, "-", nothing, operand.form, site), position)
     kind = kinds.promoted(operand.type)
     if not kinds.is_number(kind) or (operator == "~" and not isinstance(kind, kinds.Integer)):
         raise SpecificationError.at(position, f"`{operator}` has no meaning for {operand.type}")
     value = number(operand.form, kind)
     changed = value if operator == "+" else form.Unary(kind, operator, value)
-    return Value(changed, position, pure=operand.pure)
+    return Value(changed, position)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from appliance.rosmop.ir.form import Expression
+from appliance.rosmop.ir.form import Expression, acts
 from appliance.rosmop.positions import Position
 from appliance.rosmop.types.kinds import Type
 
@@ -38,7 +38,7 @@ class Value:
     """An expression: its form, and what is known of it.
 
     `place` is where the value lives if it can be assigned. `owned` means that nothing else refers to it, so it
-    needs no copy. `constant` is known without running. `pure` means that computing it twice changes nothing.
+    needs no copy. `constant` is known without running. `first` is what the form begins with, before its place is known.
     """
 
     form: Expression
@@ -46,7 +46,12 @@ class Value:
     place: "Place | None" = None
     owned: bool = True
     constant: bool | int | float | bytes | None = None
-    pure: bool = True
+    first: tuple[Expression, ...] = ()
+
+    @property
+    def pure(self) -> bool:
+        """Whether to compute it changes nothing."""
+        return not acts(self.form)
 
     @property
     def type(self) -> Type:

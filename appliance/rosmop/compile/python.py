@@ -136,7 +136,7 @@ class Printer:
         value = node.value.value if isinstance(node.value, form.Discard) else node.value
         if isinstance(value, form.Assign):
             lines.add(f"{value.name} = {self._assigned(value)}")
-        elif isinstance(value, form.Call) and value.function == "a_slot":
+        elif isinstance(value, form.Call) and value.function == "a_slot" and _is_there(value.arguments[0]):
             base, slot, new = map(self.text, value.arguments)
             lines.add(f"{base}[{slot}] = {new}")
         else:
@@ -532,6 +532,13 @@ def _constant(node: form.Expression) -> bool | int | float | bytes | str | None:
     if isinstance(node, form.Convert):
         node = node.value
     return node.value if isinstance(node, form.Literal) else None
+
+
+def _is_there(node: form.Expression) -> bool:
+    """Whether it is a variable, or a field of one: that cannot fault, so that what is put there may come before it."""
+    while isinstance(node, form.Item):
+        node = node.base
+    return isinstance(node, form.Read)
 
 
 def _beside_double(node: form.Expression) -> form.Expression:

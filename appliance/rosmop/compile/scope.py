@@ -36,9 +36,19 @@ class HelperFunction:
     node: tree.Function
     recursive: bool = False
     names: frozenset[str] = frozenset()
-    changes: bool = False
-    """It assigns a shared variable."""
+    changes: frozenset[str] = frozenset()
+    """The shared variables that it assigns, as the code names them."""
     calls: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Loan:
+    """A shared variable, or a part of one, that is handed to a function as a constant reference."""
+
+    position: Position
+    function: str
+    parameter: Variable
+    variable: Variable
 
 
 @dataclass(frozen=True)
@@ -75,6 +85,17 @@ class SpecificationNames:
     """The other specifications whose variables are used."""
     comparisons: dict[tree.Binary, Comparison] = field(default_factory=dict)
     """The comparisons that are noted."""
+    lent: list[Loan] = field(default_factory=list)
+
+    def changed_by(self, name: str) -> frozenset[str]:
+        """The shared variables that a function, or one that it calls, assigns, as the code names them."""
+        waiting, seen, found = [name], {name}, frozenset[str]()
+        while waiting:
+            function = self.functions[waiting.pop()]
+            found |= function.changes
+            waiting += function.calls - seen
+            seen |= function.calls
+        return found
 
 
 @dataclass(eq=False)
@@ -169,7 +190,7 @@ class Scope:
         self.loops: list[Loop] = []
         self.written: set[str] = set()
         self.changes = False  # something was assigned
-        self.changes_shared = False  # a shared variable was
+        self.changes_shared: set[str] = set()  # the shared variables that were, as the code names them
         self.calls: set[str] = set()  # the helper functions that are called
         self.recursive = False
         self.notes = shared.margins and role != "init"  # comparisons are noted
@@ -237,14 +258,7 @@ class Scope:
 
     def changes_anything(self) -> bool:
         """Whether what was written so far assigns something, itself or in a function that it calls."""
-        waiting, seen = list(self.calls), set(self.calls)
-        while waiting:
-            function = self.names.functions[waiting.pop()]
-            if function.changes:
-                return True
-            waiting += function.calls - seen
-            seen |= function.calls
-        return self.changes
+        return self.changes or any(self.names.changed_by(called) for called in self.calls)
 
     def unknown(self, name: str, position: Position, what: str = "variable") -> SpecificationError:
         """The refusal of a name that nothing has."""

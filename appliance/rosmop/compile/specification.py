@@ -3,7 +3,7 @@
 Specifications of one set see each other's variables. Everything wrong with any of them is found in one pass.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeVar
@@ -237,6 +237,7 @@ def _compile(
     check_parameters(shared, names, specification)
     good = tuple(event for event in events if event is not None)
     properties = [_property(shared, names, specification, node) for node in specification.properties]
+    shared.findings += _seen_changes(names)
     if start is None or len(good) < len(events) or None in properties:
         return None
     known = tuple(code for code in properties if code is not None)
@@ -256,6 +257,17 @@ def _compile(
         tuple(sorted(names.comparisons.values(), key=lambda comparison: comparison.position)),
         slicing_of(names),
     )
+
+
+def _seen_changes(names: SpecificationNames) -> Iterator[Finding]:
+    """Constant references through which a function would see what it changes: here they are what they were."""
+    for loan in names.lent:
+        if loan.variable.code in names.changed_by(loan.function):
+            text = (
+                f"`{loan.function}` gives `{loan.variable.name}` another value, which `{loan.parameter.name}` would"
+                f" not show: leave out the `&` of `{loan.parameter.name}`, or use `{loan.variable.name}` itself"
+            )
+            yield Finding(loan.position, "error", text)
 
 
 def _noted(shared: Shared, action: Callable[[], _T]) -> _T | None:

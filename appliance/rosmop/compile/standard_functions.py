@@ -43,7 +43,7 @@ class Arguments:
 
     def result(self, result: form.Expression) -> Value:
         """The result of a function without effects."""
-        return Value(result, self.position, pure=all(value.pure for value in self.values))
+        return Value(result, self.position)
 
     def value(self, kind: kinds.Type, function: str, *arguments: form.Expression) -> Value:
         """The same, by a function of the form."""
@@ -79,9 +79,7 @@ def _math_of_floats(name: str, count: int) -> Function:
 
     def of_floats(call: Arguments) -> Value:
         call.values = [
-            Value(number(value.form, kinds.FLOAT), value.position, pure=value.pure)
-            if kinds.is_number(value.type)
-            else value
+            Value(number(value.form, kinds.FLOAT), value.position) if kinds.is_number(value.type) else value
             for value in call.values
         ]
         return function(call)
@@ -103,9 +101,7 @@ def _absolute_of_long(call: Arguments) -> Value:
     """`labs`: of an integer, whatever is given."""
     for value in call.values:
         require_number(value, "`labs`")
-    call.values = [
-        Value(number(value.form, kinds.LONG), value.position, pure=value.pure) for value in call.values
-    ]
+    call.values = [Value(number(value.form, kinds.LONG), value.position) for value in call.values]
     return _absolute(call)
 
 
@@ -223,7 +219,7 @@ def _fills_at_most(call: Arguments) -> Value:
 def _stored(call: Arguments, target: Value, function: str, *arguments: form.Expression) -> Value:
     """The buffer after a function of the form has filled it."""
     filled = form.Call(kinds.CHARACTERS, function, (target.form, *arguments), call.site)
-    return Value(store(call.scope, target, filled), call.position, pure=False)
+    return Value(store(call.scope, target, filled), call.position)
 
 
 def _prints(call: Arguments) -> Value:
@@ -248,7 +244,7 @@ def _printed(
     filled = _stored(call, target, function, made, *arguments)
     length = form.Call(kinds.INT, "h_len", (made,))
     items = (form.Assign(kinds.STRING, made.name, text), filled.form, length)
-    return Value(form.Sequence(kinds.INT, items, -1), call.position, pure=False)
+    return Value(form.Sequence(kinds.INT, items, -1), call.position)
 
 
 LIBRARY: Mapping[str, Function] = MappingProxyType(

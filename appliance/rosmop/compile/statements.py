@@ -178,7 +178,10 @@ def _evaluate(scope: Scope, node: tree.Evaluate) -> None:
     if level is not None:
         scope.evaluate(calls.streamed(scope, node, level, expression, value_of, headed=True).form)
     elif isinstance(expression, tree.Assign):
-        write_store(scope, *assignment(scope, expression))
+        first, target, assigned = assignment(scope, expression)
+        for each in first:
+            scope.evaluate(each)
+        write_store(scope, target, assigned)
     elif isinstance(expression, tree.Step):
         prefix = tree.Step(expression.position, expression.operator, expression.target, prefix=True)
         scope.evaluate(value_of(scope, prefix).form)

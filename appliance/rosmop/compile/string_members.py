@@ -15,7 +15,7 @@ _BEGIN = form.Literal(kinds.ULONG, 0)
 
 def _same(call: Invocation) -> Value:
     call.count(0)
-    return Value(call.base.form, call.position, constant=call.base.constant, pure=call.base.pure)
+    return Value(call.base.form, call.position, constant=call.base.constant)
 
 
 def _text_at(call: Invocation) -> Value:
@@ -31,9 +31,7 @@ def _text_front(call: Invocation) -> Value:
 def _text_back(call: Invocation) -> Value:
     call.count(0)
     last = call.called(kinds.STRING, "t_last")
-    return Value(
-        form.Call(kinds.CHAR, "t_member", (last, _BEGIN), call.site), call.position, pure=call.base.pure
-    )
+    return Value(form.Call(kinds.CHAR, "t_member", (last, _BEGIN), call.site), call.position)
 
 
 def _substring(call: Invocation) -> Value:
@@ -52,7 +50,7 @@ def _finder(function: str, start: int) -> Method:
 def _compare(call: Invocation) -> Value:
     call.count(1)
     compared = form.Call(kinds.INT, "t_compare", (call.called(kinds.STRING, "o_charged"), call.text(0)))
-    return Value(compared, call.position, pure=call.base.pure)
+    return Value(compared, call.position)
 
 
 def _text_append(call: Invocation) -> Value:

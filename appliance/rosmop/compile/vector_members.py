@@ -27,7 +27,7 @@ def element_value(base: Value, index: Value, position: Position, site: int) -> V
         )
     place = ElementPlace(base, at, site) if base.place is not None else None
     element = form.Call(kind.element, "l_element", (base.form, at), site)
-    return Value(element, position, place, owned=base.owned, pure=base.pure and index.pure)
+    return Value(element, position, place, owned=base.owned)
 
 
 def _vector(call: Invocation) -> kinds.Vector:

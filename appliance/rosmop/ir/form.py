@@ -715,6 +715,15 @@ def nodes(root: object) -> Iterator[object]:
             waiting += [getattr(node, field.name) for field in fields(node)]
 
 
+def acts(root: Expression) -> bool:
+    """Whether to evaluate it changes anything, or is seen from outside."""
+    return any(
+        isinstance(node, Assign | Invoke | Log | Throttle)
+        or (isinstance(node, Call) and (node.type == kinds.VOID or node.function in ("a_put", "a_slot")))
+        for node in nodes(root)
+    )
+
+
 def methods_of(walker: type, nodes: UnionType) -> Mapping[type[Any], Callable[..., Any]]:
     """Which method of a class is for which kind of expression or statement (`nodes`): `_after_text` for `AfterText`."""
     named = {kind: "_" + re.sub(r"(?<!^)(?=[A-Z])", "_", kind.__name__).lower() for kind in get_args(nodes)}

@@ -174,12 +174,12 @@ def in_module(body: str, before: str = FUNCTIONS) -> list[str]:
     return [f"{monitors.value('s', name):.9g}" for name in names]
 
 
-def printed(body: str, before: str, directory: Path) -> list[str]:
+def printed(body: str, before: str, directory: Path, *options: str) -> list[str]:
     """What a program puts out that the compiler has made."""
     compiler = need_program("g++", "g++")
     source, program = directory / "program.cpp", str(directory / "program")
     source.write_text(f"{HEADERS}{before}int main() {{\n{body}\n}}\n")
-    subprocess.run([compiler, "-w", "-fwrapv", "-O0", "-o", program, str(source)], check=True)
+    subprocess.run([compiler, "-w", "-fwrapv", "-O0", *options, "-o", program, str(source)], check=True)
     return subprocess.run([program], check=True, capture_output=True, text=True).stdout.split()
 
 
