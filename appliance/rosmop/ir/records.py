@@ -124,10 +124,11 @@ class Records(Vectors):
         """Put a value into a field, or into an element of an array of fixed length."""
         base = node.arguments[0]
         kept = root_of(base) in self._layout.shared
-        if kept:
-            self._assigned.add(root_of(base))
         with self._apart(base):
-            return self._put_part(node, kept=kept)
+            code = self._put_part(node, kept=kept)
+        if kept:
+            self._assigned.add(root_of(base))  # it stands here; one that cannot was refused above
+        return code
 
     def _put_part(self, node: form.Call, *, kept: bool) -> bytes:
         base, where, value = node.arguments
