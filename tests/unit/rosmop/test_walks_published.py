@@ -317,13 +317,15 @@ def test_what_is_beyond_is_the_engines(body: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "body", ["pose.covariance[0] = n;", "pose = pose;", "pose.covariance[0] = n; PUBLISH(/a, std_msgs/Header, h);"]
+    "body",
+    ["pose.covariance[0] = n;", "pose = pose;", "pose.covariance[0] = n; PUBLISH(/a, std_msgs/Header, h);"],
 )
 def test_only_the_messages_that_change_an_array_that_is_kept_are_the_engines(body: str) -> None:
     """In a branch: of those that go the other way nothing is left."""
     fed = Fed(
         of_stamped(
-            f"if (c == 2) {{ {body} }} else {{ n += 2; }}", "geometry_msgs::PoseWithCovariance pose; std_msgs::Header h;"
+            f"if (c == 2) {{ {body} }} else {{ n += 2; }}",
+            "geometry_msgs::PoseWithCovariance pose; std_msgs::Header h;",
         )
     )
     fed.check([stamped(b"", count) for count in (1, 1, 2, 1)], "/stamped")

@@ -14,11 +14,12 @@ import pytest
 from appliance.master.calls import pipeline
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.graph.graph import Graph
-from appliance.master.graph.registry import Registry
+from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.upkeep.enactor import Enactor
 from appliance.metrics import Meter
 from appliance.policy import compile_policy
 from appliance.policy.model import Decision
+from appliance.ros.uris import parse_node_uri
 from appliance.ros.xmlrpc import Value, build_call, parse_response
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import HttpRequest, Peer
@@ -89,6 +90,7 @@ class Site:
         self.policy_text = POLICY + rules
         self.policy = compile_policy(self.policy_text, file="test.ini")
         self.trail = Records()
+        self.registry = Registry()
         self.parameters = mirror(copy.deepcopy(tree or {}), whole=bytes_limit)
         self.there = mirror(copy.deepcopy(tree or {}))
         self.arrived: list[str] = []
@@ -98,7 +100,7 @@ class Site:
         self.dies_at = ""  # a key whose request it does not outlive
         self.serve = serving(
             policy=lambda: self.policy,
-            registry=Registry(),
+            registry=self.registry,
             graph=idle(Graph),
             enactor=idle(Enactor),
             rosmaster=self,
@@ -302,18 +304,30 @@ def test_what_depends_on_the_run_before_waits_for_it(following: Value) -> None:
 
 
 def test_a_run_that_was_decided_ahead_is_decided_again_when_that_counts_no_more() -> None:
-    """A policy that came into force meanwhile, or a log that cannot be written any more, has its say."""
+    """A policy that came into force meanwhile, a log that cannot be written, who holds the name, has its say."""
 
-    async def scene(change: Callable[[Site], None]) -> None:
+    async def scene(change: Callable[[Site], None], *, denied: bool = True) -> None:
         site = Site()
         asked = await held(site, sets(*RUNS[0], *RUNS[1]))
         change(site)
         site.go.set()
-        assert told(await asked) == [1] * 64 + [0] * 64
-        assert site.arrived == [f"setParam {key}" for key in RUNS[0]]
-        assert [one.allowed for _, _, one in site.trail.decisions] == [True] * 128 + [False] * 64
+        allowed = RUNS[0] if denied else RUNS[0] + RUNS[1]
+        assert told(await asked) == [1] * len(allowed) + [0] * (128 - len(allowed))
+        assert site.arrived == [f"setParam {key}" for key in allowed]
+        decisions = [one.allowed for _, _, one in site.trail.decisions]
+        assert decisions == [True] * 128 + [False] * (128 - len(allowed))
+
+    def registers(site: Site, host: str) -> None:
+        uri = f"http://{host}:5000/"
+        node = Incarnation(
+            "key", "/me", ipaddress.ip_address(host), parse_node_uri(uri), uri, host, 19001, 19002
+        )
+        site.registry.add(node)
+        site.registry.register(node, Kind.PUBLICATION, "/chatter", "std_msgs/String")
 
     stricter = compile_policy(f"{POLICY}write default = adm\n", file="test.ini")
+    play(lambda: scene(partial(registers, host=THIRD)))
+    play(lambda: scene(partial(registers, host=OPERATOR), denied=False))
     play(lambda: scene(lambda site: setattr(site, "policy", stricter)))
     play(lambda: scene(lambda site: setattr(site.trail, "obstacle", "the log is full")))
 
