@@ -77,6 +77,8 @@ class Folder:
         self._make_id = make_id
         self._clock = clock
         self._kinds: dict[Key, _Kind] = {}
+        self._coming: dict[Key, Record] = {}
+        """Denials that the owner will offer, by the narrowest kind; of each the first, where it was not there yet."""
         self._due: dict[Key, float] = {}
         self._by_subject: dict[Key, set[Key]] = {}
         self._denials: Pool[_Holder] = Pool("kinds of denials", settings.kinds, _standing)
@@ -92,11 +94,22 @@ class Folder:
         return kind.state if kind is not None and kind.state.count else None
 
     def in_full(self, record: Record) -> str:
-        """The id of the record in full that a denial repeats, if it is known by now; else its own. For any thread."""
-        kind = self._kinds.get(kind_of(keepable(record))) if record.decision == "deny" else None
-        if kind is None or (kind.state.caller_id, kind.state.resource) != (record.caller_id, record.resource):
-            return record.id  # a kind of a stranger is of many things
-        return kind.state.recorded_id
+        """The id of the record in full that a denial repeats; else its own. By the owner, before it offers the record.
+
+        What was not offered yet (the log gathers) is remembered, so that a repetition in the same moment finds it.
+        """
+        if record.decision != "deny" or not self._settings.seconds:
+            return record.id
+        key = kind_of(keepable(record))
+        kind = self._kinds.get(key)
+        if kind is None:
+            found = self._coming.setdefault(key, record)
+            recorded_id, about = found.id, (found.caller_id, found.resource)
+        else:
+            recorded_id, about = kind.state.recorded_id, (kind.state.caller_id, kind.state.resource)
+        return (
+            recorded_id if about == (record.caller_id, record.resource) else record.id
+        )  # a stranger's is of many
 
     def offer(self, record: Record, now: float) -> Iterator[Record]:
         """The records to write for this one: itself, nothing (counted), or summaries and itself."""
@@ -112,6 +125,8 @@ class Folder:
             yield from self._end_contradicted(plain)
         if not (denial or record.folds) or not self._counted(plain, denial=denial, now=now):
             yield record
+        if denial and self._coming:
+            self._coming.pop(kind_of(plain), None)  # from now on its kind is there, or that of its host
 
     def _counted(self, record: Record, *, denial: bool, now: float) -> bool:
         key, scope = self._denial_key(record) if denial else self._passing_key(record)

@@ -158,8 +158,9 @@ def test_flood_of_denials(make_log: MakeLog, path: Path) -> None:
 
 
 @pytest.mark.parametrize("stranger", [False, True], ids=["named", "stranger"])
+@pytest.mark.parametrize("at_once", [False, True], ids=["later", "at once"])
 def test_whoever_is_denied_again_is_told_an_id_that_is_there(
-    make_log: MakeLog, path: Path, stranger: bool
+    make_log: MakeLog, path: Path, stranger: bool, at_once: bool
 ) -> None:
     """The id of a repetition, which is only counted, is that of the record in full; another denial has its own."""
     log = make_log()
@@ -167,11 +168,12 @@ def test_whoever_is_denied_again_is_told_an_id_that_is_there(
     def told(**about: Any) -> str:
         record = decision(log, decision="deny", **about)
         found_by = log.record(msgspec.structs.replace(record, stranger=stranger))
-        assert settle(log) is None
+        assert at_once or settle(log) is None
         return found_by
 
     again = [told() for _ in range(3)]
     assert len(set(again)) == 1
+    assert settle(log) is None
     shown = show(path, again[-1], 0)
     assert shown is not None
     assert shown.entry.record.decision == "deny"
