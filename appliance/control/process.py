@@ -191,7 +191,7 @@ class _Control:
         )
         return Hosts(
             self._certification,
-            partial(find_endpoint, self._settings.ipsec.endpoint, self._lifeline.endpoint),
+            partial(find_endpoint, self._settings, self._lifeline.endpoint),
             expel=self._parts.expel,
             carried_out=self._parts.relay.carried_out,
             machines=self._parts.machines,

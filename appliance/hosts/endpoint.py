@@ -5,16 +5,21 @@ from collections.abc import Awaitable, Callable
 
 from appliance.channel.answers.hosts import Endpoint
 from appliance.channel.messages import EndpointFound
+from appliance.config import Settings
+from appliance.hosts.rest_place import NO_TUNNELS
 from appliance.hosts.table import HostRefusedError
 
 _PATIENCE_SECONDS = 20.0
 
 
-async def find_endpoint(configured: str | None, look: Callable[[], Awaitable[EndpointFound]]) -> Endpoint:
+async def find_endpoint(settings: Settings, look: Callable[[], Awaitable[EndpointFound]]) -> Endpoint:
     """What is configured, else what the supervisor sees.
 
     Raises `HostRefusedError`, which says what to give instead.
     """
+    if settings.isolation == "none":
+        raise HostRefusedError(NO_TUNNELS)
+    configured = settings.ipsec.endpoint
     if configured is not None:
         return Endpoint(configured, "ipsec.endpoint of the configuration")
     try:

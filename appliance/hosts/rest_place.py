@@ -4,6 +4,11 @@ from dataclasses import dataclass
 
 from appliance.config import Settings, is_loopback
 
+NO_TUNNELS = (
+    "isolation: none has no tunnels, for no firewall keeps their addresses from being forged: start the appliance with"
+    " `isolation: netns` or `container`"
+)
+
 
 @dataclass(frozen=True)
 class RestPlace:
@@ -19,13 +24,13 @@ class RestPlace:
 
 def rest_place(settings: Settings) -> RestPlace:
     """The place."""
+    if settings.isolation == "none":
+        return RestPlace(None, NO_TUNNELS, None)
     if settings.api_address is None:
         return RestPlace(None, "REST is off: hosts cannot enrol themselves; set `api: 0.0.0.0:8443`", None)
     host, port = settings.api_address
     if not settings.api_tls:
         return RestPlace(None, "REST is in clear text (api_tls: off): hosts cannot enrol themselves", None)
-    if settings.isolation == "none":
-        return RestPlace(None, "isolation: none has no tunnels", None)
     everywhere = settings.isolation == "netns" or host in ("0.0.0.0", "::")  # noqa: S104  compared only
     inner = port if everywhere else None
     trouble = _trouble_outside(settings, host, port, everywhere=everywhere)

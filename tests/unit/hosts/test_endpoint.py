@@ -1,13 +1,19 @@
 """Tests of `appliance.hosts.endpoint`."""
 
 import asyncio
+from typing import Any
 
 import pytest
 
 from appliance.channel.answers.hosts import Endpoint
 from appliance.channel.messages import EndpointFound
+from appliance.config import Ipsec, Settings
 from appliance.hosts.endpoint import find_endpoint
 from appliance.hosts.table import HostRefusedError
+
+
+def _settings(endpoint: str | None = None, **more: Any) -> Settings:
+    return Settings(ipsec=Ipsec(endpoint=endpoint), **more)
 
 
 async def _found() -> EndpointFound:
@@ -20,20 +26,28 @@ async def _several() -> EndpointFound:
 
 def test_what_is_configured_comes_first() -> None:
     """Nobody looks then, so that it also helps where nothing can be found."""
-    assert asyncio.run(find_endpoint("robot.example.org", _several)) == Endpoint(
+    assert asyncio.run(find_endpoint(_settings("robot.example.org"), _several)) == Endpoint(
         "robot.example.org", "ipsec.endpoint of the configuration"
     )
 
 
 def test_what_the_supervisor_sees_is_taken_with_its_reason() -> None:
     """So that a person can judge it."""
-    assert asyncio.run(find_endpoint(None, _found)) == Endpoint("10.0.0.5", "the only address here")
+    assert asyncio.run(find_endpoint(_settings(), _found)) == Endpoint("10.0.0.5", "the only address here")
 
 
 def test_what_cannot_be_told_is_refused_with_what_to_give() -> None:
     """Flag, field of REST and key of the configuration; it is no defect of the appliance (not `ours`)."""
     with pytest.raises(HostRefusedError) as caught:
-        asyncio.run(find_endpoint(None, _several))
+        asyncio.run(find_endpoint(_settings(), _several))
     for words in ("10.0.0.5, 10.0.1.5", "--appliance ADDRESS", "ipsec: {endpoint: ADDRESS}", "`endpoint`"):
         assert words in str(caught.value), words
     assert not caught.value.ours
+
+
+@pytest.mark.parametrize("endpoint", [None, "10.0.0.5"])
+def test_where_there_are_no_tunnels_no_address_is_asked_for(endpoint: str | None) -> None:
+    """None would open one: what is needed instead is said."""
+    with pytest.raises(HostRefusedError, match="`isolation: netns` or `container`") as caught:
+        asyncio.run(find_endpoint(_settings(endpoint, isolation="none"), _found))
+    assert "--appliance" not in str(caught.value)
