@@ -1,7 +1,9 @@
 """Files that are there as a whole or not at all, whatever dies meanwhile."""
 
+import contextlib
 import os
 import stat
+import sys
 from pathlib import Path
 
 
@@ -32,13 +34,21 @@ def write_where_told(path: Path, data: bytes) -> None:
     """Write what somebody wants at a place of his choice. Raises `OSError`.
 
     A file is replaced as a whole and keeps its mode and owner, also behind a link. What is no file (a pipe, a device),
-    or has an owner that this process cannot give it again, is written into.
+    or has an owner that this process cannot give it again, is written into; and so is what this process's own output
+    goes to (/dev/stdout), behind what it has said.
     """
     try:
         there = path.stat()
     except FileNotFoundError:
         write_whole(path, data, 0o644)
         return
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        with contextlib.suppress(OSError, ValueError):  # it is closed, or is no file
+            if os.path.samestat(there, os.fstat(stream.fileno())):
+                stream.flush()
+                with os.fdopen(os.dup(stream.fileno()), "wb") as output:
+                    output.write(data)
+                return
     user, groups = os.geteuid(), {os.getegid(), *os.getgroups()}
     keeps = user == 0 or (there.st_uid == user and there.st_gid in groups)
     if not (keeps and stat.S_ISREG(there.st_mode)):

@@ -3,6 +3,7 @@
 import os
 import stat
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -81,3 +82,16 @@ def test_a_file_behind_a_link_keeps_its_mode_and_a_pipe_stays_one(tmp_path: Path
     assert pipe.is_fifo()
     write_where_told(tmp_path / "new", b"one")
     assert (tmp_path / "new").read_bytes() == b"one"
+
+
+def test_what_goes_to_our_own_output_stands_behind_what_was_said(tmp_path: Path) -> None:
+    """`verb --write /dev/stdout >> file` keeps what the file had, and what the verb says before and after."""
+    file = tmp_path / "file"
+    file.write_text("before\n")
+    program = (
+        "from pathlib import Path; from appliance.whole_files import write_where_told as write\n"
+        "print('said'); write(Path('/dev/stdout'), b'written\\n'); print('done')"
+    )
+    with file.open("a") as output:
+        subprocess.run([sys.executable, "-c", program], stdout=output, check=True)
+    assert file.read_text() == "before\nsaid\nwritten\ndone\n"
