@@ -63,6 +63,12 @@ class Database:
         self._failed = failed
         self._failing = ""
         self._told: set[str] = set()
+        # The file beside it is made once it has its tables. SQLite takes an empty one for new: nothing is revoked then.
+        if path.exists() and not path.stat().st_size and path.with_suffix(".ahead").exists():
+            raise StoreError(
+                f"{path}: is empty, and was not when the appliance ran before: restore a backup (rosrv restore), or"
+                " move the file away to start with an empty state"
+            )
         try:
             self._connection = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
             self._connection.execute("PRAGMA journal_mode=WAL")

@@ -173,6 +173,20 @@ def test_a_file_that_is_no_database_is_named_with_what_to_do(tmp_path: Path) -> 
     assert file.read_bytes().startswith(b"this is not")
 
 
+def test_a_file_that_lost_all_it_had_is_not_taken_for_a_new_one(tmp_path: Path) -> None:
+    """Tokens, hosts and what was revoked would be gone without a word; an empty file before the first start is none."""
+    path = tmp_path / "state.db"
+    path.touch()
+    Database(path, SCHEMA, failed=print).close()
+    os.truncate(path, 0)
+    with pytest.raises(
+        StoreError, match=r"state\.db: is empty, and was not .*rosrv restore.* move the file away"
+    ):
+        Database(path, SCHEMA, failed=print)
+    path.unlink()
+    Database(path, SCHEMA, failed=print).close()
+
+
 def test_a_place_that_cannot_be_written_is_not_taken_for_a_bad_file(tmp_path: Path) -> None:
     """Where the place is at fault (a full disk, a folder that is not there), nobody is told to move the state away."""
     with pytest.raises(StoreError, match=r"state\.db.*make room") as caught:
