@@ -14,8 +14,8 @@ NEVER: Final = {"rich", "pygments", "typer", "lark", "numpy", "pyroute2", "z3", 
 ENTRIES: Final = {role.name: role.entry.partition(":")[0] for role in ROLES if role.entry is not None}
 _BARE = {"pydantic", "rosbags"}
 ALSO: Final = {
-    "signer": _BARE, "relay": _BARE | {"cryptography"}, "control": _BARE, "charon": _BARE, "syslog": _BARE,
-    "recorder": {"pydantic"}, "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette"},
+    "signer": _BARE, "relay": _BARE | {"cryptography", "appliance.config"}, "control": _BARE,
+    "charon": _BARE, "syslog": _BARE, "recorder": {"pydantic"}, "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette"},
 }  # fmt: skip
 
 

@@ -1,17 +1,22 @@
 """Tests of `appliance.supervisor.relay_entry`."""
 
+import json
 from dataclasses import fields
+from pathlib import Path
 
 from appliance.config import Relay, Settings
+from appliance.config_sources import plain
 from appliance.relay.limits import Limits
 from appliance.supervisor.relay_entry import limits_of
 
 
-def test_every_key_reaches_the_relay() -> None:
+def test_every_key_reaches_the_relay(tmp_path: Path) -> None:
     """Each key of the section `relay` is a limit of the relay, with the same default, and changes it."""
+    written = tmp_path / "config.json"
     keys = {field.name for field in fields(Relay)}
     assert keys <= {field.name for field in fields(Limits)}
-    assert limits_of(Settings()) == Limits()
+    written.write_text(json.dumps(plain(Settings())))
+    assert limits_of(written) == Limits()
     for name in keys:
-        changed = Settings(relay=Relay(**{name: 7 << 20}))
-        assert getattr(limits_of(changed), name) == 7 << 20
+        written.write_text(json.dumps(plain(Settings(relay=Relay(**{name: 7 << 20})))))
+        assert getattr(limits_of(written), name) == 7 << 20
