@@ -7,6 +7,7 @@ the files of the verbs.
 
 import functools
 import inspect
+import os.path
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -77,8 +78,58 @@ def _nothing() -> None:
     pass
 
 
+class _Reader:
+    """Reads one flag or argument as typer does, which has pydantic say that a text is a text and a path is a path.
+
+    Those, and what is not given, are read without: loading pydantic would be half of the time of a short command.
+    """
+
+    def __init__(self, parameter: Any) -> None:
+        self._parameter = parameter
+        self._typers = parameter.get_runtime_param
+
+    def itself(self) -> "_Reader":
+        """As typer asks for it."""
+        return self
+
+    def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
+        """The value that the verb is given. Raises `typer.BadParameter`."""
+        kind = self._parameter.type_descriptor.annotation
+        if value is None:
+            return () if param.multiple or param.nargs == -1 else None
+        plain = isinstance(value, str | Path) and str(value).isascii()
+        if kind is Path and plain and not self._looks_at(Path(value)):
+            return Path(value)
+        if (kind is str and plain) or (kind in (int, float, str) and value is param.default):
+            return value
+        return self._typers().coerce(value, param=param, ctx=ctx)
+
+    def _looks_at(self, path: Path) -> bool:
+        """Whether typer might refuse this path, or change it."""
+        info = self._parameter.type_descriptor.parameter_info
+        if info.exists or info.writable or info.resolve_path or not (info.file_okay and info.dir_okay):
+            return True
+        return info.readable and os.path.exists(path) and not os.access(path, os.R_OK)  # noqa: PTH110  no error
+
+
+class _Sparing:
+    """A command whose flags and arguments are read by `_Reader`."""
+
+    def get_params(self, ctx: Any) -> Any:
+        """All of them, `--help` included."""
+        found = super().get_params(ctx)  # type: ignore[misc]  # the class beside it has them
+        for parameter in found:
+            if parameter.get_runtime_param.__name__ != "itself":
+                parameter.get_runtime_param = _Reader(parameter).itself
+        return found
+
+
+class _Command(_Sparing, TyperCommand):
+    pass
+
+
 def _group_of(verbs: Verbs) -> type[TyperGroup]:
-    class _Lazy(TyperGroup):
+    class _Lazy(_Sparing, TyperGroup):
         """A group whose commands are imported when they are run."""
 
         def __init__(self, **settings: Any) -> None:
@@ -136,5 +187,7 @@ def loaded(verb: Verb, name: str) -> Any:
     module, _colon, attribute = verb.place.partition(":")
     found = getattr(late.load(f"appliance.cli.{module}"), attribute)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command(name, help="\n\n".join(filter(None, (verb.first, inspect.getdoc(found)))))(found)
+    app.command(name, cls=_Command, help="\n\n".join(filter(None, (verb.first, inspect.getdoc(found)))))(
+        found
+    )
     return typer.main.get_command(app)

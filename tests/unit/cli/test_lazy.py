@@ -36,6 +36,20 @@ def test_the_command_imports_only_what_a_verb_needs() -> None:
     assert done.stdout.strip() == ""
 
 
+def test_a_command_reads_texts_and_paths_without_pydantic(tmp_path: Path) -> None:
+    """A verb is asked with flags that are texts and paths; a number is typer's to read, and to refuse."""
+    program = "import sys\ntry: main()\nfinally: print('pydantic' in sys.modules)"
+    status = ["status", "--json", "--state", str(tmp_path)]
+    for arguments, has in ((status, "False"), (["audit", "search", "--limit", "many"], "True")):
+        done = subprocess.run(
+            [sys.executable, "-c", f"from appliance.cli.main import main\n{program}", *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.stdout.splitlines()[-1] == has, done.stderr
+
+
 @pytest.mark.parametrize(("name", "command"), [pytest.param(*one, id=one[0]) for one in commands()])
 def test_every_verb_has_help_with_an_example(name: str, command: Any) -> None:
     """One sentence first, an example of this very verb, `--json`; every option and argument is explained.

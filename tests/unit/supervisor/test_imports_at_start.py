@@ -15,7 +15,8 @@ ENTRIES: Final = {role.name: role.entry.partition(":")[0] for role in ROLES if r
 _BARE = {"pydantic", "rosbags"}
 ALSO: Final = {
     "signer": _BARE, "relay": _BARE | {"cryptography", "appliance.config"}, "control": _BARE,
-    "charon": _BARE, "syslog": _BARE, "recorder": {"pydantic"}, "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette"},
+    "charon": _BARE, "syslog": _BARE, "recorder": {"pydantic"},
+    "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette"},
 }  # fmt: skip
 
 
