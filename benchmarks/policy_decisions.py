@@ -12,7 +12,9 @@ import random
 import statistics
 import time
 
-from appliance.policy import Category, Policy, Request, compile_policy
+from appliance.policy.compiler import compile_policy
+from appliance.policy.model import Category, Request
+from appliance.policy.policy import Policy
 
 SIZES = (10, 100, 1_000, 10_000)
 REQUESTS = 4_000

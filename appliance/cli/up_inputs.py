@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from appliance.config import Settings
-from appliance.policy import Known, PolicyError, judge
+from appliance.policy.findings import PolicyError
+from appliance.policy.judgement import Known, judge
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.site_keys import read_signature
 from appliance.supervisor.errors import StartError

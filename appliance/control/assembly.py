@@ -58,8 +58,8 @@ from appliance.master.upkeep.moves import Moving
 from appliance.master.upkeep.publisher import OwnPublisher
 from appliance.master.upkeep.reconcile import Reconciler
 from appliance.master.upkeep.reminders import Reminders
-from appliance.policy import Policy
 from appliance.policy.model import Address
+from appliance.policy.policy import Policy
 from appliance.ros import log_message
 from appliance.rpc.bulk import LargeWrites, bulk_turns
 from appliance.shares.pool import Pool

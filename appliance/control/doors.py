@@ -12,8 +12,8 @@ from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.config import Settings
 from appliance.master.calls.glimpse import asked_for
-from appliance.policy import Policy
 from appliance.policy.model import Address
+from appliance.policy.policy import Policy
 from appliance.ros.xmlrpc import Limits, build_fault
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.server import AtOnce, Handler, HttpServer, Peer, Refusal, not_at_once

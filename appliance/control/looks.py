@@ -24,7 +24,7 @@ from appliance.control.policies import Policies
 from appliance.hosts.hosts import Hosts
 from appliance.inventory import inventory
 from appliance.master.graph.registry import Kind, Life
-from appliance.policy import Live
+from appliance.policy.live import Live
 from appliance.policy.sections import DECIDERS
 
 MOST_MESSAGES = 20

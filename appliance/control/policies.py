@@ -24,9 +24,11 @@ from appliance.channel.answers import policy as answers
 from appliance.channel.answers.policy import Loaded
 from appliance.control.errors import UnknownThingError
 from appliance.fingerprints import fingerprint
-from appliance.policy import Known, Policy, PolicyError, judge
+from appliance.policy.findings import PolicyError
 from appliance.policy.hosts import Network
+from appliance.policy.judgement import Known, judge
 from appliance.policy.model import Address
+from appliance.policy.policy import Policy
 from appliance.site_keys import read_signature, signer
 from appliance.store.revisions import Trial, UnknownRevisionError, wanted
 from appliance.store.state import RevisionRow, StateStore

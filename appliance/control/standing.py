@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from appliance.policy import Policy
 from appliance.policy.model import Address, address_of
+from appliance.policy.policy import Policy
 from appliance.shares.pool import Standing
 
 

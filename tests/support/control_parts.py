@@ -29,7 +29,7 @@ from appliance.master.upkeep.entries import Entries
 from appliance.master.upkeep.liveness import Liveness, Watchlist
 from appliance.master.upkeep.reconcile import Reconciler
 from appliance.metrics import Meter
-from appliance.policy import compile_policy
+from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Address, Decision
 from appliance.ros.uris import node_uri, parse_node_uri
 from appliance.ros.xmlrpc import Limits, Value, build_call, parse_response

@@ -46,7 +46,8 @@ from appliance.master.upkeep import liveness as liveness_module
 from appliance.master.upkeep.arrivals import Arrivals
 from appliance.master.upkeep.enactor import Enactor, restore
 from appliance.master.upkeep.reminders import Reminders
-from appliance.policy import Policy, compile_policy
+from appliance.policy.compiler import compile_policy
+from appliance.policy.policy import Policy
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import BrokenOffError, RefusedError, UnansweredError
 from appliance.shares.pool import Standing

@@ -17,7 +17,7 @@ from appliance.master.calls.repetition import Repetitions
 from appliance.master.calls.table import master_table
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
-from appliance.policy import Policy
+from appliance.policy.policy import Policy
 from appliance.ros.xmlrpc import Limits
 from appliance.rpc.bulk import LargeWrites, bulk_turns
 from appliance.rpc.server import Handler, HttpRequest

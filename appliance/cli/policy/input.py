@@ -17,9 +17,12 @@ from appliance.channel.admin import RegistrationsWanted
 from appliance.cli import output
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.target import Appliance
-from appliance.policy import Address, Category, Known, Live, Policy, Request
 from appliance.policy.actions import BadWordError, find_hosts
 from appliance.policy.hosts import Network, canonical_address, canonical_network
+from appliance.policy.judgement import Known
+from appliance.policy.live import Live
+from appliance.policy.model import Address, Category, Request
+from appliance.policy.policy import Policy
 
 usage_error = functools.partial(output.usage_error, verb="rosrv policy")
 Robot = Annotated[

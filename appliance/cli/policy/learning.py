@@ -17,8 +17,10 @@ from appliance.cli.output import counted, refused, say_json
 from appliance.cli.policy.input import Robot, networks_of, request_of, usage_error
 from appliance.cli.spans import Since
 from appliance.cli.target import Appliance, speaks
-from appliance.policy import Category, PolicyError, compile_policy
+from appliance.policy.compiler import compile_policy
+from appliance.policy.findings import PolicyError
 from appliance.policy.learn import Learned, Observation, learn
+from appliance.policy.model import Category
 
 _OWN_NODE = "the appliance's own node"
 

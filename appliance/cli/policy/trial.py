@@ -13,7 +13,9 @@ from msgspec.structs import asdict
 from appliance.channel.admin import AdminAnswer, PolicyWanted
 from appliance.cli.policy.input import known_of, live_now, read_text
 from appliance.cli.target import Appliance
-from appliance.policy import Ending, Finding, Known, PolicyError, Severity, endings, judge
+from appliance.policy.findings import Finding, PolicyError, Severity
+from appliance.policy.judgement import Known, judge
+from appliance.policy.live import Ending, endings
 from appliance.site_keys import read_signature
 
 

@@ -26,23 +26,14 @@ from appliance.cli.policy.input import (
 )
 from appliance.cli.policy.trial import Trial, try_policy
 from appliance.cli.target import Appliance, speaks
-from appliance.policy import (
-    Category,
-    Decision,
-    Difference,
-    Finding,
-    Judged,
-    PolicyError,
-    Request,
-    diff,
-    explain,
-    judge,
-)
 from appliance.policy.actions import BadWordError, check_resource
-from appliance.policy.explain import Explanation, render
-from appliance.policy.findings import Severity
+from appliance.policy.diff import Difference, diff
+from appliance.policy.explain import Explanation, explain, render
+from appliance.policy.findings import Finding, PolicyError, Severity
 from appliance.policy.grant import Asked, UngrantableError
 from appliance.policy.grant import grant as grant_of
+from appliance.policy.judgement import Judged, judge
+from appliance.policy.model import Category, Decision, Request
 from appliance.policy.rights import needs_node, rights_of
 
 _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_default=False)]

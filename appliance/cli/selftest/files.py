@@ -15,7 +15,9 @@ from appliance.audit.search import search
 from appliance.cli.selftest.findings import Found, fail, ok, skip, told, warn
 from appliance.config import Settings
 from appliance.hosts.hosts_file import DeclaredHostsError, read_declared
-from appliance.policy import Known, PolicyError, judge, run_cases
+from appliance.policy.cases import run_cases
+from appliance.policy.findings import PolicyError
+from appliance.policy.judgement import Known, judge
 from appliance.policy.policy import Policy
 from appliance.shipped import SHIPPED
 from appliance.site_keys import read_signature

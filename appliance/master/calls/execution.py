@@ -32,8 +32,8 @@ from appliance.master.parameter_charges import LimitReachedError
 from appliance.master.reach.places import NoPortError
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.liveness import Liveness, Probe
-from appliance.policy import Policy
 from appliance.policy.model import Address, Category, Decision
+from appliance.policy.policy import Policy
 from appliance.ros.errors import EncodingError, PeerError, ProtocolError
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import Bulk, LargeWrites, weigh

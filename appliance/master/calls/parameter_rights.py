@@ -8,8 +8,8 @@ from appliance.audit_trail import AuditTrail
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import denial_text
 from appliance.master.graph.registry import Incarnation
-from appliance.policy import Policy
 from appliance.policy.model import Address, Category, Decision, Request
+from appliance.policy.policy import Policy
 from appliance.policy.rights import decide_right, right_to_find, right_to_read
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.server import Peer

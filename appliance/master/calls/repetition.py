@@ -28,8 +28,8 @@ from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.master.reach.places import Addresses
 from appliance.master.rosmaster import RosMaster
-from appliance.policy import Policy
 from appliance.policy.model import Decision
+from appliance.policy.policy import Policy
 from appliance.ros.errors import PeerError
 from appliance.ros.parameter_tree import standing_at
 from appliance.ros.xmlrpc import MethodCall, Value

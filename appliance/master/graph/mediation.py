@@ -9,7 +9,7 @@ boundary: a node that has been told a port can ask it for anything.
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.policy import Policy
+from appliance.policy.policy import Policy
 from appliance.specifications.files import Checked
 
 

@@ -12,9 +12,9 @@ from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph, revocation
 from appliance.master.graph.own_node import OWN, ROSOUT
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
-from appliance.policy import Policy
 from appliance.policy.live import Live, live_by, may_keep
 from appliance.policy.model import Address, Decision, address_of
+from appliance.policy.policy import Policy
 from appliance.ros.parameter_tree import Tree
 from appliance.specifications.allocation import TOPIC
 from appliance.store.state import PermissionRow

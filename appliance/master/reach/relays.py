@@ -22,9 +22,9 @@ from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.places import Places
 from appliance.master.reach.topic_looks import TopicLooks
 from appliance.master.reach.traffic import Carried
-from appliance.policy import Policy
 from appliance.policy.limits import Part, Rate
 from appliance.policy.model import address_of
+from appliance.policy.policy import Policy
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Resource

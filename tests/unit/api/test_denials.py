@@ -15,7 +15,7 @@ from appliance.audit_trail import rule_reference
 from appliance.channel.answers.policy import PolicyKnown, Why
 from appliance.channel.messages.relay import Violation
 from appliance.master.graph.graph import revocation
-from appliance.policy import compile_policy
+from appliance.policy.compiler import compile_policy
 from appliance.policy.live import Live, may_keep
 from appliance.policy.settings import AT_ONCE
 from distribution.audit_events_page import uses

@@ -13,8 +13,9 @@ import pytest
 
 from appliance.channel.admin import PolicyConfirm, PolicyLoad, PolicyReload
 from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
-from appliance.policy import Policy, judgement
+from appliance.policy import judgement
 from appliance.policy.model import Address, Category, Request
+from appliance.policy.policy import Policy
 from appliance.store.state import StateStore
 from tests.support.control_parts import OPEN, Records
 from tests.support.site_key import LINE, OTHER_KEY, OTHER_LINE, signed

@@ -3,7 +3,7 @@
 import ipaddress
 
 from appliance.control.standing import HostStanding
-from appliance.policy import compile_policy
+from appliance.policy.compiler import compile_policy
 from appliance.shares.pool import Standing
 
 NAMED, OTHER = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")

@@ -6,7 +6,7 @@ from typing import Any
 import yaml
 
 from appliance.config_sources import resolve
-from appliance.policy import compile_policy
+from appliance.policy.compiler import compile_policy
 
 ROOT = Path(__file__).parents[3]
 ROLE = ROOT / "examples/ansible/roles/rosrv"

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.master.graph.registry import Incarnation, Kind, new_key
-from appliance.policy import Live, compile_policy, endings
+from appliance.policy.compiler import compile_policy
+from appliance.policy.live import Live, endings
 from appliance.ros.uris import parse_node_uri
 from appliance.store.state import PermissionRow
 from tests.support.control_parts import ControlParts

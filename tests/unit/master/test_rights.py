@@ -30,12 +30,16 @@ from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registry import Incarnation, Kind, Registry, new_key
 from appliance.master.graph.revocation import CALLS
-from appliance.policy import Live, Policy, compile_policy, diff, explain, run_cases
 from appliance.policy.actions import VERBS
+from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
+from appliance.policy.compiler import compile_policy
+from appliance.policy.diff import diff
+from appliance.policy.explain import explain
 from appliance.policy.learn import Observation, learn
-from appliance.policy.live import may_keep
+from appliance.policy.live import Live, may_keep
 from appliance.policy.model import Category, Decision, Request
+from appliance.policy.policy import Policy
 from appliance.policy.rights import needs_node
 from appliance.ros.parameter_tree import Tree
 from appliance.ros.uris import parse_node_uri

@@ -4,8 +4,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.policy import CaseResult, PolicyError, compile_policy, run_cases
 from appliance.policy.actions import VERBS
+from appliance.policy.cases import CaseResult, run_cases
+from appliance.policy.compiler import compile_policy
+from appliance.policy.findings import PolicyError
 from tests.support.examples import examples
 
 POLICY = compile_policy(

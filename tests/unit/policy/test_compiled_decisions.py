@@ -12,7 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.policy import Category, PolicyError, Request, compile_policy
+from appliance.policy.compiler import compile_policy
+from appliance.policy.findings import PolicyError
+from appliance.policy.model import Category, Request
 from tests.support.examples import examples
 
 Rules = list[tuple[str, str, list[str]]]  # section, key, words of the value

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from appliance.policy import Policy, PolicyError, Severity, compile_policy
-from appliance.policy.findings import MAXIMUM_FINDINGS
+from appliance.policy.compiler import compile_policy
+from appliance.policy.findings import MAXIMUM_FINDINGS, PolicyError, Severity
 from appliance.policy.model import TELLS
+from appliance.policy.policy import Policy
 from appliance.policy.reader import MAXIMUM_CHARACTERS
 from tests.support.examples import examples
 

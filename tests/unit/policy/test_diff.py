@@ -2,7 +2,9 @@
 
 import ipaddress
 
-from appliance.policy import Category, Request, compile_policy, diff
+from appliance.policy.compiler import compile_policy
+from appliance.policy.diff import diff
+from appliance.policy.model import Category, Request
 
 OLD = "[Nodes]\ndefault = *\n[Publishers]\ndefault = 10.0.0.1\n/cmd = 10.0.0.5\n"
 

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from appliance.policy import compile_policy, run_cases
 from appliance.policy.actions import VERBS
+from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
+from appliance.policy.compiler import compile_policy
 from appliance.policy.sections import NAMES
 
 PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text(encoding="utf-8")

@@ -2,8 +2,9 @@
 
 import ipaddress
 
-from appliance.policy import Category, Explanation, Request, compile_policy, explain
-from appliance.policy.explain import render
+from appliance.policy.compiler import compile_policy
+from appliance.policy.explain import Explanation, explain, render
+from appliance.policy.model import Category, Request
 from appliance.policy.rights import decide, rights_of
 
 POLICY = compile_policy(

@@ -4,8 +4,8 @@ import ipaddress
 
 import pytest
 
-from appliance.policy import Live, compile_policy, endings
-from appliance.policy.live import live_by, may_keep
+from appliance.policy.compiler import compile_policy
+from appliance.policy.live import Live, endings, live_by, may_keep
 from appliance.ros.parameter_tree import Tree
 
 HOST = ipaddress.ip_address("10.0.0.5")

@@ -5,9 +5,10 @@ import re
 
 import pytest
 
-from appliance.policy import Address, Category, Decision, Policy, Request, compile_policy
 from appliance.policy.commands import COMMANDS, DECIDED_ELSEWHERE, NAMED_ONLY
-from appliance.policy.model import told_of
+from appliance.policy.compiler import compile_policy
+from appliance.policy.model import Address, Category, Decision, Request, told_of
+from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, rights_of
 
 FIGURE = """

@@ -16,7 +16,7 @@ _BARE = {"pydantic", "rosbags"}
 ALSO: Final = {
     "signer": _BARE, "relay": _BARE | {"cryptography", "appliance.config"}, "control": _BARE,
     "charon": _BARE, "syslog": _BARE, "recorder": {"pydantic"},
-    "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette"},
+    "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette", "yaml", "appliance.policy.policy"},
 }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, Registry
 from appliance.master.upkeep.liveness import Presence, Probe
-from appliance.policy import compile_policy
+from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.parameter_tree import Tree
 from appliance.ros.uris import parse_node_uri, parse_service_uri

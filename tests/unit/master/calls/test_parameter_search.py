@@ -9,7 +9,7 @@ import pytest
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.calls.parameters import ParameterSearch
-from appliance.policy import compile_policy
+from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.parameter_tree import standing_at
 from appliance.rpc.server import Peer

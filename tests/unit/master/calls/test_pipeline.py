@@ -17,7 +17,7 @@ from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.upkeep.enactor import Enactor
 from appliance.metrics import Meter
-from appliance.policy import compile_policy
+from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.uris import parse_node_uri
 from appliance.ros.xmlrpc import Value, build_call, parse_response

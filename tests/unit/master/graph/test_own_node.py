@@ -10,7 +10,7 @@ from appliance.master.calls.gate import Gate, HostLimits
 from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.own_node import ROSOUT
 from appliance.master.graph.registry import Kind, Registry
-from appliance.policy import compile_policy
+from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Decision
 from appliance.ros.uris import parse_node_uri
 from appliance.rpc.server import Peer

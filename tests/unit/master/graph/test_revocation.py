@@ -4,7 +4,7 @@ import pytest
 
 from appliance.master.graph.registry import Kind, Life
 from appliance.master.graph.revocation import revoked
-from appliance.policy import compile_policy
+from appliance.policy.compiler import compile_policy
 from appliance.ros.xmlrpc import Value
 from appliance.store.state import PermissionRow
 from tests.support.control_parts import OPEN, POLICY, ControlParts

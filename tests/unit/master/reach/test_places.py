@@ -10,7 +10,7 @@ import pytest
 
 from appliance.master.graph.registry import Incarnation
 from appliance.master.reach.places import NoPortError, Places
-from appliance.policy import compile_policy
+from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Address
 from appliance.ros.uris import parse_node_uri
 

@@ -20,8 +20,9 @@ from appliance.master.reach.places import Places
 from appliance.master.reach.relays import RelayControl
 from appliance.master.reach.traffic import Carried
 from appliance.master.upkeep.enactor import Enactor
-from appliance.policy import Policy, compile_policy
+from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Address
+from appliance.policy.policy import Policy
 from appliance.ros.uris import parse_node_uri
 from appliance.shares.pool import Bounds
 from appliance.shares.table import GRANTS
