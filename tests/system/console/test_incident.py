@@ -151,7 +151,7 @@ def test_who_may_not_read_is_told_why(
     """A viewer sees the list and the time line, and whom the messages are for; nothing is wider than the window."""
     reader = opened(token("viewer"), width=390, height=844)
     page = reader.go("recordings")
-    press(page.locator("tbody").get_by_role("link").first)
+    press(page.locator(f'tbody a[href$="{recording["id"]}"]'))
     expect(page.get_by_role("slider", name="Moment")).to_be_visible()
     expect(page.get_by_role("button", name="Read messages")).to_have_attribute(
         "title", "For the role investigator; yours is viewer"
