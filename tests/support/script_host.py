@@ -27,6 +27,20 @@ fi
 exec chroot "$2/" sh -c 'echo mounted; exec sleep infinity'
 """
 
+_END = """\
+for file in /run/rosrv/*.pid; do
+    [ -e "$file" ] || continue
+    pid=$(cat "$file")
+    kill -- "-$pid" 2>/dev/null
+    for _ in $(seq 100); do
+        kill -0 "$pid" 2>/dev/null || break
+        sleep 0.1
+    done
+    kill -KILL -- "-$pid" 2>/dev/null
+done
+true
+"""
+
 
 class ScriptHost:
     """A context manager; `address` is what ROS nodes on it are told to be (set once it has joined).
@@ -52,7 +66,7 @@ class ScriptHost:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self.run("sh", "-c", "for f in /run/rosrv/*.pid; do [ -e $f ] && kill -- -$(cat $f); done; true")
+        self.run("sh", "-c", _END)  # the next host of this network takes the same ports
         self._holder.stop()
 
     def command(self, args: Sequence[str]) -> list[str]:

@@ -121,7 +121,9 @@ UNIT
 
 # Where there is no systemd: a program in the background, by its pid file.
 run=/run/rosrv
-running() { [ -s "$run/$1.pid" ] && kill -0 "$(cat "$run/$1.pid")" 2>/dev/null; }
+# What has ended runs no more, also where process 1 of a container does not collect it.
+runs() { kill -0 "$1" 2>/dev/null && ! grep -q ') Z ' "/proc/$1/stat" 2>/dev/null; }
+running() { [ -s "$run/$1.pid" ] && runs "$(cat "$run/$1.pid")"; }
 background() {
     what=$1
     shift
@@ -134,14 +136,19 @@ restart_charon() {
     if running charon; then
         pid=$(cat "$run/charon.pid")
         kill "$pid"
-        while kill -0 "$pid" 2>/dev/null; do sleep 0.1; done
+        tries=0
+        while runs "$pid"; do
+            tries=$((tries + 1))
+            [ "$tries" -ne 100 ] || kill -KILL "$pid" 2>/dev/null || true
+            sleep 0.1
+        done
     fi
     rm -f /run/charon.vici
     background charon charon-systemd
     tries=0
     while [ ! -S /run/charon.vici ]; do
         tries=$((tries + 1))
-        [ "$tries" -lt 150 ] || die "charon does not start: $run/charon.log"
+        [ "$tries" -lt 600 ] || die "charon does not start: $run/charon.log"
         sleep 0.1
     done
 }

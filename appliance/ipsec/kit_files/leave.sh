@@ -7,11 +7,18 @@ set -eu
 cd /
 
 systemd() { [ -d /run/systemd/system ]; }
+# What has ended runs no more, also where process 1 of a container does not collect it.
+runs() { kill -0 "$1" 2>/dev/null && ! grep -q ') Z ' "/proc/$1/stat" 2>/dev/null; }
 stop() {
     pid=$(cat "/run/rosrv/$1.pid" 2>/dev/null) || return 0
     # Each was started in a session of its own, so what it has started ends with it.
     kill -- "-$pid" 2>/dev/null || kill "$pid" 2>/dev/null || true
-    while kill -0 "$pid" 2>/dev/null; do sleep 0.1; done
+    tries=0
+    while runs "$pid"; do
+        tries=$((tries + 1))
+        [ "$tries" -ne 100 ] || kill -KILL -- "-$pid" 2>/dev/null || true
+        sleep 0.1
+    done
     rm -f "/run/rosrv/$1.pid"
 }
 
