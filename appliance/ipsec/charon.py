@@ -74,9 +74,15 @@ class Vici:
         self._stated = stated
 
     def seen(self) -> list[TunnelSeen]:
-        """The tunnels that stand now."""
+        """The tunnels that stand now.
+
+        One of a host that is not wanted is closed again: keys that were just being made anew can outlive an end.
+        """
         with self._said("the list of tunnels"):
             found = [(name, row) for reply in self._session.list_sas() for name, row in reply.items()]
+        standing = {host for name, _ in found if (host := host_of(name)) is not None}
+        for host in sorted(standing - self._loaded.keys()):
+            self._close(host)
         return [one for name, row in found if (one := _seen(name, row)) is not None]
 
     def version(self) -> str:

@@ -8,17 +8,31 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from vici.protocol import Message, Packet
+from vici.protocol import FiniteStream, Message, Packet
 
 from appliance.channel.messages import TunnelsStated
 from appliance.ipsec.charon import CharonError, Vici
+from appliance.ipsec.strongswan import connection_name
+
+_ESTABLISHED = {"state": "ESTABLISHED", "child-sas": {"ros-1": {"state": "INSTALLED"}}}
+
+
+def _listed(tunnel: str) -> bytes:
+    name = b"list-sa"
+    said: bytes = Message.serialize({tunnel: _ESTABLISHED})
+    return bytes([Packet.EVENT, len(name)]) + name + said
 
 
 class StandIn:
-    """A charon that answers every command with success; `events` is what it says to who registers for events."""
+    """A charon that answers every command with success; `events` is what it says to who registers for events.
+
+    `standing` are the names of its tunnels, whatever it is asked to end, `asked` the commands it got.
+    """
 
     def __init__(self, path: Path) -> None:
         self.events = bytes([Packet.EVENT_CONFIRM])
+        self.standing: list[str] = []
+        self.asked: list[tuple[str, dict[str, bytes]]] = []
         self._listener = socket.socket(socket.AF_UNIX)
         self._listener.bind(str(path))
         self._listener.listen()
@@ -31,8 +45,14 @@ class StandIn:
             while header := stream.read(4):
                 packet = stream.read(struct.unpack("!I", header)[0])
                 success = bytes([Packet.CMD_RESPONSE]) + Message.serialize({"success": "yes"})
-                answer = success if packet[0] == Packet.CMD_REQUEST else self.events
-                connection.sendall(struct.pack("!I", len(answer)) + answer)
+                answers = [success if packet[0] == Packet.CMD_REQUEST else self.events]
+                if packet[0] == Packet.CMD_REQUEST:
+                    name, body = packet[2 : 2 + packet[1]].decode(), packet[2 + packet[1] :]
+                    self.asked.append((name, dict(Message.deserialize(FiniteStream(body)))))
+                    if name == "list-sas":
+                        answers[:0] = map(_listed, self.standing)
+                for answer in answers:
+                    connection.sendall(struct.pack("!I", len(answer)) + answer)
 
     def close(self) -> None:
         """End it, after whoever speaks to it."""
@@ -75,3 +95,15 @@ def test_a_list_that_is_too_long_is_said(charon: tuple[StandIn, Vici]) -> None:
     vici.provision(stated(65_535))
     with pytest.raises(CharonError, match="the list of revoked certificates"):
         vici.provision(stated(65_536))
+
+
+def test_what_stands_and_is_not_wanted_is_closed_at_each_look(charon: tuple[StandIn, Vici]) -> None:
+    """An end that charon agreed to is not believed: who is revoked while keys are made anew stays out."""
+    stand_in, vici = charon
+    vici.provision(stated(1))
+    stand_in.standing = [connection_name("gone"), "(unnamed)"]
+    for _ in range(2):
+        stand_in.asked.clear()
+        assert [one.name for one in vici.seen()] == ["gone"]
+        ended = [body["ike"] for name, body in stand_in.asked if name == "terminate"]
+        assert ended == [connection_name("gone").encode()]
