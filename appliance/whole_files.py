@@ -7,13 +7,18 @@ import sys
 from pathlib import Path
 
 
-def write_whole(path: Path, data: bytes, mode: int) -> None:
-    """Replace a file, on the disk when this returns. Raises `OSError`; the file before is then as it was."""
+def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | None = None) -> None:
+    """Replace a file, on the disk when this returns. Raises `OSError`; the file before is then as it was.
+
+    It is of `owner` (user and group), or of who writes it, before it has its name.
+    """
     making = path.with_name(path.name + ".new")
     making.unlink(missing_ok=True)
     descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     try:
         with os.fdopen(descriptor, "wb") as file:
+            if owner is not None:
+                os.fchown(descriptor, *owner)
             os.fchmod(descriptor, mode)  # whatever the mask is: the folder says who comes by
             file.write(data)
             file.flush()
@@ -54,6 +59,4 @@ def write_where_told(path: Path, data: bytes) -> None:
     if not (keeps and stat.S_ISREG(there.st_mode)):
         path.write_bytes(data)
         return
-    place = path.resolve()
-    write_whole(place, data, stat.S_IMODE(there.st_mode))
-    os.chown(place, there.st_uid, there.st_gid)
+    write_whole(path.resolve(), data, stat.S_IMODE(there.st_mode), (there.st_uid, there.st_gid))

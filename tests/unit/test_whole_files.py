@@ -95,3 +95,26 @@ def test_what_goes_to_our_own_output_stands_behind_what_was_said(tmp_path: Path)
     with file.open("a") as output:
         subprocess.run([sys.executable, "-c", program], stdout=output, check=True)
     assert file.read_text() == "before\nsaid\nwritten\ndone\n"
+
+
+def test_a_file_of_another_user_is_its_owners_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever is killed then, or may not give it away, leaves none that its owner cannot read."""
+    need_root()
+    file = tmp_path / "policy.ini"
+    file.write_text("before")
+    file.chmod(0o640)
+    os.chown(file, 12345, 12346)
+    renamed: list[tuple[int, int, int]] = []
+    rename = Path.rename
+
+    def noted(making: Path, name: Path) -> Path:
+        there = making.stat()
+        renamed.append((there.st_uid, there.st_gid, stat.S_IMODE(there.st_mode)))
+        return rename(making, name)
+
+    monkeypatch.setattr(Path, "rename", noted)
+    write_where_told(file, b"after")
+    assert renamed == [(12345, 12346, 0o640)]
+    assert (file.read_bytes(), file.stat().st_uid) == (b"after", 12345)

@@ -169,13 +169,7 @@ class Interpreter:
         return None
 
     def _evaluate(self, node: form.Evaluate, frame: Frame) -> None:
-        value = node.value.value if isinstance(node.value, form.Discard) else node.value
-        if isinstance(value, form.Call) and value.function == "a_slot":
-            base, slot, new = value.arguments
-            given = self.value(new, frame)  # first, as in C++ since 2017: it may give the message anew
-            self.value(base, frame)[self.value(slot, frame)] = given
-        else:
-            self.value(value, frame)
+        self.value(node.value, frame)
 
     def _if(self, node: form.If, frame: Frame) -> str | None:
         return self._block(node.yes if self.value(node.test, frame) else node.no, frame)
