@@ -74,8 +74,12 @@ def back_up(state: Path, file: Path) -> list[str]:
     except BaseException as error:  # Ctrl-C, too
         file.unlink()
         if isinstance(error, (OSError, sqlite3.Error)):
-            advice = "make room there, or name a file elsewhere" if _is_full(error) else _ADVICE
-            raise BackupError(f"the backup was not made: {error}; {advice}") from error
+            reason = f"{error}; {_ADVICE}"
+            if _is_full(error):
+                reason = (
+                    f"{file.absolute().parent}: the disk is full; make room there, or name a file elsewhere"
+                )
+            raise BackupError(f"the backup was not made: {reason}") from error
         raise
     return names
 

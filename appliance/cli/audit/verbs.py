@@ -225,7 +225,7 @@ def export(
         if output is None:
             count = _write_all(entries, told, sys.stdout)
         else:
-            with output.open("x", encoding="ascii") as file, _or_nothing(output):
+            with _new_file(output) as file:
                 count = _write_all(entries, told, file)
     if output is not None:
         tell(f"{count} records in {output}")
@@ -239,12 +239,16 @@ def _print_lines(entries: list[Entry], as_json_lines: bool, *, ocsf: bool) -> No
 
 
 @contextmanager
-def _or_nothing(output: Path) -> Iterator[None]:
-    """A file that is not whole is none."""
+def _new_file(path: Path) -> Iterator[TextIO]:
+    """A file that is not there yet; one that is not whole is none."""
+    file = path.open("x", encoding="ascii")
     try:
-        yield
-    except BaseException:
-        output.unlink()
+        with file:
+            yield file
+    except BaseException as error:
+        path.unlink()
+        if isinstance(error, OSError):  # a full disk: the system does not say of which file
+            error.filename = error.filename or str(path)
         raise
 
 

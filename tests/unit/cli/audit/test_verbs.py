@@ -171,7 +171,7 @@ def test_an_export_that_does_not_fit_leaves_no_file(state: Path, tmp_path: Path,
     try:
         (disk / "full").write_bytes(bytes(4096))
         done = rosrv("export", *what, "--output", str(disk / "out.ndjson"), state=state)
-        assert (done.returncode != 0, "No space left" in done.stderr) == (True, True), done.stderr
+        assert (done.returncode != 0, "out.ndjson: No space left" in done.stderr) == (True, True), done.stderr
         assert [one.name for one in disk.iterdir()] == ["full"]
     finally:
         subprocess.run(["umount", "--lazy", disk], check=True)
