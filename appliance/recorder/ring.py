@@ -152,11 +152,11 @@ class Stream:
         self._place = self._end = 0  # in the memory
         self._used = 0  # the word
 
-    def write(self, frames: memoryview, messages: int, first: int) -> None:
-        """Leave these frames, `first` the number of the first one."""
+    def write(self, frames: memoryview, messages: int, first: int, judged: int = 0) -> None:
+        """Leave these frames, `first` the number of the first one; `judged`: when monitors were given them, or 0."""
         ring = self._ring
         size = len(frames)
-        now = self.written = ring.clock()
+        now = self.written = ring.clock(judged)
         place = self._place
         end = place + RECORD.size + size
         if end <= self._end:
@@ -224,7 +224,7 @@ class RingWriter:
         topic_share: float,
         host_share: float,
         seconds: float,
-        clock: Callable[[], int] = time.time_ns,
+        clock: Callable[[int], int] = lambda judged: judged or time.time_ns(),
     ) -> None:
         self.geometry = geometry(len(memory))
         self.block, self.data = self.geometry.block, self.geometry.data
@@ -268,7 +268,7 @@ class RingWriter:
         chain = self._chains[self._last_stream] = _Chain(shares, (topic, host))
         for number in range(needed):
             part = text[number * self.block : (number + 1) * self.block]
-            block = self.take(self._last_stream, number, HEADER, 0, chain, now=self.clock())
+            block = self.take(self._last_stream, number, HEADER, 0, chain, now=self.clock(0))
             place = self.geometry.data + block * self.block
             self.memory[place : place + len(part)] = part
             self.words[used_at(block)] = len(part)
@@ -391,7 +391,7 @@ class RingWriter:
             chain = self._chains.setdefault(row.stream, _Chain())
             if row.kind == DATA:
                 chain.data += 1
-                self._order[block] = row.stream, self.clock()
+                self._order[block] = row.stream, self.clock(0)
             else:
                 chain.headers.append(block)
                 self._headers += 1

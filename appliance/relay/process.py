@@ -66,7 +66,7 @@ class RelayProcess:
         elif isinstance(message, LinkOpened) and message.role == "control":
             self._open_control(socket.socket(fileno=descriptors[0]))
         elif isinstance(message, RingGiven):
-            self._engine.record(Recorded(message, descriptors[0]))
+            self._engine.record(Recorded(message, descriptors[0], self._engine.middle.now))
         else:
             raise TypeError(f"the supervisor sent a relay {type(message).__name__}")
 

@@ -26,6 +26,9 @@ censor() {
         if (text.size() > 2) { return; }
     }
 }
+dated() {
+    event said() /dated std_msgs/String '{}' { ROS_INFO("%ld", ros::Time::now().toNSec()); }
+}
 """
 CONFIGURATION = """
 recorder:
@@ -104,6 +107,20 @@ def said(ros: RosSession, bag: Path, topic: str) -> list[str]:
         "    print(text)"
     )
     return ros.run("/usr/bin/python3", "-c", program, str(bag), topic).stdout.splitlines()
+
+
+def test_a_recording_has_the_time_that_monitors_had(
+    appliance: Appliance, ros: RosSession, tmp_path: Path
+) -> None:
+    """To the nanosecond: what they do with time, and what follows from it, comes out the same again."""
+    ros.talker("rospy", "/dated")
+    lines = appliance.recorded(event="monitor log", count=15)
+    appliance.rosrv("record", "now", "--before", "1m", "--after", "1s")
+    bag = fetched(appliance, recordings(appliance)[0]["id"], tmp_path)
+    (tmp_path / "dated.rv").write_text(MONITOR)
+    again = rosrv("monitor", "run", str(tmp_path / "dated.rv"), "--bag", str(bag), "--json").stdout
+    told = {line["text"] for record in again.splitlines() for line in json.loads(record)["log"]}
+    assert {line["reason"] for line in lines if not line["detail"].get("count")} <= told
 
 
 def viewers_see_no_contents(appliance: Appliance, dropped: str) -> None:

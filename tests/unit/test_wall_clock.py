@@ -11,6 +11,7 @@ READERS = {
         "control/recording_orders.py", "evidence/bundle.py", "forwarding/forwarder.py",
         "hosts/checked_ports.py", "hosts/table.py",
         "recorder/recorder.py", "recorder/ring.py", "relay/looks.py", "relay/monitors/middle.py",
+        "relay/recorder_ring.py",
         "specifications/monitors.py", "supervisor/life.py", "supervisor/rings.py", "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [

@@ -44,10 +44,10 @@ class Batch:
 
     `last` is where the last of the `messages` frames begins, None if that has to be looked for; `stride` the bytes of
     each of the frames if they are known to be equally long, else 0. `first` is the number of the first frame among
-    those of its publication.
+    those of its publication. `judged` is when monitors were given them, by their clock; 0: they were not.
     """
 
-    __slots__ = ("_kept", "_owned", "first", "last", "messages", "stride", "view")
+    __slots__ = ("_kept", "_owned", "first", "judged", "last", "messages", "stride", "view")
 
     def __init__(
         self, view: memoryview, messages: int, last: int | None, *, owned: bool = False, stride: int = 0
@@ -57,6 +57,7 @@ class Batch:
         self.last = last
         self.stride = stride
         self.first = 1
+        self.judged = 0
         self._owned = owned
         self._kept: memoryview | None = None
 

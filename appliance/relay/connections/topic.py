@@ -287,13 +287,14 @@ class RelayedTopic:
         messages, first = batch.messages, batch.first
         self._pass(batch, since)
         if recording is self._recording:
-            recording.write(view, messages, first)
+            recording.write(view, messages, first, batch.judged)
 
     def _pass(self, batch: Batch, since: float) -> None:
         """What a limit lets pass goes on."""
         passing = self.flow.passing(batch, self._clock(), latching=self._latching)
         if passing is not None:
             self._admit(passing, since)
+            batch.judged = passing.judged
 
     def _admit(self, batch: Batch, since: float) -> None:
         left = batch if self.through is None else self.through(batch)

@@ -92,7 +92,7 @@ class Lane:
     def through(self, batch: Batch) -> Batch | None:
         """The frames that go on, as the monitors leave them; None when none does."""
         middle = self._middle
-        now = middle.now()
+        now = batch.judged = middle.now()
         if self._sight is not middle.sight or now >= self._until or batch.messages > _MANY:
             return self._through(batch, Passage(batch, now))
         assert self._walker is not None  # noqa: S101  `_prepare` has found one

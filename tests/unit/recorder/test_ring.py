@@ -36,9 +36,9 @@ class Clock:
     def __init__(self, now: int = 1) -> None:
         self.now = now
 
-    def __call__(self) -> int:
+    def __call__(self, judged: int = 0) -> int:
         """The time now."""
-        return self.now
+        return judged or self.now
 
 
 def ring(memory: memoryview, clock: Clock | None = None) -> RingWriter:

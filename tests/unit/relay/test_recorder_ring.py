@@ -2,7 +2,8 @@
 
 import mmap
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -15,9 +16,9 @@ from tests.unit.relay.connections.test_topic import HEADER, Story, batch
 EVER = 0, 1 << 63
 
 
-def given(descriptor: int, *, never: tuple[str, ...] = ()) -> Recorded:
+def given(descriptor: int, *, never: tuple[str, ...] = (), now: Callable[[], int] = time.time_ns) -> Recorded:
     """The recorder of a relay."""
-    return Recorded(RingGiven(0, 1, 60, ["/chat*"], list(never)), os.dup(descriptor))
+    return Recorded(RingGiven(0, 1, 60, ["/chat*"], list(never)), os.dup(descriptor), now)
 
 
 @pytest.fixture
@@ -62,6 +63,23 @@ def test_what_is_never_to_be_recorded_is_not(memory: int, never: tuple[str, ...]
     assert given(memory, never=never).open("/chatter", "10.0.0.1", header) is None
     assert given(memory).open("/other", "10.0.0.1", header) is None
     assert given(memory).open("/chatter", "10.0.0.1", header) is not None
+
+
+def test_what_was_judged_has_the_time_of_that_until_the_clock_is_set(
+    memory: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what nobody judged that of when it was recorded; a clock that was set is followed, by as much."""
+    second, wall = 10**9, 5000 * 10**9
+    monkeypatch.setattr(time, "time_ns", lambda: wall)
+    stream = given(memory, now=lambda: 5000 * second + 7).open("/chatter", "10.0.0.1", HEADER)
+    assert stream is not None
+    stream.write(batch(b"1").view, 1, 1, 4999 * second)
+    stream.write(batch(b"2").view, 1, 2)
+    wall += 60 * second
+    stream.write(batch(b"3").view, 1, 3, 5000 * second)
+    reader = RingReader(memoryview(mmap.mmap(memory, 0, prot=mmap.PROT_READ)))
+    [found] = reader.read(*EVER)
+    assert [one.time for one in found.batches] == [4999 * second, 5000 * second + 7, 5060 * second - 7]
 
 
 @pytest.mark.parametrize("size", [10, 100_000])
