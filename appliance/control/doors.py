@@ -4,6 +4,7 @@ A stranger (an address that no rule of the policy names) is refused by the begin
 asked for; while the real ROS Master is not hidden, everybody is refused.
 """
 
+import asyncio
 import socket
 from collections.abc import Callable
 from functools import partial
@@ -71,6 +72,10 @@ class Doors:
         )
         self._servers.append(server)
         await server.start()
+
+    async def sweep(self) -> None:
+        """Close the connections of all listeners whose time is over; runs until cancelled."""
+        await asyncio.gather(self.visitors.sweep(), self._own_visitors.sweep())
 
     def close(self) -> None:
         """Serve nobody any more."""

@@ -278,7 +278,7 @@ class _Control:
         for work in (
             parts.reconciler.run(),
             parts.liveness.run(),
-            base.doors.visitors.sweep(),
+            base.doors.sweep(),
             SpareMemory().watch(),
             self._clock.watch(),
             self._save_parameters(),

@@ -1,0 +1,47 @@
+"""Who is let in to the listeners of control, and until when."""
+
+import asyncio
+import dataclasses
+import socket
+from pathlib import Path
+
+import pytest
+
+from appliance.audit.log import AuditLog
+from appliance.audit_trail import AuditTrail
+from appliance.config import Settings
+from appliance.control.doors import Doors
+from appliance.policy.compiler import compile_policy
+from appliance.rpc.server import HttpRequest
+from appliance.shares.pool import Standing
+
+pytestmark = pytest.mark.anyio
+
+WAIT = 30.0
+CALL = b"POST / HTTP/1.1\r\nHost: here\r\nContent-Length: 1\r\n\r\n?"
+
+
+@pytest.mark.parametrize("guarded", [True, False])
+async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *, guarded: bool) -> None:
+    """Also where the ROS Master calls, which keeps a connection to each node that ever was."""
+    given = Settings()
+    settings = dataclasses.replace(given, limits=dataclasses.replace(given.limits, idle_seconds=0.1))
+    policy = compile_policy("[Nodes]\ndefault = *\n", file="a.ini")
+    log = AuditLog(tmp_path / "audit.db")
+    trail = AuditTrail(log, strict=False, deny_when_failed=False)
+    doors = Doors(settings, trail, lambda: policy, lambda _host: Standing.NAMED)
+
+    async def answer(_request: HttpRequest) -> bytes:
+        return b"!"
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        await doors.open(listener, answer, guarded=guarded)
+        sweep = asyncio.get_running_loop().create_task(doors.sweep())
+        reader, writer = await asyncio.open_connection(*listener.getsockname())
+        writer.write(CALL)
+        async with asyncio.timeout(WAIT):
+            assert (await reader.read()).endswith(b"!")
+        writer.close()
+        sweep.cancel()
+        doors.close()
+    log.close()
