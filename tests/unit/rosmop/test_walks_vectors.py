@@ -61,7 +61,7 @@ STATEMENTS = (
     "if (a == b) { n++; }", "std::sort(a.begin(), a.end());", "std::reverse(b.begin(), b.end());",
     "if (x == 1) { values[0] = 3; }", "if (x == 6) { values = d; n += values.size(); DROP; }",
     "if (x == 7) { for (auto one : b) { b.push_back(one); if (b.size() > 9) { break; } } }",
-    "keep(d);", "keep(values);", "n += least(d);", "n += size();", "a.push_back(size());", "b[size()] = 1;", "again();",
+    "keep(values);", "n += least(d);", "n += size();", "a.push_back(size());", "b[size()] = 1;", "again();",
     "f[0] = f[1] = 3;", "a[a.size() - 1] = b[b.size() - 1];", 'ROS_INFO("%f %d", n, (int) a.size());',
     "std::cout << b[0] << std::endl;",
 )  # fmt: skip
@@ -137,7 +137,7 @@ def test_nothing_of_that_is_for_the_engine(body: str) -> None:
 
 BEYOND = (
     "std::reverse(b.begin(), b.end());", "if (a == b) { n++; }", "values[0] = x;", "a = made();", "grow(a);",
-    "for (auto one : b) { b.push_back(one); if (n++ > 5) { break; } }", "b[size()] = 1;", "w[0].push_back(x);",
+    "for (auto one : b) { b.push_back(one); if (n++ > 5) { break; } }", "w[0].push_back(x);",
     "n = b[(b = a)[0]];", "a = x ? b : d;", "t.push_back(when);",
 )  # fmt: skip
 
