@@ -1,4 +1,4 @@
-"""Faults in what writes the modules of events are found: each instruction of two events, wrong in every way.
+"""Faults in what writes the modules of events are found: each instruction of three events, wrong in every way.
 
 A wrong operand, constant, operation, comparison, sign, width, offset; a check that is left out or turned round.
 """
@@ -20,6 +20,9 @@ def test_every_fault_is_found_or_none(text: str) -> None:
     told = Counter(faulty(FAULTY[text]))
     kinds, answers = {kind for kind, _ in told}, {answer for _, answer in told}
     assert kinds == {*FAULTS, "operand"}
-    assert answers == {"equal", "not equal"}
+    unproved = {
+        "uses an element of a message that is made, kept or published"
+    }  # an address that is not constant
+    assert answers - unproved == {"equal", "not equal"}
     found = sum(count for (_, answer), count in told.items() if answer == "not equal")
     assert found > 90

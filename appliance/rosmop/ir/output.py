@@ -33,6 +33,7 @@ class Line:
     """A line: the `values` that it is made of, and how many bytes it may have besides those of its strings."""
 
     def __init__(self, node: form.Log, context: str) -> None:
+        self.node = node
         self.level = node.level
         self.context = context
         self.values: list[form.Expression] = []
@@ -87,13 +88,13 @@ class Publication:
         self.context = context
         self.cost = OUTPUT_COST + room
         self.size = HEAD.size + -(-room // 8) * 8
-        self._node = node
+        self.node = node
         self._room = room
         self._texts = texts
 
     def put_out(self, memory: memoryview, at: int, monitor: str) -> Published:
         """The message that stands there."""
-        node, begin = self._node, at + HEAD.size
+        node, begin = self.node, at + HEAD.size
         if not self._texts:
             data = bytes(memory[begin : begin + self._room])
             return Published(monitor, node.topic, node.kind.name, data, node.site)

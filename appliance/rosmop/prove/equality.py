@@ -5,9 +5,9 @@ function leaves the message to Python (which then judges it anew), or
 
 - the form does not fault,
 - both say the same of whether the event happened, dropped the message, changed it,
-- and the bytes of the message, the variables and what is left of the budget are the same. (What lines of output say is
-  not compared, and an event that looks at a string, vector or message that is kept, or changes or makes one, or
-  publishes, is not proved.)
+- the bytes of the message, the variables and what is left of the budget are the same,
+- and so is what is put out and published, in its order. (An event that looks at a string or vector that is kept, or
+  changes or makes one, is not proved.)
 
 Where it leaves the message, the walk takes back what it has done: each variable that it has written stands among those
 that are taken back, and each byte in the log (`module_terms.py`).
@@ -23,15 +23,16 @@ from appliance.rosmop.compile.program import groups
 from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.feed import AREA, FeedModule, module_of
-from appliance.rosmop.ir.values import Values
+from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.prove.decoding import functions_of
 from appliance.rosmop.prove.form_terms import Meaning, wrapped
-from appliance.rosmop.prove.module_terms import Done, Execution
+from appliance.rosmop.prove.module_terms import Done, Execution, made_at
 from appliance.rosmop.prove.terms import (
     DOUBLE,
     SINGLE,
     Beginning,
     DiffersError,
+    Noted,
     NotProvedError,
     Result,
     Term,
@@ -40,6 +41,7 @@ from appliance.rosmop.prove.terms import (
     both,
     either,
     integer,
+    number_at,
     opposite,
 )
 from appliance.rosmop.runtime.context import BUDGET
@@ -108,11 +110,20 @@ class Validation:
         self._clock = clock
         self._patience = patience
         self.codes = functions_of(module.code)
-        kept = [at for own in module.cells for at in own.kept]
+        kept = [at for own in module.cells for name in own.variables for at in own.texts_of(name)]
         kept += [own.variables[name][0] for own in module.cells for name in own.vectors]
         self._strings = [range(at, at + 8) for at in kept]
         self._strings += [range(at, at + len(raw)) for raw, at in module.strings.items()]
         self._strings += module.rooms
+        self._lasting = [
+            *(range(at, at + 8) for own in module.cells for at in own.known.values()),
+            *(range(at, at + 8) for at in module.publications.values()),
+            *(
+                range(at, at + own.sizes[name])
+                for own in module.cells
+                for name, (at, _) in own.records.items()
+            ),
+        ]
 
     def finding(self, topic: str, event: str, function: str, place: int) -> Finding:
         """What is known of the event that is at this place among those of a topic."""
@@ -127,10 +138,11 @@ class Validation:
             return Finding(topic, event, str(error))
 
     def _compared(self, name: str, number: int, topic: str) -> str:
-        begin, cells, known = self._beginning()
-        meant = Meaning(self._forms, self._values, begin, name).result()
+        begin, cells, made, known = self._beginning()
+        module = self._module
+        meant = Meaning(self._forms, self._values, begin, name, module.lines, module.strings).result()
         done = Execution(
-            self.codes, number, begin.message, begin.size, cells, self._strings, self._module.places
+            self.codes, number, begin.message, begin.size, cells, self._strings, module.places, made
         ).done()
         self._check_undone(done, topic)
         left = either(done.trapped, done.bits == _ELSEWHERE)
@@ -149,6 +161,15 @@ class Validation:
                 f"the variable at {place}": opposite(_same(done.cells[place], value))
                 for place, value in self._ends(meant)
             },
+            **{
+                f"the message that is kept at {place}": made_at(done.slots, place, part.size() // 8) != part
+                for place, part in self._kept_ends(meant)
+            },
+            "how much is put out": done.said != meant.said,
+            **{
+                f"what is put out ({place})": both(noted.alive, opposite(_among(noted, done.lines)))
+                for place, noted in enumerate(meant.noted)
+            },
         }
         decided = both(opposite(left), opposite(meant.left), opposite(unknown))
         wrong |= {text: both(decided, condition) for text, condition in others.items()}
@@ -163,17 +184,11 @@ class Validation:
 
     def _first(self, known: Sequence[Term], wrong: Mapping[str, Term]) -> str | None:
         """Why they are not known to be equal; None if they are. Raises `DiffersError`."""
-        open_ones = {
-            text: condition for text, condition in wrong.items() if not z3.is_false(z3.simplify(condition))
-        }
         begun = self._clock()
-        if (
-            not open_ones
-            or self._asked(abstracted([*known, either(*open_ones.values())]), begun)[0] == z3.unsat
-        ):
-            return None
         undecided = False
-        for text, condition in open_ones.items():
+        for text, condition in wrong.items():
+            if z3.is_false(z3.simplify(condition)):
+                continue
             question = [*known, condition]
             answer, guess = self._asked(abstracted(question), begun)
             if answer != z3.unsat:
@@ -196,12 +211,13 @@ class Validation:
         answer = solver.check()
         return answer, solver.model() if answer == z3.sat else None
 
-    def _beginning(self) -> tuple[Beginning, dict[int, Term], list[Term]]:
-        """What every event may begin with; the same as the module's cells; and what is known of it."""
+    def _beginning(self) -> tuple[Beginning, dict[int, Term], Term, list[Term]]:
+        """What every event may begin with; the same as the module's cells and messages; and what is known of it."""
+        made = z3.Array("made", z3.BitVecSort(32), z3.BitVecSort(8))
         now, size = z3.BitVec("now", 64), z3.BitVec("size", 32)
         known = [now >= 0, now < _LATEST, z3.ULE(size, AREA)]
         cells: dict[int, Term] = {_NOW: now, _REST: integer(0, 64)}
-        variables: dict[str, Term] = {}
+        variables: dict[str, Any] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
                 if isinstance(kind, kinds.String | kinds.Vector):
@@ -210,6 +226,10 @@ class Validation:
                 if isinstance(kind, kinds.Time | kinds.Duration):
                     most = MAX_TIME + (1 << 32)
                     known += [variables[name] >= -most, variables[name] <= most]
+            for name, (address, kind) in component.records.items():
+                variables[name] = tuple(
+                    number_at(made, integer(address + at, 32), size) for at, size in self._parts(kind)
+                )
         budgets = {context: z3.BitVec(f"budget of {context}", 64) for context in self._module.budgets}
         for context, address in self._module.budgets.items():
             known += [budgets[context] >= 0, budgets[context] <= BUDGET]
@@ -219,7 +239,26 @@ class Validation:
             known.append(throttles[key] >= 0)
             cells[address] = throttles[key]
         message = z3.Array("message", z3.BitVecSort(32), z3.BitVecSort(8))
-        return Beginning(message, size, now, variables, budgets, throttles), cells, known
+        return Beginning(message, size, now, variables, budgets, throttles), cells, made, known
+
+    def _parts(self, kind: Type, at: int = 0) -> Iterator[tuple[int, int]]:
+        """Where each number and string of a message that is kept stands in it, and its bytes."""
+        if not isinstance(kind, kinds.Record):
+            yield at, 8 if isinstance(kind, kinds.String) else struct_size(struct_code(kind) or "")
+            return
+        end = at
+        for field in self._values.fields(kind):
+            for place, size in self._parts(field, at):
+                yield place, size
+                end = place + size
+            at = end
+
+    def _kept_ends(self, meant: Result) -> Iterator[tuple[int, Term]]:
+        """What must stand at the end in messages that are kept, and where."""
+        for component in self._module.cells:
+            for name, (address, kind) in component.records.items():
+                for (at, _), part in zip(self._parts(kind), meant.variables[name], strict=True):
+                    yield address + at, part
 
     def _ends(self, meant: Result) -> Iterator[tuple[int, Term]]:
         """What each cell must hold at the end."""
@@ -232,7 +271,17 @@ class Validation:
 
     def _check_undone(self, done: Done, topic: str) -> None:
         taken_back = {address for address, _ in self._module.feeds[topic].undo}
-        for address in sorted(done.stored - taken_back - set(self._module.budgets.values())):
+        scratch = set(self._module.budgets.values()) | {
+            address
+            for address in done.stored
+            if any(address in place for place in self._module.places)
+            and not any(address in place for place in self._lasting)
+        }
+        words = {
+            address if address % 8 == 0 else address - address % 8: address
+            for address in done.stored - scratch
+        }
+        for address in sorted(words.keys() - taken_back):
             raise DiffersError(f"what it writes at {address} is not taken back")
 
 
@@ -259,6 +308,12 @@ def _example(model: Any) -> str:
 def _same(held: Term, value: Term) -> Term:
     """Whether a cell holds a value; a truth may be one by its bits."""
     return held == (as_bits(value) if z3.is_bool(value) and not z3.is_bool(held) else value)
+
+
+def _among(noted: Noted, lines: Term) -> Term:
+    """Whether one of what may stand there does."""
+    held = number_at(lines, noted.offset, noted.allowed[0].size() // 8) if noted.allowed else None
+    return either(*(held == one for one in noted.allowed))
 
 
 def _bit(bits: Term, which: int) -> Term:

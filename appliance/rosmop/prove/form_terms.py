@@ -7,7 +7,7 @@
 - What it measures of the values that a specification holds, once in a megabyte that it says it will make, is left out.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -15,14 +15,17 @@ from typing import Any
 import z3
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.output import BYTES, Line
+from appliance.rosmop.ir.output import BYTES, HEAD, Line, Publication
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.prove.terms import (
+    AT,
     DOUBLE,
+    FRAME,
     MIXED,
     NEAREST,
     SINGLE,
     Beginning,
+    Noted,
     NotProvedError,
     Result,
     State,
@@ -39,12 +42,12 @@ from appliance.rosmop.prove.terms import (
     with_number,
 )
 from appliance.rosmop.runtime import times
-from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, UNMEASURED
+from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, OUTPUT_COST, UNMEASURED
 from appliance.rosmop.runtime.wire import MAX_EMPTY
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
-_MESSAGE, _DROPPED, _CHANGED, _BUDGET = "message", "dropped", "changed", "budget"
+_MESSAGE, _DROPPED, _CHANGED, _BUDGET, _SAID = "message", "dropped", "changed", "budget", "said"
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,10 @@ class _View:
     message: Term
     start: Term
     count: Term
+
+
+_Made = tuple[Term, ...]
+"""A message that is made or kept: the bits of each of its numbers, as they are sent; of a string address and length."""
 
 
 class UnknownError(Exception):
@@ -77,12 +84,37 @@ def wrapped(value: Term, kind: kinds.Integer) -> Term:
     return (z3.SignExt if kind.signed else z3.ZeroExt)(32 - kind.bits, z3.Extract(kind.bits - 1, 0, value))
 
 
-class Meaning:
-    """One event. `functions` are those of its set, `values` the types of its messages."""
+def _text(view: _View) -> Term:
+    """Where a string of the message stands, and how long it is."""
+    return z3.Concat(z3.Extract(31, 0, view.count), AT + z3.Extract(31, 0, view.start))
 
-    def __init__(
-        self, functions: Mapping[str, form.Function], values: Values, beginning: Beginning, name: str
+
+def _word(value: Term, kind: Type) -> Term:
+    """A number as it stands in a line."""
+    if isinstance(kind, kinds.Floating):
+        return z3.fpToIEEEBV(value if kind.bits == 64 else z3.fpFPToFP(NEAREST, value, DOUBLE))
+    bits = as_bits(value) if z3.is_bool(value) else value
+    return bits if bits.size() == 64 else (z3.SignExt if is_signed(kind) else z3.ZeroExt)(32, bits)
+
+
+class Meaning:
+    """One event. `functions` are those of its set, `values` the types of its messages; `lines` are what the module puts
+    out, by number, and `strings` where constants stand in it.
+    """
+
+    def __init__(  # noqa: PLR0917  as `result` names them
+        self,
+        functions: Mapping[str, form.Function],
+        values: Values,
+        beginning: Beginning,
+        name: str,
+        lines: Sequence[Line | Publication] = (),
+        strings: Mapping[bytes, int] = MappingProxyType({}),
     ) -> None:
+        self._lines = lines
+        self._strings = strings
+        self._noted: list[Noted] = []
+        self._context = functions[name].context
         self._functions = functions
         self._values = values
         self._beginning = beginning
@@ -100,6 +132,7 @@ class Meaning:
         begin, no = self._beginning, z3.BoolVal(False)
         budget = begin.budgets[self._function.context]
         slots: dict[Any, Any] = {_MESSAGE: begin.message, _DROPPED: no, _CHANGED: no, _BUDGET: budget}
+        slots[_SAID] = integer(0, 32)
         slots |= {("shared", name): value for name, value in begin.variables.items()}
         state = State(z3.BoolVal(True), slots)
         self._block(self._function.body, state)
@@ -112,7 +145,7 @@ class Meaning:
         variables = {name: end["shared", name] for name in begin.variables}
         return Result(
             either(*self._left), unknown, happened, end[_DROPPED], end[_CHANGED], end[_MESSAGE], variables,
-            {**begin.budgets, self._function.context: end[_BUDGET]},
+            {**begin.budgets, self._function.context: end[_BUDGET]}, end[_SAID], self._noted,
         )  # fmt: skip
 
     # Ends
@@ -200,19 +233,50 @@ class Meaning:
     def _drop(self, _node: form.Drop, state: State) -> None:
         state.slots[_DROPPED] = z3.BoolVal(True)
 
-    def _publish(self, _node: form.Publish, _state: State) -> None:
-        raise UnknownError("a message that is published")
+    def _publish(self, node: form.Publish, state: State) -> None:
+        made = self._leaves(node.kind, node.value, state)
+        kinds_of = list(self._kinds(node.kind))
+        size = sum(leaf.size() // 8 for leaf in made)
+        cost = integer(OUTPUT_COST + size, 64)
+        for leaf, kind in zip(made, kinds_of, strict=True):
+            if isinstance(kind, kinds.String):
+                cost = cost + z3.ZeroExt(32, z3.Extract(63, 32, leaf))
+        self._put_out(node, made, cost, state)
 
     def _log(self, node: form.Log, state: State) -> None:
-        """A line costs the most that it can; that the module keeps the right values for it is not looked at."""
+        """A line costs the most that it can."""
         line = Line(node, "")
-        cost = integer(line.cost, 64)
-        for value in (self._value(expression, state) for expression in line.values):
-            cost = cost + (z3.UDiv(value.count, integer(BYTES, 64)) if isinstance(value, _View) else 0)
+        cost, words = integer(line.cost, 64), []
+        for expression in line.values:
+            value = self._value(expression, state)
+            if isinstance(value, _View):
+                cost = cost + z3.UDiv(value.count, integer(BYTES, 64))
+                words.append(_text(value))
+            else:
+                words.append(_word(value, expression.type))
+        self._put_out(node, words, cost, state)
+
+    def _put_out(
+        self, node: form.Log | form.Publish, parts: Sequence[Term], cost: Term, state: State
+    ) -> None:
+        """Note a line or publication: its number among those of the module, the frame, and its parts."""
+        numbers = [
+            integer(number, 32)
+            for number, line in enumerate(self._lines)
+            if line.node is node and line.context == self._context
+        ]
         self._spend(cost, state)
+        begin = state.slots[_SAID]
+        self._noted += (Noted(state.alive, begin, numbers), Noted(state.alive, begin + 4, [FRAME]))
+        offset = HEAD.size
+        for part in parts:
+            self._noted.append(Noted(state.alive, begin + offset, [part]))
+            offset += part.size() // 8
+        state.slots[_SAID] = begin + (offset + 7 & ~7)
 
     def _pending(self, node: form.Pending, state: State) -> None:
         """Only `Whole` asks for it."""
+        state.slots[self._frame, node.name] = node.writes
 
     def _require(self, node: form.Require, state: State) -> None:
         test = self._value(node.test, state)
@@ -268,11 +332,14 @@ class Meaning:
             state.slots[self._frame, name] = self._number(state.slots[_MESSAGE], place, kind)
 
     def _number(self, message: Term, place: Term, kind: Type) -> Term:
+        return self._decoded(number_at(message, place, self._size(kind)), kind)
+
+    def _decoded(self, bits: Term, kind: Type) -> Term:
+        """The number that these bytes are."""
         if isinstance(kind, kinds.Time | kinds.Duration):
             extend = z3.ZeroExt if kind == kinds.TIME else z3.SignExt
-            seconds, rest = (extend(32, number_at(message, place + more, 4)) for more in (0, 4))
+            seconds, rest = (extend(32, z3.Extract(more + 31, more, bits)) for more in (0, 32))
             return seconds * integer(times.BILLION, 64) + rest
-        bits = number_at(message, place, self._size(kind))
         if isinstance(kind, kinds.Bool):
             return bits != 0
         if isinstance(kind, kinds.Floating):
@@ -354,6 +421,116 @@ class Meaning:
         rest = z3.If(rest < 0, rest + billion, rest)
         return (value - rest) / billion, rest
 
+    # Messages that are made or kept
+
+    def _kinds(self, kind: Type) -> Iterator[Type]:
+        """The types of the numbers, times and strings in a value, in order."""
+        parts: Sequence[Type] = self._values.fields(kind) if isinstance(kind, kinds.Record) else ()
+        if isinstance(kind, kinds.Vector):
+            if kind.length is None:
+                raise UnknownError("an array of any length in a message that is made")
+            parts = [kind.element] * kind.length
+        elif not isinstance(kind, kinds.Record):
+            yield kind
+        for part in parts:
+            yield from self._kinds(part)
+
+    def _leaves(self, kind: Type, node: form.Expression, state: State) -> _Made:
+        """A value as it stands in a message that is made."""
+        if isinstance(kind, kinds.String) and isinstance(node, form.Literal | form.Zero):
+            raw = node.value if isinstance(node, form.Literal) else b""
+            place = self._strings.get(raw) if isinstance(raw, bytes) else None
+            if not isinstance(raw, bytes) or place is None:
+                raise UnknownError("a constant string")
+            return (z3.Concat(integer(len(raw), 32), integer(place, 32)),)
+        value = self._value(node, state)
+        if isinstance(value, tuple):
+            return value
+        if not isinstance(value, _View):
+            return (self._packed(value, kind, state),)
+        if isinstance(kind, kinds.String):
+            return (_text(value),)
+        found, offset = [], 0
+        for leaf in self._kinds(kind):
+            number = self._part(value, offset, leaf)
+            found.append(self._packed(number, leaf, state))
+            offset += self._size(leaf)
+        return tuple(found)
+
+    def _span(self, kind: Type, number: int) -> tuple[int, int]:
+        """Where a field or element begins among the parts of a value, and ends."""
+        if isinstance(kind, kinds.Vector):
+            size = len(list(self._kinds(kind.element)))
+            return number * size, (number + 1) * size
+        assert isinstance(kind, kinds.Record)  # noqa: S101  what has parts is one of the two
+        counts = [len(list(self._kinds(field))) for field in self._values.fields(kind)]
+        begin = sum(counts[:number])
+        return begin, begin + counts[number]
+
+    def _path(self, node: form.Expression) -> tuple[form.Read, int]:
+        """The variable that a place is in, and where it begins among its parts."""
+        if isinstance(node, form.Item):
+            variable, begin = self._path(node.base)
+            return variable, begin + self._span(node.base.type, node.number)[0]
+        if not isinstance(node, form.Read):
+            raise UnknownError("an element of a message that is made")
+        return node, 0
+
+    def _change(self, node: form.Call, state: State) -> Any:
+        """Put a value into a field, or an element that is known."""
+        base, where, new = node.arguments
+        number = where.value if isinstance(where, form.Literal) else None
+        if not isinstance(number, int) or form.acts(new):
+            raise UnknownError("an element of a message that is made")
+        variable, begin = self._path(base)
+        whole = self._read(variable, state)
+        if not isinstance(whole, tuple):
+            raise UnknownError("a message that is changed")
+        if isinstance(base.type, kinds.Vector):
+            self._leave_to_python(state, z3.BoolVal(not 0 <= number < (base.type.length or 0)))
+        first, last = (begin + one for one in self._span(base.type, number))
+        kind = new.type if isinstance(base.type, kinds.Vector) else self._field(base.type, number)
+        put = self._leaves(kind, new, state)
+        own = (self._frame, variable.name)
+        state.slots[own if own in state.slots else ("shared", variable.name)] = (
+            *whole[:first],
+            *put,
+            *whole[last:],
+        )
+
+    def _field(self, kind: Type, number: int) -> Type:
+        assert isinstance(kind, kinds.Record)  # noqa: S101  what has slots
+        return self._values.fields(kind)[number]
+
+    def _whole(self, node: form.Whole, state: State) -> Any:
+        """The message at hand, with the fields that were assigned."""
+        self._make(z3.ZeroExt(32, self._beginning.size), state)
+        at, found = form.Spot(None, 0), []
+        for number, kind in enumerate(self._kinds(node.type)):
+            if isinstance(kind, kinds.String):
+                name = f"text {number} of {node.pending}"
+                self._read_value(form.ReadValue(-1, name, f"{name} end", at, kind), state)
+                found.append(_text(state.slots[self._frame, name]))
+                at = form.Spot(f"{name} end", 0)
+                continue
+            self._within(at, self._size(kind), state)
+            value = self._number(state.slots[_MESSAGE], self._place(at, state), kind)
+            found.append(self._packed(value, kind, state))
+            at = at.plus(self._size(kind))
+        for write in state.slots[self._frame, node.pending]:
+            flag, kind, begin = state.slots[self._frame, write.flag], node.type, 0
+            for step in write.path:
+                if not isinstance(step, int):
+                    raise UnknownError("a part of a time that was assigned")
+                begin += self._span(kind, step)[0]
+                kind = kind.element if isinstance(kind, kinds.Vector) else self._field(kind, step)
+            wanted = state.where(flag)
+            put = self._leaves(kind, write.value, wanted)
+            state.alive = either(wanted.alive, state.where(opposite(flag)).alive)
+            for place, leaf in enumerate(put, begin):
+                found[place] = choice(flag, leaf, found[place])
+        return tuple(found)
+
     # Expressions
 
     def _value(self, node: form.Expression, state: State) -> Any:
@@ -375,11 +552,16 @@ class Meaning:
         return z3.BoolVal(bool(value)) if isinstance(kind, kinds.Bool) else integer(value, width(kind))
 
     def _zero(self, node: form.Zero, state: State) -> Any:
+        if isinstance(node.type, kinds.Record):
+            return tuple(self._nothing(kind) for kind in self._kinds(node.type))
         if isinstance(node.type, kinds.Floating):
             return self._literal(form.Literal(node.type, 0.0), state)
         if not isinstance(node.type, kinds.Bool | kinds.Integer | kinds.Time | kinds.Duration):
             raise UnknownError(f"a zero of type {node.type}")
         return self._whole_number(0, node.type)
+
+    def _nothing(self, kind: Type) -> Term:
+        return integer(0, 64 if isinstance(kind, kinds.String) else 8 * self._size(kind))
 
     def _read(self, node: form.Read, state: State) -> Any:
         own, shared = (self._frame, node.name), ("shared", node.name)
@@ -390,7 +572,11 @@ class Meaning:
 
     def _assign(self, node: form.Assign, state: State) -> Any:
         value = self._value(node.value, state)
+        if isinstance(value, tuple) and isinstance(node.value, form.Read | form.Item | form.Assign):
+            raise UnknownError("two names of one message")
         where: int | str = "shared" if node.name in self._shared else self._frame
+        if isinstance(node.type, kinds.Record) and isinstance(value, _View) and where == "shared":
+            value = self._leaves(node.type, node.value, state)
         if where == "shared" and node.name not in self._beginning.variables:
             raise UnknownError(f"a variable of type {node.type}")
         state.slots[where, node.name] = value
@@ -565,6 +751,12 @@ class Meaning:
 
     def _item(self, node: form.Item, state: State) -> Any:
         view = self._value(node.base, state)
+        if isinstance(view, tuple):
+            if isinstance(node.type, kinds.String):
+                raise UnknownError("a string in a message that is made")
+            first, last = self._span(node.base.type, node.number)
+            made = isinstance(node.type, kinds.Record | kinds.Vector)
+            return view[first:last] if made else self._decoded(view[first], node.type)
         if not isinstance(view, _View) or not isinstance(node.base.type, kinds.Record):
             raise UnknownError("a part of a value")
         before = self._values.fields(node.base.type)[: node.number]
@@ -581,6 +773,9 @@ class Meaning:
 
     def _copy(self, node: form.Copy, state: State) -> Any:
         view, kind = self._value(node.value, state), node.type
+        if isinstance(view, tuple):
+            self._pay_arrays(kind, state)
+            return view
         if isinstance(kind, kinds.Vector) and struct_code(kind.element) is not None:
             self._make(view.count * self._values.width(kind.element), state)
         elif not isinstance(kind, kinds.Record) or any(
@@ -589,10 +784,22 @@ class Meaning:
             raise UnknownError(f"a copy of type {kind}")
         return view
 
+    def _pay_arrays(self, kind: Type, state: State) -> None:
+        """A copy costs what its arrays take."""
+        parts: Sequence[Type] = self._values.fields(kind) if isinstance(kind, kinds.Record) else ()
+        if isinstance(kind, kinds.Vector):
+            length = kind.length or 0
+            self._make(integer(length * self._values.width(kind.element), 64), state)
+            parts = [kind.element] * length
+        for part in parts:
+            self._pay_arrays(part, state)
+
     def _call(self, node: form.Call, state: State) -> Any:
         name, arguments = node.function, node.arguments
         if name in ("a_part",):
             return self._with_part(node, state)
+        if name in ("a_slot", "a_put"):
+            return self._change(node, state)
         values = [self._value(argument, state) for argument in arguments]
         kind = arguments[0].type if arguments else kinds.VOID
         if name in _OF_VIEWS and isinstance(values[0], _View):
@@ -643,9 +850,10 @@ class Meaning:
             raise UnknownError("recursion")
         function = self._functions[node.function]
         values = [self._value(argument, state) for argument in node.arguments]
-        outer = self._frame, self._shared, self._returned
+        outer = self._frame, self._shared, self._returned, self._context
         self._calls += 1
         self._frame, self._shared, self._returned = self._calls, function.shared, []
+        self._context = function.context
         state.slots |= {
             (self._frame, name): value for name, value in zip(function.parameters, values, strict=False)
         }
@@ -654,7 +862,7 @@ class Meaning:
             self._block(function.body, inner)
             ends = [*self._returned, (inner, None)]
         finally:
-            self._frame, self._shared, self._returned = outer
+            self._frame, self._shared, self._returned, self._context = outer
         ends = [(end, value) for end, value in ends if not z3.is_false(end.alive)]
         if not ends:
             state.alive = z3.BoolVal(False)

@@ -4,12 +4,13 @@ Three kinds of places are known, and an address that is none of them is a differ
 
 - cells, 8 bytes each at constant addresses: variables, budgets, times, and where the log ends (`UNDO`);
 - the message, from the address that the function is handed: everything that is read or written is within its size;
-- what is put out, of which only is known that it stands nowhere else;
+- messages that are made, kept or published, and what says whether one may be, at constant addresses;
+- what is put out, in order;
 - the log, by which a message that is left is put back: whatever is written into the message was noted there before,
   address, size and the bytes that stood there, and a note is never written again.
 
-Of strings that variables keep, and of constant ones, nothing is known, nor of messages that are made, kept or
-published: who looks at them is not proved.
+Of strings that variables keep, and of constant ones, nothing is known but where they are: who looks at them is not
+proved.
 
 What the function has left (`ELSEWHERE`) and a trap are the same: the walk takes back what was begun.
 """
@@ -24,7 +25,9 @@ import z3
 
 from appliance.rosmop.prove.decoding import Code, Instruction
 from appliance.rosmop.prove.terms import (
+    AT,
     DOUBLE,
+    FRAME,
     MIXED,
     NEAREST,
     SINGLE,
@@ -48,7 +51,7 @@ POSITION, UNDO, SAID = 0, 8, 12
 """Where the frame, the end of the log and that of the lines stand."""
 
 _ENTRY = 16  # bytes of a note: address, size (4 bytes each), what stood there
-_MESSAGE, _NOTE = "message", "note"
+_MESSAGE, _NOTE, _LINES, _MADE = "message", "note", "lines", "made"
 _SORTS: Mapping[str, Any] = MappingProxyType(
     {"i32": z3.BitVecSort(32), "i64": z3.BitVecSort(64), "f32": SINGLE, "f64": DOUBLE}
 )
@@ -84,13 +87,16 @@ class Done:
     message: Term
     cells: Mapping[int, Term]
     stored: frozenset[int]
+    lines: Term
+    said: Term
+    slots: Mapping[Any, Any]
 
 
 class Execution:
     """One event's function, by its number, begun with these cells (truths are numbers, too).
 
     `strings` are the addresses of strings, and of the cells that say where they are; `messages` those of messages that
-    are made or kept, and of what says whether one may be published.
+    are made or kept, and of what says whether one may be published; what stands there is `made`.
     """
 
     def __init__(  # noqa: PLR0917  as `done` names them
@@ -102,6 +108,7 @@ class Execution:
         cells: Mapping[int, Term],
         strings: Sequence[range] = (),
         messages: Sequence[range] = (),
+        made: Term = None,
     ) -> None:
         self._functions = functions
         self._strings = strings
@@ -113,10 +120,19 @@ class Execution:
         self._frames = 0
         self._frame = 0
         self._returned: list[tuple[State, Term]] = []
-        slots: dict[Any, Any] = {_MESSAGE: message, ("cell", UNDO): Pointer("log", integer(0, 32))}
+        slots: dict[Any, Any] = {
+            _MESSAGE: message,
+            _LINES: z3.Array("lines", z3.BitVecSort(32), z3.BitVecSort(8)),
+        }
+        slots |= {("cell", UNDO): Pointer("log", integer(0, 32))}
         slots |= {
             ("cell", SAID): Pointer("lines", integer(0, 32)),
-            ("cell", POSITION): z3.BitVec("position", 32),
+            ("cell", POSITION): FRAME,
+        }
+        slots |= {
+            (_MADE, address): z3.Select(made, integer(address, 32))
+            for message in messages
+            for address in message
         }
         slots |= {("cell", address): value for address, value in cells.items()}
         self._state = State(z3.BoolVal(True), slots)
@@ -133,7 +149,7 @@ class Execution:
         }
         return Done(
             either(*self._trapped), either(*self._outside), bits, state.slots[_MESSAGE], cells,
-            frozenset(self._stored),
+            frozenset(self._stored), state.slots[_LINES], state.slots["cell", SAID].offset, state.slots,
         )  # fmt: skip
 
     def _call(self, number: int, arguments: Sequence[Any], state: State) -> Any:
@@ -244,13 +260,11 @@ class Execution:
                 raise DiffersError("it reads its own log")
             size = int(how.partition("_")[0] or bits) // 8
             value = number_at(state.slots[_MESSAGE], self._within(address, int(offset), size, state), size)
-            if family in ("f32", "f64"):
-                return z3.fpBVToFP(value, _SORTS[family])
-            missing = bits - 8 * size
-            return (
-                value if not missing else (z3.SignExt if how.endswith("_s") else z3.ZeroExt)(missing, value)
-            )
-        place = self._cell(address, int(offset))
+            return _loaded(value, family, how)
+        size = int(how.partition("_")[0] or bits) // 8
+        place = self._cell(address, int(offset), size)
+        if self._is_made(place):
+            return _loaded(made_at(state.slots, place, size), family, how)
         value = state.slots.get(("cell", place))
         if how or value is None or not _fits(value, family):
             raise DiffersError(
@@ -261,15 +275,23 @@ class Execution:
     def _store(  # noqa: PLR0917  as the instruction has them
         self, family: str, how: str, offset: float, address: Any, value: Any, state: State
     ) -> None:
+        size = int(how or family[1:]) // 8
         if isinstance(address, Pointer) and address.place == "lines":
+            place = address.offset + integer(int(offset), 32)
+            state.slots[_LINES] = with_number(state.slots[_LINES], place, _stored(value, size))
             return
         if isinstance(address, Pointer):
-            size = int(how or family[1:]) // 8
             (self._write if address.place == "message" else self._note)(
                 address, int(offset), size, value, state
             )
             return
-        place = self._cell(address, int(offset))
+        place = self._cell(address, int(offset), size)
+        if self._is_made(place):
+            bits = _stored(value, size)
+            for byte in range(size):
+                state.slots[_MADE, place + byte] = z3.Extract(8 * byte + 7, 8 * byte, bits)
+            self._stored.add(place)
+            return
         if place == UNDO and not how:
             self._add_note(value, state)
             return
@@ -284,13 +306,18 @@ class Execution:
         if place != SAID:
             self._stored.add(place)
 
-    def _cell(self, address: Any, offset: int) -> int:
-        """A constant address of what is neither a string nor a message."""
+    def _is_made(self, place: int) -> bool:
+        return any(place in message for message in self._messages)
+
+    def _cell(self, address: Any, offset: int, size: int) -> int:
+        """A constant address of what is no string; all of it is in one message, or in none."""
         number = z3.simplify(_bits(address))
         known = z3.is_bv_value(number)
         place = int(number.as_long()) + offset if known else -1
-        if any(place in message for message in self._messages) or (self._messages and not known):
-            raise NotProvedError("uses a message that is made, kept or published")
+        if self._messages and not known:
+            raise NotProvedError("uses an element of a message that is made, kept or published")
+        if any((place in message) != (place + size - 1 in message) for message in self._messages):
+            raise DiffersError(f"it looks at {size} bytes at {place}, of which some are a message's")
         if any(place in string for string in self._strings) or (self._strings and not known):
             raise NotProvedError("uses a constant string, or a string or vector that is kept or made")
         if not known:
@@ -341,6 +368,31 @@ class Execution:
         state.slots["cell", UNDO] = value
         for part in (0, 4, 8):
             del state.slots["part", part]
+
+
+def made_at(slots: Mapping[Any, Any], place: int, size: int) -> Term:
+    """What so many bytes of a message are that is made or kept, as they are stored together if they were."""
+    every = [slots[_MADE, place + byte] for byte in reversed(range(size))]
+    return z3.simplify(z3.Concat(*every) if size > 1 else every[0])
+
+
+def _loaded(value: Term, family: str, how: str) -> Term:
+    """So many bytes as a number of the machine."""
+    if family in ("f32", "f64"):
+        return z3.fpBVToFP(value, _SORTS[family])
+    missing = int(family[1:]) - value.size()
+    return value if not missing else (z3.SignExt if how.endswith("_s") else z3.ZeroExt)(missing, value)
+
+
+def _stored(value: Any, size: int) -> Term:
+    """A number of the machine, or an address in the message, as so many bytes."""
+    if isinstance(value, Pointer):
+        if value.place != "message":
+            raise DiffersError("it notes an address that is nowhere in the message")
+        value = AT + value.offset
+    elif z3.is_fp(value):
+        value = z3.fpToIEEEBV(value)
+    return z3.Extract(8 * size - 1, 0, _bits(value))
 
 
 def each_name(family: str, how: str) -> str:

@@ -17,6 +17,10 @@ Term = Any
 
 DOUBLE, SINGLE = z3.Float64(), z3.Float32()
 NEAREST = z3.RNE()
+AT = z3.BitVec("at", 32)
+"""Where the message stands in the memory."""
+FRAME = z3.BitVec("position", 32)
+"""Where its frame does."""
 
 
 class NotProvedError(Exception):
@@ -75,6 +79,8 @@ def choice(test: Term, yes: Term, no: Term) -> Term:
         return yes
     if z3.is_false(test) or yes is None:
         return no
+    if isinstance(yes, tuple) and isinstance(no, tuple) and len(yes) == len(no):
+        return tuple(choice(test, *parts) for parts in zip(yes, no, strict=True))
     if is_dataclass(yes) and not isinstance(yes, type) and type(yes) is type(no):
         parts = {
             field.name: choice(test, getattr(yes, field.name), getattr(no, field.name))
@@ -150,15 +156,24 @@ class Beginning:
     message: Term
     size: Term
     now: Term
-    variables: Mapping[str, Term]
+    variables: Mapping[str, Any]
     budgets: Mapping[str, Term]
     throttles: Mapping[tuple[str, int], Term]
 
 
 @dataclass(frozen=True)
+class Noted:
+    """What stands among what is put out, where it comes to that (`alive`): one of these from an offset on."""
+
+    alive: Term
+    offset: Term
+    allowed: Sequence[Term]
+
+
+@dataclass(frozen=True)
 class Result:
-    """What an event has come to: `left` it is not decided here (a fault, what is put out), and why nobody knows
-    (`unknown`, by name). The rest counts where it is neither.
+    """What an event has come to: `left` it is not decided here (a fault), and why nobody knows (`unknown`, by name);
+    the rest counts where it is neither. What it puts out is `noted`, in so many bytes (`said`, see `ir/output.py`).
     """
 
     left: Term
@@ -167,8 +182,10 @@ class Result:
     dropped: Term
     changed: Term
     message: Term
-    variables: Mapping[str, Term]
+    variables: Mapping[str, Any]
     budgets: Mapping[str, Term]
+    said: Term
+    noted: Sequence[Noted]
 
 
 _SMALL = 1 << 10
