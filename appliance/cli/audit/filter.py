@@ -8,12 +8,15 @@ from typing import Annotated, Concatenate, ParamSpec
 
 import typer
 
+from appliance.audit.events import EVENTS
 from appliance.audit.moment import MomentError, parse_moment
+from appliance.audit.output import printable
 from appliance.audit.query import Filter
 from appliance.audit.record import Severity
-from appliance.cli.audit.errors import Errors
+from appliance.cli.audit.errors import Errors, tell
 from appliance.cli.spans import Since, Until
 from appliance.cli.target import Appliance
+from appliance.wrong_values import meant
 
 _P = ParamSpec("_P")
 
@@ -58,6 +61,8 @@ def _filter(
     end = None if until is None else parse_moment(until, now)
     if begin is not None and end is not None and begin > end:
         raise MomentError(f"--since {since} is later than --until {until}: nothing is between them")
+    if event is not None and not set(event) & set("*?[") and event not in EVENTS:
+        tell(printable(f"this version records no event {event!r}{meant(event, EVENTS)}"))
     return Filter(
         decision=tuple(name for name, asked in wanted.items() if asked),
         since=begin,

@@ -57,6 +57,16 @@ def test_a_time_that_ends_before_it_begins_is_refused(state: Path) -> None:
     assert done.stderr == "rosrv: --since 1h is later than --until 2h: nothing is between them\n"
 
 
+def test_an_event_that_this_version_does_not_record_is_told(state: Path) -> None:
+    """Beside what is found, for the log may be of another version: the nearest, in searches and exports."""
+    for verb in ("search", "export"):
+        done = run("audit", verb, "--event", "desicion", "--state", str(state))
+        assert (done.returncode, done.stdout) == (0, "")
+        assert done.stderr == "rosrv: this version records no event 'desicion'; did you mean decision?\n"
+        for known in ("decision", "desi*"):
+            assert "this version" not in run("audit", verb, "--event", known, "--state", str(state)).stderr
+
+
 def test_search_json(state: Path) -> None:
     """`search --json` prints the records that match as NDJSON, newest first."""
     found = lines(
