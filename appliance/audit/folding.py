@@ -103,13 +103,12 @@ class Folder:
         key = kind_of(keepable(record))
         kind = self._kinds.get(key)
         if kind is None:
-            found = self._coming.setdefault(key, record)
-            recorded_id, about = found.id, (found.caller_id, found.resource)
+            first = self._coming.setdefault(key, record)
+            known, about = first.id, (first.caller_id, first.resource)
         else:
-            recorded_id, about = kind.state.recorded_id, (kind.state.caller_id, kind.state.resource)
-        return (
-            recorded_id if about == (record.caller_id, record.resource) else record.id
-        )  # a stranger's is of many
+            known, about = kind.state.recorded_id, (kind.state.caller_id, kind.state.resource)
+        same = about == (record.caller_id, record.resource)
+        return known if same else record.id  # a kind of a stranger is of many things
 
     def offer(self, record: Record, now: float) -> Iterator[Record]:
         """The records to write for this one: itself, nothing (counted), or summaries and itself."""

@@ -175,10 +175,14 @@ class RelayProcess:
         return link
 
     def ping(self, number: int) -> None:
-        """Wait for the answer of the relay's main loop: everything sent to it before has been carried out."""
-        after = len(self.lifeline.messages)
-        self.lifeline.send(Ping(number))
-        self.lifeline.wait_for(lambda message: message == Pong(number), after=after)
+        """Wait for two turns of the relay's main loop: everything sent to it before has been carried out.
+
+        The first may be the one in which it is given a link, and has not read what was sent over that.
+        """
+        for answer in (Pong(number), Pong(number + 1_000_000)):
+            after = len(self.lifeline.messages)
+            self.lifeline.send(Ping(answer.number))
+            self.lifeline.wait_for(answer.__eq__, after=after)
 
     def stop(self) -> int:
         """End it as the supervisor does; its exit status."""

@@ -85,6 +85,5 @@ def test_a_port_lives_while_its_node_is_placed(relay: RelayProcess) -> None:
     assert not refuses(port)
     link.send(NodeWithdrawn("k"))
     relay.ping(3)
-    relay.ping(4)
     assert refuses(port)
     link.close()
