@@ -5,7 +5,9 @@ there alone) and `/run`; with a root of its own, that system's programs. Nothing
 changed.
 """
 
+import contextlib
 import os
+import signal
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +15,7 @@ from typing import Any, Self
 
 from examples.landshark.lab import Host
 from tests.support.processes import Process
+from tests.support.waiting import eventually
 
 _MOUNTS = """\
 set -e
@@ -27,19 +30,7 @@ fi
 exec chroot "$2/" sh -c 'echo mounted; exec sleep infinity'
 """
 
-_END = """\
-for file in /run/rosrv/*.pid; do
-    [ -e "$file" ] || continue
-    pid=$(cat "$file")
-    kill -- "-$pid" 2>/dev/null
-    for _ in $(seq 100); do
-        kill -0 "$pid" 2>/dev/null || break
-        sleep 0.1
-    done
-    kill -KILL -- "-$pid" 2>/dev/null
-done
-true
-"""
+_PATIENT_LOOKS = 20  # some seconds
 
 
 class ScriptHost:
@@ -53,6 +44,7 @@ class ScriptHost:
         self.directory = directory
         self.address = ""
         self._upper = directory / "layer"
+        self._looks = 0
         directory.mkdir(parents=True, exist_ok=True)
         self._holder = Process(
             host,
@@ -66,8 +58,29 @@ class ScriptHost:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self.run("sh", "-c", _END)  # the next host of this network takes the same ports
+        self.run("sh", "-c", "for f in /run/rosrv/*.pid; do [ -e $f ] && kill -- -$(cat $f); done; true")
         self._holder.stop()
+        eventually(self._left, lambda: f"programs of {self.outer.name} have ended: {self._programs()}")
+
+    def _programs(self) -> dict[int, str]:
+        """Of the kit, by process, those that live in this network; they may have lost their files of process ids."""
+        found = {}
+        for pid in self.outer.namespace.processes():
+            with contextlib.suppress(OSError):
+                name = Path(f"/proc/{pid}/comm").read_text().strip()
+                if name in ("charon-systemd", "keep.sh", "renew.sh"):
+                    found[pid] = name
+        return found
+
+    def _left(self) -> bool:
+        """Whether the next host of this network finds the ports free; what does not end by itself is ended."""
+        programs = self._programs()
+        self._looks += 1
+        if self._looks == _PATIENT_LOOKS:
+            for pid in programs:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+        return not programs
 
     def command(self, args: Sequence[str]) -> list[str]:
         """A command line that runs this on the host."""
