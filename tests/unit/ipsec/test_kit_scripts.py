@@ -1,5 +1,6 @@
 """Tests of the scripts of a kit as they are shipped: any /bin/sh runs them, and no Python."""
 
+import os
 import re
 import subprocess
 from pathlib import Path
@@ -44,3 +45,15 @@ def test_it_asks_of_its_tools_what_ubuntu_20_04_has(script: Path) -> None:
     assert set(re.findall(r"\bopenssl ([a-z0-9]+) -", text)) <= set(_OPENSSL.split())
     raw = [line for line in text.splitlines() if "-rawin" in line]
     assert len(raw) == (script.name == "renew.sh")
+
+
+@pytest.mark.parametrize("name", ["join.sh", "leave.sh"])
+def test_what_has_ended_and_nobody_collects_runs_no_more(name: str) -> None:
+    """Process 1 of a container may collect nothing: who waits for the end of such a program waits for ever."""
+    runs = next(line for line in (FOLDER / name).read_text().splitlines() if line.startswith("runs() "))
+    with subprocess.Popen(["/bin/true"]) as ended:
+        os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)
+        for pid, status in ((ended.pid, 1), (os.getpid(), 0)):
+            assert (
+                subprocess.run(["/bin/dash", "-c", f"{runs}\nruns {pid}"], check=False).returncode == status
+            )
