@@ -352,7 +352,9 @@ class _Control:
             case messages.ProbePassed():
                 self._base.doors.probed("")
             case _:
-                _log.error("the supervisor said what is not for control", message=type(message).__name__)
+                _log.error(
+                    "the supervisor said something that is not for control", message=type(message).__name__
+                )
 
     def _link(self, role: str, index: int, sock: socket.socket) -> None:
         """To another process."""
@@ -383,7 +385,9 @@ class _Control:
             try:
                 await _reload_policy(self._base.policies)
             except PolicyRefusedError as error:
-                _log.error("the policy is refused, the last good one stays in force", findings=error.findings)
+                _log.error(
+                    "the policy was refused, the last good one stays in force", findings=error.findings
+                )
             except StoreError as error:
                 _log.error("the policy is in force and not kept", reason=str(error))
             await self._reload_hosts()
@@ -455,7 +459,7 @@ async def _restore(base: Foundation, parts: Parts) -> None:
         if name.startswith("port:"):
             places.adopt(name, sock)
     restore(registry, base.store)
-    parts.grants.restore(base.store.permissions())
+    enactor.carry_out(parts.grants.restore(base.store.permissions()))
     claimed: set[int] = set()
     for incarnation in registry.all():
         if incarnation.life is Life.REPLACED:

@@ -338,7 +338,7 @@ class Control(ControlParts):
     async def begin(self) -> None:
         """As the process does: what was kept, then its loops."""
         restore(self.registry, cast(Any, self.world.kept))
-        self.grants.restore(self.world.kept.permissions())
+        self.enactor.carry_out(self.grants.restore(self.world.kept.permissions()))
         self.enactor.carry_out(self.revocation.policy_changed(self.current, self.current))
         self.attach()
         self.world.task(self.reconciler.run())

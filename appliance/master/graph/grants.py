@@ -24,10 +24,15 @@ class Grants:
         self._of_host: dict[str, dict[PermissionRow, None]] = {}  # the same, in the order they were granted
         self._count = 0
 
-    def restore(self, rows: Iterable[PermissionRow]) -> None:
-        """Put back what was kept."""
+    def restore(self, rows: Iterable[PermissionRow]) -> Effects:
+        """Put back what was kept. Grants of an earlier version, for every name of a host, go: it looks up again."""
+        effects: Effects = []
         for row in rows:
-            self._add(row)
+            if row.caller_id:
+                self._add(row)
+            else:
+                effects.append(EraseGrant(row))
+        return effects
 
     def all(self) -> list[PermissionRow]:
         """Every grant."""
