@@ -137,7 +137,7 @@ restart_charon() {
         pid=$(cat "$run/charon.pid")
         kill "$pid"
         tries=0
-        while runs "$pid"; do
+        while runs "$pid" && [ "$tries" -lt 150 ]; do
             tries=$((tries + 1))
             [ "$tries" -ne 100 ] || kill -KILL "$pid" 2>/dev/null || true
             sleep 0.1

@@ -14,7 +14,7 @@ stop() {
     # Each was started in a session of its own, so what it has started ends with it.
     kill -- "-$pid" 2>/dev/null || kill "$pid" 2>/dev/null || true
     tries=0
-    while runs "$pid"; do
+    while runs "$pid" && [ "$tries" -lt 150 ]; do
         tries=$((tries + 1))
         [ "$tries" -ne 100 ] || kill -KILL -- "-$pid" 2>/dev/null || true
         sleep 0.1
