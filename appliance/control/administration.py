@@ -44,6 +44,11 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     NotSealedError: "failed",
     StoreError: "failed",
 }
+# What must be kept, else it is not begun. Not who is let in no more: he is out at once, and the answer says what is not
+# kept. Not recordings: the recorder looks after its own room.
+KEPT = (admin.CHANGES | {admin.TokenAdd, admin.HostEnrol, admin.HostRenewItself, admin.HostRenewed}) - {
+    admin.HostRevoke, admin.TokenRevoke, admin.RecordNow, admin.RecordingOfMemory, admin.RecordingRemove
+}  # fmt: skip
 Orders = (
     Policies | Monitors | Tokens | RecordingOrders | EvidenceOrders
     | Hosts | SelfService | CheckedPorts | Certification
@@ -60,11 +65,21 @@ class _Taken(NamedTuple):
 
 
 class Administration:
-    """Carries out requests; `durable` waits until what was recorded is on disk, or cannot be."""
+    """Carries out requests; `durable` waits until what was recorded is on disk, or cannot be.
 
-    def __init__(self, looks: Looks, *orders: Orders, durable: Callable[[], Awaitable[object]]) -> None:
+    `require_room()` raises `StoreError` when the disk takes nothing: what could not be kept is not begun.
+    """
+
+    def __init__(
+        self,
+        looks: Looks,
+        *orders: Orders,
+        durable: Callable[[], Awaitable[object]],
+        require_room: Callable[[], None],
+    ) -> None:
         self._looks = looks
         self._durable = durable
+        self._require_room = require_room
         self._methods: dict[type, _Taken] = {}
         for part in (looks, *orders):
             for _name, method in inspect.getmembers(part, inspect.iscoroutinefunction):
@@ -85,6 +100,8 @@ class Administration:
     async def _answer(self, request: admin.AdminRequest[A], who: str) -> admin.AdminAnswer[A]:
         method, wants_who, _ = self._methods[type(request)]
         try:
+            if type(request) in KEPT:
+                self._require_room()
             return admin.AdminAnswer(True, await (method(request, who) if wants_who else method(request)))
         except (PolicyRefusedError, SpecificationsRefusedError) as error:
             text = self._in_force(error)

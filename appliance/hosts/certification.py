@@ -24,6 +24,7 @@ from appliance.hosts.rest_place import RestPlace
 from appliance.hosts.table import HostForbiddenError, HostRefusedError, HostTable
 from appliance.hosts.tunnels import Tunnels
 from appliance.hosts.view import soon
+from appliance.store.database import StoreError
 from appliance.store.state import StateStore
 
 _SERVED_SECONDS = 10.0
@@ -123,8 +124,15 @@ class Certification:
         self.changed()
 
     async def finish(self, name: str, kept: dict[str, str] | None = None) -> KitParts:
-        """The answer to an enrolment, when all of it is on the disk and charon knows it; `kept`: with its token."""
-        await self.store.settled()
+        """The answer to an enrolment, when all of it is on the disk and charon knows it; `kept`: with its token.
+
+        Raises `HostRefusedError`, `StoreError`.
+        """
+        try:
+            await self.store.settled()
+        except StoreError as error:
+            stands = f"{name} is enrolled until then and has no kit: rosrv host kit {name}, or revoke it"
+            raise StoreError(f"{error}; {stands}") from error
         taken = await self.tunnels.until_taken()
         warning = None if taken else "charon does not know it yet; `rosrv status` and the log say why"
         return await self.kit(name, warning, kept)

@@ -28,7 +28,7 @@ _ROWS = 64  # of one statement
 
 _CATCH_UP_SECONDS = 1.0
 _SETTLE_SECONDS = 5.0
-
+_ROOM = 4 << 20  # bytes: the log of SQLite grows so far, and few texts are longer
 
 _LEFT = "changes that the file state.ahead took are made at the next start, others are lost"
 
@@ -149,6 +149,14 @@ class Database:
         """Queue that the rows with these values in these columns are gone; see `submit`."""
         wanted = " AND ".join(f"{column} = ?" for column in where)
         self.submit(f"DELETE FROM {table} WHERE {wanted}", tuple(where.values()))  # noqa: S608  fixed names
+
+    def require_room(self) -> None:
+        """Raises `StoreError` when the disk does not take what an order would change: nothing is to be changed then."""
+        disk = os.statvfs(self._path.parent)
+        free = disk.f_bavail * disk.f_frsize
+        if self._failing or free < _ROOM:
+            why = self._failing or f"{self._path}: {free} bytes are free on its disk, {_ROOM} are wanted"
+            raise StoreError(f"{why}; nothing was changed: make room and order it again")
 
     async def settled(self) -> None:
         """Wait until everything queued so far is on the disk. Raises `StoreError` when it cannot be written."""

@@ -130,6 +130,10 @@ class StateStore:
         """Wait until everything saved so far is on the disk. Raises `StoreError` when it cannot be written."""
         await self.database.settled()
 
+    def require_room(self) -> None:
+        """Raises `StoreError` when what is ordered could not be kept: before anything is changed."""
+        self.database.require_room()
+
     def together(self) -> AbstractContextManager[None]:
         """What is saved inside outlasts the process when this has ended, by one write."""
         return self.database.together()

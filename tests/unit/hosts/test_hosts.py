@@ -59,6 +59,7 @@ from appliance.ipsec import authority as ipsec
 from appliance.ipsec.proof import RequestRefusedError
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.policy.model import Address
+from appliance.store.database import StoreError
 from appliance.store.state import StateStore
 from tests.support.audit import HeardTrail
 
@@ -804,5 +805,25 @@ def test_only_what_charon_took_of_this_life_counts_as_taken(
         running.cancel()
         for one in (link, charon):
             one.close()
+
+    run(tmp_path, work)
+
+
+def test_a_host_whose_disk_fills_meanwhile_is_told_how_it_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is enrolled and nobody has its kit: whoever ordered it hears so, and by what it is made or taken back."""
+
+    async def full() -> None:
+        raise StoreError("state.db: full; make room")
+
+    async def work(bench: Bench) -> None:
+        with monkeypatch.context() as patched:
+            patched.setattr(bench.store, "settled", full)
+            with pytest.raises(
+                StoreError, match=r"^state\.db: full; make room; .*no kit: rosrv host kit a, or revoke"
+            ):
+                await add(bench, "a")
+        await bench.hosts.renew(HostRenew("a", signing_request(make_key(), "a").decode(), 90), "tester")
 
     run(tmp_path, work)

@@ -1,0 +1,128 @@
+"""Orders to an appliance whose state has a disk that is full: done and kept, or refused before anything is changed."""
+
+import subprocess
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import pytest
+
+from appliance.channel import admin
+from appliance.cli.admin_socket import AdminSocket
+from appliance.control.administration import KEPT
+from tests.support.appliance import OPEN_POLICY, Appliance
+from tests.support.waiting import eventually
+
+RULE = "silent() { event said() /chatter std_msgs/String '{}' { } }\n"
+CLOSED = OPEN_POLICY.replace("default = *", "default = 10.9.9.9")
+REQUEST = "a signing request"
+ORDERS: tuple[admin.AdminRequest[Any], ...] = (
+    admin.PolicyReload(),
+    admin.PolicyRollback(1),
+    admin.PolicyLoad(CLOSED),
+    admin.PolicyConfirm(),
+    admin.MonitorLoad({"loud.rv": RULE.replace("silent", "loud")}),
+    admin.MonitorReplace("silent", RULE.replace("said", "heard")),
+    admin.MonitorReload(),
+    admin.MonitorRemove(["silent"]),
+    admin.MonitorRollback(0),
+    admin.MonitorConfirm(),
+    admin.MonitorSwitch(["silent"], False),
+    admin.MonitorTrial(["silent"], True),
+    admin.MonitorResume(["silent"]),
+    admin.TokenAdd("late", "viewer", 3600.0),
+    admin.HostToken("laptop", endpoint="192.0.2.1"),
+    admin.HostAdd("laptop", REQUEST),
+    admin.HostEnrol("rosrv-enrol_none", REQUEST, "192.0.2.2"),
+    admin.HostRenew("laptop", REQUEST),
+    admin.HostRenewItself("laptop", REQUEST, b"", "192.0.2.2"),
+    admin.HostRenewed("laptop", "192.0.2.2"),
+    admin.HostPorts("192.0.2.3", "closed"),
+    admin.HostsReload(),
+)
+LOOKS = (
+    admin.PolicyRevisions(), admin.MonitorRevisions(), admin.MonitorsWanted(True), admin.TokenList(), admin.HostList()
+)  # fmt: skip
+
+
+class SmallDisk:
+    """An appliance whose state is on a disk of its own."""
+
+    def __init__(self, appliance: Appliance) -> None:
+        self.appliance = appliance
+        self.filler = appliance.state / "filler"
+
+    def ask(self, request: admin.AdminRequest[Any]) -> admin.AdminAnswer[Any]:
+        """One question or order."""
+        return AdminSocket(self.appliance.state).ask(request)
+
+    def fill(self) -> None:
+        """Nothing more can be written."""
+        with self.filler.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
+            while True:
+                file.write(bytes(1 << 16))
+
+    def revoked(self) -> set[str]:
+        """The tokens that are good for nothing."""
+        known = self.ask(admin.TokenList()).body
+        return {token.name for token in known.tokens if token.revoked is not None} if known else set()
+
+    def all(self) -> list[object]:
+        """What orders change, as it can be seen."""
+        return [msgspec.to_builtins(self.ask(look).body) for look in LOOKS]
+
+
+@pytest.fixture
+def small() -> Iterator[SmallDisk]:
+    """Its disk has 32 MiB; a token `guest` and a monitor are there."""
+    appliance = Appliance()
+    appliance.state.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=32m,mode=755", "rosrv-state-test", str(appliance.state)]
+    subprocess.run(mount, check=True)
+    try:
+        appliance.start()
+        disk = SmallDisk(appliance)
+        assert disk.ask(admin.TokenAdd("guest", "viewer", 3600.0)).ok
+        loaded = disk.ask(admin.MonitorLoad({"silent.rv": RULE}))
+        assert loaded.ok, loaded.findings
+        yield disk
+    finally:
+        appliance.stop()
+        subprocess.run(["umount", "--lazy", appliance.state], check=True)
+        appliance.close()
+
+
+def test_an_order_that_cannot_be_kept_changes_nothing(small: SmallDisk) -> None:
+    """Each says so, and that room must be made; with room it is carried out, after a crash too."""
+    assert {type(order) for order in ORDERS} == KEPT
+    before = small.all()
+    small.fill()
+    for order in ORDERS:
+        answer = small.ask(order)
+        assert (answer.ok, answer.trouble) == (False, "failed"), order
+        assert answer.error is not None
+        assert "nothing was changed: make room" in answer.error, order
+    assert small.all() == before
+    small.filler.unlink()
+    for order in (
+        admin.TokenAdd("late", "viewer", 3600.0),
+        admin.PolicyLoad(CLOSED),
+        admin.HostPorts("192.0.2.3", "open"),
+    ):
+        assert small.ask(order).ok, order
+    after = small.all()
+    small.appliance.kill("control")
+    assert eventually(lambda: small.all() or None, small.appliance.story) == after
+
+
+def test_who_is_let_in_no_more_is_out_though_that_cannot_be_kept(small: SmallDisk) -> None:
+    """At once; the answer says what a restart would do, and when there is room it is kept after all."""
+    small.fill()
+    answer = small.ask(admin.TokenRevoke("guest"))
+    assert answer.error is not None
+    assert "make room: until then a restart undoes what was ordered" in answer.error
+    assert small.revoked() == {"guest"}
+    small.filler.unlink()
+    eventually(lambda: small.ask(admin.TokenAdd("late", "viewer", 3600.0)).ok, small.appliance.story)
+    small.appliance.kill("control")
+    assert eventually(small.revoked, small.appliance.story) == {"guest"}
