@@ -14,9 +14,8 @@ from typing import cast
 
 import appliance
 from appliance.channel.answers.inventory import Inventory, Part
-from appliance.shipped import SHIPPED
+from appliance.shipped import DPKG, SHIPPED
 
-DPKG = Path("/var/lib/dpkg")
 # Of packages.txt: what runs on the robot's machine.
 RUNS = (
     "python3-rosmaster", "rosout", "iproute2", "iptables", "nftables", "charon-systemd",

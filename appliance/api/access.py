@@ -22,7 +22,7 @@ from typing import cast
 from appliance.api.problems import ProblemError, too_many
 from appliance.api.rates import Buckets, peer_key
 from appliance.channel.answers.tokens import TokenRole
-from appliance.channel.messages import Asked, TokenKept
+from appliance.channel.messages.api import Asked, TokenKept
 from appliance.config import is_loopback
 from appliance.order_proof import reading_hash, reading_id
 from appliance.shares.pool import Standing

@@ -16,10 +16,17 @@ from typing import Any
 import structlog
 
 from appliance.api.access import Bearer
-from appliance.channel import messages
 from appliance.channel.admin import CHANGES, A, AdminAnswer, AdminRequest, decode
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
+from appliance.channel.messages.api import (
+    RequestAnswered,
+    RequestMade,
+    RestCalled,
+    RestServed,
+    TokenKept,
+    TokensStated,
+)
 
 _log = structlog.get_logger()
 _MOST_OPEN = 48
@@ -31,10 +38,10 @@ class ControlAwayError(Exception):
     """Control cannot be asked now; the text says why, for whoever called."""
 
 
-def _made(number: int, request: AdminRequest[Any], bearer: Bearer | None) -> messages.RequestMade:
+def _made(number: int, request: AdminRequest[Any], bearer: Bearer | None) -> RequestMade:
     shown = bearer.shown if bearer is not None else ""
     asked = bearer.asked if bearer is not None and type(request) in CHANGES else None
-    return messages.RequestMade(number, request, shown, asked)
+    return RequestMade(number, request, shown, asked)
 
 
 class ControlLink:
@@ -43,13 +50,11 @@ class ControlLink:
     `tokens_stated(tokens)` hears what tokens may be used from now on, `lost()` that control is gone.
     """
 
-    def __init__(
-        self, tokens_stated: Callable[[list[messages.TokenKept]], None], lost: Callable[[], None]
-    ) -> None:
+    def __init__(self, tokens_stated: Callable[[list[TokenKept]], None], lost: Callable[[], None]) -> None:
         self._tokens_stated = tokens_stated
         self._lost = lost
         self._link = Link(self._received, self._ended)
-        self._kept: deque[messages.RestCalled] = deque()
+        self._kept: deque[RestCalled] = deque()
         self._dropped = 0
         self._pin = ""
         self.known = False  # whether the tokens were told on this link
@@ -73,7 +78,7 @@ class ControlLink:
     def _tell_pin(self) -> None:
         if self._pin:
             with contextlib.suppress(ChannelFullError):  # the link ends, and the next is told
-                self._link.send(messages.RestServed(self._pin))
+                self._link.send(RestServed(self._pin))
 
     async def ask(
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float = ANSWER_SECONDS
@@ -95,7 +100,7 @@ class ControlLink:
             ) from None
         return decode(answer, request)
 
-    def tell(self, call: messages.RestCalled) -> None:
+    def tell(self, call: RestCalled) -> None:
         """Have a call recorded."""
         self._kept.append(call)
         if len(self._kept) > _MOST_KEPT:
@@ -124,9 +129,9 @@ class ControlLink:
 
     def _received(self, message: Any) -> None:
         match message:
-            case messages.RequestAnswered(number, answer):
+            case RequestAnswered(number, answer):
                 self._link.answered(number, answer)
-            case messages.TokensStated(tokens):
+            case TokensStated(tokens):
                 self.known = True
                 self._tokens_stated(tokens)
                 self._tell_kept()

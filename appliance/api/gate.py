@@ -29,7 +29,7 @@ from appliance.api.dry_runs import is_dry
 from appliance.api.journal import Journal
 from appliance.api.problems import REASON, ProblemError, defect, too_many
 from appliance.api.rates import Buckets
-from appliance.channel.messages import Asked
+from appliance.channel.messages.api import Asked
 from appliance.config import ApiLimits
 from appliance.order_proof import HEADER
 

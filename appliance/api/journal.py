@@ -8,7 +8,7 @@ token) are never folded.
 from collections import Counter
 from collections.abc import Callable
 
-from appliance.channel.messages import RestCalled
+from appliance.channel.messages.api import RestCalled
 
 FOLD_SECONDS = 10.0
 _READS = frozenset({"GET", "HEAD"})

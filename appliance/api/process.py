@@ -32,6 +32,7 @@ from appliance.api.listener import Listener
 from appliance.api.services import Services
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.messages.api import ApiLink
 from appliance.config import Settings, load_resolved
 
 _log = structlog.get_logger()
@@ -184,7 +185,7 @@ class _Api:
                 self._given.set()
             case messages.LinkOpened(role) if role == "control":
                 sock = socket.socket(fileno=descriptors[0])
-                self._control.attach(Channel(sock, messages.ApiLink, limit=8 << 20, longest=64 << 20))
+                self._control.attach(Channel(sock, ApiLink, limit=8 << 20, longest=64 << 20))
             case _:
                 for descriptor in descriptors:
                     os.close(descriptor)

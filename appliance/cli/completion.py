@@ -13,16 +13,6 @@ from appliance.channel.admin import A, AdminRequest
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
 
 Complete = Callable[[typer.Context, str], list[str]]
-_ISOLATIONS = {
-    "netns": "a network namespace of its own on this host",
-    "container": "it is in a container, which is its namespace",
-    "none": "no namespace and no firewall: for development",
-}
-
-
-def isolations(incomplete: str) -> list[tuple[str, str]]:
-    """Where the appliance may live, each with what it is."""
-    return [(name, text) for name, text in _ISOLATIONS.items() if name.startswith(incomplete)]
 
 
 def _names(request: AdminRequest[A], of: Callable[[A], Iterable[str]]) -> Complete:

@@ -15,7 +15,6 @@ import setproctitle
 import structlog
 import typer
 
-from appliance.cli import completion
 from appliance.cli.up_inputs import read_inputs
 from appliance.config import Settings
 from appliance.config_sources import resolve
@@ -27,7 +26,18 @@ from appliance.supervisor.supervisor import ControlReady
 
 _MOST_WARNINGS = 10
 
+_ISOLATIONS = {
+    "netns": "a network namespace of its own on this host",
+    "container": "it is in a container, which is its namespace",
+    "none": "no namespace and no firewall: for development",
+}
+
 log = structlog.get_logger()
+
+
+def _isolations(incomplete: str) -> list[tuple[str, str]]:
+    """Where the appliance may live, each with what it is."""
+    return [(name, text) for name, text in _ISOLATIONS.items() if name.startswith(incomplete)]
 
 
 def up(  # noqa: PLR0917  typer gives every flag by its name
@@ -51,7 +61,7 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
     ] = None,
     rosmaster_port: Annotated[int | None, typer.Option(help="Port of the hidden ROSMaster; 0: any")] = None,
     isolation: Annotated[
-        str | None, typer.Option(help="container, netns or none", autocompletion=completion.isolations)
+        str | None, typer.Option(help="container, netns or none", autocompletion=_isolations)
     ] = None,
     relay: Annotated[
         str | None, typer.Option(help="all, or monitored: only what [Monitor] or a specification names")

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import msgspec
 
 import appliance
+from appliance import late
 from appliance.channel import admin
 from appliance.channel.answers.graph import Graph, Registration, Registrations, TopicMessage, TopicMessages
 from appliance.channel.answers.inventory import InUse, Inventory
@@ -22,7 +23,6 @@ from appliance.control.monitor_states import monitors_of, monitors_status
 from appliance.control.overview import graph_of
 from appliance.control.policies import Policies
 from appliance.hosts.hosts import Hosts
-from appliance.inventory import inventory
 from appliance.master.graph.registry import Kind, Life
 from appliance.policy.live import Live
 from appliance.policy.sections import DECIDERS
@@ -63,7 +63,7 @@ class Looks:
 
     async def inventory(self, _request: admin.InventoryWanted) -> Inventory:
         """What runs, and what it uses of the kernel."""
-        found = await asyncio.to_thread(inventory)
+        found: Inventory = await asyncio.to_thread(late.load("appliance.inventory").inventory)
         around = self.surroundings
         used = InUse(
             firewall=around.firewall.report.backend,

@@ -26,6 +26,7 @@ from appliance.channel import messages
 from appliance.channel.admin import HostsReload, PolicyReload
 from appliance.channel.answers.status import AuditState
 from appliance.channel.channel import Channel
+from appliance.channel.messages.api import ApiLink
 from appliance.config import Settings, load_resolved
 from appliance.control.admin import AdminServer
 from appliance.control.administration import Administration
@@ -365,7 +366,7 @@ class _Control:
             case "signer":
                 self._signing.attach(Channel(sock, messages.SignerLink))
             case "api":
-                self._rest.attach(Channel(sock, messages.ApiLink, limit=16 << 20, longest=8 << 20))
+                self._rest.attach(Channel(sock, ApiLink, limit=16 << 20, longest=8 << 20))
             case "charon":
                 self._tunnels.attach(Channel(sock, messages.TunnelLink))
             case "syslog":

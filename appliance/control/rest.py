@@ -33,6 +33,7 @@ from appliance.channel.admin import (
 )
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
+from appliance.channel.messages.api import RequestAnswered, RequestMade, RestCalled, RestServed, TokensStated
 from appliance.control.administration import Administration
 from appliance.control.rest_proof import Askers, UnprovenError
 from appliance.control.tokens import Tokens
@@ -67,7 +68,7 @@ class RestLink:
         self._askers = Askers(tokens, require_proof=require_proof)
         self._trail = trail
         self._link = Link(self._received, self._lost)
-        self._waiting: deque[messages.RequestMade] = deque()
+        self._waiting: deque[RequestMade] = deque()
         self._worker: asyncio.Task[None] | None = None  # of the present link
         self._slow: set[asyncio.Task[None]] = set()
         self._workers: set[asyncio.Task[None]] = set()  # that, and those of links that ended amid a request
@@ -82,7 +83,7 @@ class RestLink:
 
     def _received(self, message: object) -> None:
         match message:
-            case messages.RequestMade(number):
+            case RequestMade(number):
                 if len(self._waiting) >= _MOST_WAITING:
                     text = "too many requests wait for the appliance: try again"
                     self._send_answer(number, AdminAnswer(False, error=text, trouble="busy"))
@@ -92,9 +93,9 @@ class RestLink:
                     self._worker = asyncio.get_running_loop().create_task(self._work(self._link.channel))
                     self._workers.add(self._worker)
                     self._worker.add_done_callback(self._workers.discard)
-            case messages.RestCalled():
+            case RestCalled():
                 self._record(message)
-            case messages.RestServed(pin):
+            case RestServed(pin):
                 self._served(pin)
             case _:
                 self._link.close()
@@ -109,7 +110,7 @@ class RestLink:
                 await self._serve(channel, made)
             await asyncio.sleep(0)
 
-    def _begin(self, channel: Channel | None, made: messages.RequestMade) -> None:
+    def _begin(self, channel: Channel | None, made: RequestMade) -> None:
         """Serve beside the others what waits for charon, the signer, the recorder or a topic's messages."""
         if len(self._slow) >= _MOST_SLOW:
             text = "too many requests that take a while are under way: try again"
@@ -119,12 +120,12 @@ class RestLink:
         self._slow.add(task)
         task.add_done_callback(self._slow.discard)
 
-    async def _serve(self, channel: Channel | None, made: messages.RequestMade) -> None:
+    async def _serve(self, channel: Channel | None, made: RequestMade) -> None:
         answer = await self._answer(made)
         if channel is self._link.channel:
             self._send_answer(made.number, answer)
 
-    async def _answer(self, made: messages.RequestMade) -> AdminAnswer[Any]:
+    async def _answer(self, made: RequestMade) -> AdminAnswer[Any]:
         if type(made.request) in _CHANGES and self._trail.obstacle is not None:
             return AdminAnswer(False, error=self._trail.obstacle, trouble="failed")
         try:
@@ -139,7 +140,7 @@ class RestLink:
             _log.exception("a request of the api failed", request=type(made.request).__name__)
             return AdminAnswer(False, error=f"a defect of rosrv: {type(error).__name__}", trouble="failed")
 
-    def _refused(self, made: messages.RequestMade, error: UnprovenError) -> None:
+    def _refused(self, made: RequestMade, error: UnprovenError) -> None:
         asked = made.asked
         self._trail.happened(
             "order refused",
@@ -153,7 +154,7 @@ class RestLink:
             verb=verb_of(made.request),
         )
 
-    def _record(self, call: messages.RestCalled) -> None:
+    def _record(self, call: RestCalled) -> None:
         denied = call.status in _DENIED or (call.method in _ORDERS and call.status >= 400 and not call.dry)
         self._trail.happened(
             "rest call",
@@ -173,10 +174,10 @@ class RestLink:
 
     def state_tokens(self) -> None:
         """Tell the api what tokens may be used."""
-        self._send(messages.TokensStated(self._tokens.usable()))
+        self._send(TokensStated(self._tokens.usable()))
 
     def _send_answer(self, number: int, answer: AdminAnswer[Any]) -> None:
-        self._send(messages.RequestAnswered(number, encode(answer)))
+        self._send(RequestAnswered(number, encode(answer)))
 
     def _send(self, message: messages.Message) -> None:
         try:

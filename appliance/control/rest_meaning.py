@@ -17,7 +17,7 @@ import msgspec
 
 from appliance.channel import admin
 from appliance.channel.admin import CHANGES, OPERATIONS, PARAMETERS, Operation
-from appliance.channel.messages import Asked
+from appliance.channel.messages.api import Asked
 
 _TAG = re.compile(r'"([\x21\x23-\x7e]{1,90})"')
 _NO = frozenset({"0", "false", "off", "no", "f", "n"})

@@ -19,7 +19,7 @@ import time
 from appliance.audit.record import Severity
 from appliance.channel import admin
 from appliance.channel.answers.tokens import Challenge, TokenRole, may
-from appliance.channel.messages import Asked, RequestMade
+from appliance.channel.messages.api import Asked, RequestMade
 from appliance.control.challenges import SECONDS, ChallengeRefusedError, Challenges
 from appliance.control.rest_meaning import NoOrderError, meant
 from appliance.control.tokens import Tokens

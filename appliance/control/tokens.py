@@ -11,7 +11,7 @@ from typing import cast
 from appliance.audit_trail import AuditTrail
 from appliance.channel import admin
 from appliance.channel.answers import tokens as answers
-from appliance.channel.messages import TokenKept
+from appliance.channel.messages.api import TokenKept
 from appliance.store.database import StoreError
 from appliance.store.state import StateStore
 from appliance.store.tokens import BadTokenNameError, TokenRow, make_token

@@ -18,6 +18,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import (
     Encoding,
@@ -31,7 +32,6 @@ from appliance.ages import AgeClock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child import Child
-from appliance.config import load_resolved
 from appliance.ipsec.authority import Authority
 from appliance.ipsec.authority_key import Kind, read_passphrase
 from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints, newest_signing
@@ -42,6 +42,23 @@ from appliance.whole_files import write_whole
 
 KEY_FILE = "audit.key"
 PUBLIC_KEY_FILE = "audit.pub"
+
+
+class _Audit(msgspec.Struct):
+    retention_days: float | None
+    retention_bytes: int | None
+
+
+class _Ipsec(msgspec.Struct):
+    ca: Kind
+
+
+class _Settings(msgspec.Struct):
+    """What of the settings is read here, as the supervisor has written it; the signer takes no part in the rest."""
+
+    state: str
+    audit: _Audit
+    ipsec: _Ipsec
 
 
 def load_or_create_key(directory: Path) -> Ed25519PrivateKey:
@@ -144,10 +161,9 @@ class Signer:
 
 def main(lifeline_fd: int, config: Path, passphrase: int | None) -> None:
     """Be the signer: `lifeline_fd` is the lifeline's descriptor, `passphrase` that of the file that has it."""
-    settings = load_resolved(config)
-    audit = settings.audit
-    kept = Kept(audit.retention_days, None if audit.retention_bytes is None else int(audit.retention_bytes))
-    serve(lifeline_fd, settings.state / "signer", settings.ipsec.ca, passphrase, kept)
+    settings = msgspec.json.decode(config.read_bytes(), type=_Settings)
+    kept = Kept(settings.audit.retention_days, settings.audit.retention_bytes)
+    serve(lifeline_fd, Path(settings.state, "signer"), settings.ipsec.ca, passphrase, kept)
 
 
 def serve(

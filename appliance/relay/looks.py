@@ -5,15 +5,20 @@ is bounded: `ros/message_view.py` cuts long values, and a look has at most `MOST
 for a look and a publisher. A topic that nobody looks into costs nothing.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from appliance import late
 from appliance.channel.messages import LookWanted, Message, MessageSeen
 from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.topic import RelayedTopic
-from appliance.ros.message_view import PublisherReader
+
+if TYPE_CHECKING:
+    from appliance.ros.message_view import PublisherReader
 
 MOST_LOOKS = 8
 MOST_MESSAGES = 20
@@ -51,7 +56,7 @@ class Looks:
         for number in list(self._open):
             self.end(number)
 
-    def _see(self, number: int, topic: RelayedTopic, reader: "_Reader", batch: Batch) -> None:
+    def _see(self, number: int, topic: RelayedTopic, reader: _Reader, batch: Batch) -> None:
         position = 0
         while position < len(batch.view) and self._left.get(number, 0) > 0:
             self._left[number] -= 1
@@ -68,11 +73,12 @@ class _Reader:
     def __init__(self, topic: RelayedTopic) -> None:
         self._topic = topic
         self._header: Mapping[str, str] | None = None
-        self._reader = PublisherReader({})
+        self._view = late.load("appliance.ros.message_view")
+        self._reader: PublisherReader = self._view.PublisherReader({})
 
     def read(self, data: bytes) -> tuple[str, dict[str, Any], str]:
         """The type, the fields, and why there are none but the first bytes."""
         header = self._topic.header or {}
         if header is not self._header:
-            self._header, self._reader = header, PublisherReader(header)
+            self._header, self._reader = header, self._view.PublisherReader(header)
         return self._reader.type, *self._reader.read(data)

@@ -30,6 +30,7 @@ from appliance.rosmop.agenda import Agenda, Patience
 from appliance.rosmop.compile.events import EventCode
 from appliance.rosmop.compile.specification import Compiled, compile_files, findings_of
 from appliance.rosmop.execution import Asked, Execution, OnFault
+from appliance.rosmop.happened import NOBODY, Sender
 from appliance.rosmop.monitor import Monitor, Step, monitors_of
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding, Position
@@ -42,7 +43,6 @@ from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.parser import parse
 from appliance.rosmop.walks import Walker, Walks, walks_of
-from appliance.rosmop.why import NOBODY, Sender
 
 
 def _never() -> bool:

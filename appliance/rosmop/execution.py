@@ -12,6 +12,7 @@ from typing import Literal
 
 from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.faults import explain
+from appliance.rosmop.happened import NOBODY, Sender
 from appliance.rosmop.logics.interface import Categories, RunFaultError
 from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step
 from appliance.rosmop.outcomes import DROPPED, Fault, Outcome, Verdict
@@ -19,7 +20,7 @@ from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.context import FOLDED_NS, FaultError, LogLine
 from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.slices import Key, Slice
-from appliance.rosmop.why import NOBODY, Bound, Sender, of_slice
+from appliance.rosmop.why import Bound, of_slice
 
 OnFault = Literal["drop", "pass"]
 Asked = Callable[[Verdict, int], bool]

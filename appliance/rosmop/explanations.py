@@ -7,9 +7,9 @@ import datetime
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from appliance import late
+from appliance.rosmop.happened import SEQ, Happened
 from appliance.rosmop.outcomes import DROPPED, Fault, Outcome, Verdict, named
-from appliance.rosmop.subformulas import deciding
-from appliance.rosmop.why import SEQ, Happened
 
 _EACH_END = 5
 """So many of the first and of the last events are told; how many there are between them is said."""
@@ -92,7 +92,7 @@ def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
     said["fewest"] = why.fewest
     if why.since is not None:
         said["since"] = moment(why.since)
-    decided = deciding(verdict.source, why)
+    decided = late.load("appliance.rosmop.subformulas").deciding(verdict.source, why)
     if decided:
         said["decided"] = decided
     return {"why": said}

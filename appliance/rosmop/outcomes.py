@@ -6,11 +6,11 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 from appliance.rosmop.compile.module import Site
+from appliance.rosmop.happened import Explanation
 from appliance.rosmop.logics.interface import Source
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.context import LogLine, Published
 from appliance.rosmop.runtime.wire import Buffer
-from appliance.rosmop.why import Explanation
 
 Result = Literal["passed", "changed", "dropped"]
 

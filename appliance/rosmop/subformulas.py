@@ -5,10 +5,10 @@ What is looked at are the few events of an explanation, so this is the meaning i
 
 from collections.abc import Callable, Iterator, Sequence
 
+from appliance.rosmop.happened import Explanation
 from appliance.rosmop.logics import mtl, ptcaret, ptltl
 from appliance.rosmop.logics.formula import Bounds, Formula, Syntax, nodes, read_formula
 from appliance.rosmop.logics.interface import Source
-from appliance.rosmop.why import Explanation
 
 _SYNTAXES: dict[str, Syntax] = {"ptltl": ptltl.SYNTAX, "mtl": mtl.SYNTAX, "ptcaret": ptcaret.SYNTAX}
 _BOOLEAN: dict[str, Callable[[list[bool]], bool]] = {

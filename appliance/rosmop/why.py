@@ -21,6 +21,7 @@ import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from appliance.rosmop.happened import NOBODY, Explanation, Happened, Sender
 from appliance.rosmop.logics.automaton import Automaton
 from appliance.rosmop.logics.bounded import BoundedRun
 from appliance.rosmop.logics.interface import (
@@ -61,28 +62,6 @@ CLOCKED_ROOM = _COUNT.size + _RUN.size * RUNS + ENTRY.size * RING
 """Bytes of `ClockedSteps.room`."""
 
 
-class Sender(NamedTuple):
-    """Who sent a message (0: nobody; numbered by who has the monitors), and its number, if it has one by its `kind`."""
-
-    source: int = 0
-    number: int = 0
-    kind: int = 0
-
-
-NOBODY = Sender()
-NO_NUMBER, SEQ = range(2)
-"""Kinds of numbers: none; `seq` of the header."""
-
-
-class Happened(NamedTuple):
-    """An event (its number in the specification), when, whose message it was; the state after it, if it has a name."""
-
-    event: int
-    time: int
-    sender: Sender
-    state: str = ""
-
-
 class Bound(NamedTuple):
     """An event of a parametric specification that happened: which parameters (by number) it bound, and to what (`key`
     has True before the values).
@@ -98,17 +77,6 @@ class Bound(NamedTuple):
     sender: Sender
     creates: bool
     everywhere: bool = True
-
-
-class Explanation(NamedTuple):
-    """Events that alone give a verdict. None of them can be left out if they are the `fewest`.
-
-    `since`: they give it to the property as it was at this time (ns), after events that are not kept any more.
-    """
-
-    events: tuple[Happened, ...]
-    fewest: bool = True
-    since: int | None = None
 
 
 class Exits:

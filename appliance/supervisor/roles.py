@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from appliance.inventory import DPKG
+from appliance.shipped import DPKG
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.ports import first_free
 from appliance.supervisor.walls.folders import around, runnable

@@ -6,12 +6,12 @@ process cannot be told anything that is not written here. A struct that travels 
 
 Strings from strangers (names, header values) are carried as values and never interpreted on the way.
 
-A message that is written in one of these files is one of `messages`: nothing else is to be listed.
+A message that is written in one of these files is one of `messages`: nothing else is to be listed. But for those of
+the link to the api, which bring every request of operators: only its two ends import `messages.api`.
 """
 
 # ruff: noqa: F403  a new message is listed by being written
 from appliance.channel.answers.status import ProcessInfo as ProcessInfo
-from appliance.channel.messages.api import *
 from appliance.channel.messages.forwarding import *
 from appliance.channel.messages.lifeline import *
 from appliance.channel.messages.message import *

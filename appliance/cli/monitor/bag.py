@@ -19,8 +19,8 @@ from appliance.cli.monitor.input import usage_error
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.happened import Sender
 from appliance.rosmop.outcomes import Outcome, Verdict, bound
-from appliance.rosmop.why import Sender
 
 _OWN = "/rosrv"  # the appliance: what monitors publish is not given to monitors
 # What `rosbags` raises for a damaged bag, beside an error of its own.

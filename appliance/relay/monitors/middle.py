@@ -37,8 +37,8 @@ from appliance.relay.monitors.observer import Observer, refusal
 from appliance.relay.monitors.places import NOWHERE, Place, Senders
 from appliance.relay.monitors.trials import Trials
 from appliance.relay.report import Reporter
+from appliance.rosmop.happened import Sender
 from appliance.rosmop.runtime.context import Published
-from appliance.rosmop.why import Sender
 
 if TYPE_CHECKING:
     from appliance.rosmop.engine import MonitorSet

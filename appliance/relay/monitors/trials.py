@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, NamedTuple
 from appliance.relay.loop import Loop, Timer
 from appliance.relay.monitors.observer import Observer
 from appliance.relay.monitors.places import NOWHERE, Place, Sighting
+from appliance.rosmop.happened import Sender
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.runtime.context import TRIAL_BUDGET
-from appliance.rosmop.why import Sender
 
 if TYPE_CHECKING:
     from appliance.rosmop.engine import MonitorSet, Tapped

@@ -23,6 +23,7 @@ import struct
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from appliance.rosmop.happened import NO_NUMBER, SEQ
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.assembly import PAGE, assembled
 from appliance.rosmop.ir.layout import NOW, POSITION, ROOM, SAID, SURE, UNDO, Cells, NotScalarError
@@ -46,7 +47,7 @@ from appliance.rosmop.ir.wasm import (
     unsigned,
 )
 from appliance.rosmop.runtime.context import BUDGET
-from appliance.rosmop.why import CLOCKED_ROOM, ENTRY, KEPT, NO_NUMBER, RING, RUNS, SEQ
+from appliance.rosmop.why import CLOCKED_ROOM, ENTRY, KEPT, RING, RUNS
 
 EFFECT = 4
 """Where the address of the last effect stands."""

@@ -8,7 +8,7 @@ import pytest
 
 from appliance.api.access import Doorkeeper
 from appliance.api.problems import ProblemError
-from appliance.channel.messages import TokenKept
+from appliance.channel.messages.api import TokenKept
 from appliance.store import tokens
 from appliance.store.tokens import TokenRow, make_token
 

@@ -9,11 +9,10 @@ import pytest
 
 from appliance.api.access import Bearer
 from appliance.api.control import ControlAwayError, ControlLink
-from appliance.channel import messages
 from appliance.channel.admin import AdminAnswer, StatusWanted, encode
 from appliance.channel.answers.status import Status
 from appliance.channel.channel import Channel
-from appliance.channel.messages import RestCalled, TokenKept
+from appliance.channel.messages.api import ApiLink, RequestAnswered, RestCalled, TokenKept, TokensStated
 from tests.support.answers import example
 from tests.support.heard import Heard
 
@@ -23,7 +22,7 @@ class Control:
 
     def __init__(self, link: ControlLink, ends: list[Channel]) -> None:
         here, there = socket.socketpair()
-        api, self.channel = Channel(here, messages.ApiLink), Channel(there, messages.ApiLink)
+        api, self.channel = Channel(here, ApiLink), Channel(there, ApiLink)
         ends += [api, self.channel]
         link.attach(api)
         self._ear = Heard(self.channel)
@@ -68,9 +67,7 @@ def test_each_question_gets_its_own_answer() -> None:
         asked = [asyncio.create_task(link.ask(StatusWanted(), bearer(f"who{one}"))) for one in range(3)]
         for made in reversed(await there.until(3)):
             there.channel.send(
-                messages.RequestAnswered(
-                    made.number, encode(AdminAnswer(True, example(Status, probe=made.shown)))
-                )
+                RequestAnswered(made.number, encode(AdminAnswer(True, example(Status, probe=made.shown))))
             )
         assert [(await one).given().probe for one in asked] == ["who0", "who1", "who2"]
 
@@ -123,7 +120,7 @@ def test_what_happened_meanwhile_is_told_to_the_next_control() -> None:
         there = control()
         assert not link.connected
         token = TokenKept("0123456789ab", "a", "viewer", b"", b"", 1.0)
-        there.channel.send(messages.TokensStated([token]))
+        there.channel.send(TokensStated([token]))
         heard = await there.until(1000)
         assert [one.path for one in heard] == [f"/{number}" for number in range(100, 1100)]
         assert tokens == [token]
@@ -141,7 +138,7 @@ def test_what_cannot_be_told_keeps_nothing_else_from_being_told() -> None:
         link.tell(call(2))
         there = control()
         token = TokenKept("0123456789ab", "a", "viewer", b"", b"", 1.0)
-        there.channel.send(messages.TokensStated([token]))
+        there.channel.send(TokensStated([token]))
         assert [one.path for one in await there.until(2)] == ["/1", "/2"]
         assert tokens == [token]
         link.tell(call(3))

@@ -5,7 +5,7 @@ from typing import Any
 import msgspec
 
 from appliance.api.journal import Journal
-from appliance.channel.messages import RestCalled
+from appliance.channel.messages.api import RestCalled
 
 
 def answered(journal: Journal, **changes: Any) -> None:

@@ -9,6 +9,7 @@ import pytest
 from appliance.channel import admin, messages
 from appliance.channel.admin import answer_to
 from appliance.channel.answers.graph import TopicMessage
+from appliance.channel.messages import api
 from appliance.control.administration import Orders, request_of
 from appliance.control.looks import Looks
 
@@ -74,7 +75,7 @@ def test_one_method_answers_each_request_with_what_is_said(request_kind: Any) ->
 def test_nothing_without_a_type_crosses_between_processes() -> None:
     """No message, request or answer has a field that may hold anything: `Any`, `object`, `dict[str, Any]`."""
     kinds = [
-        *(one for _name, one in inspect.getmembers(messages, inspect.isclass)),
+        *(one for file in (messages, api) for _name, one in inspect.getmembers(file, inspect.isclass)),
         *REQUESTS,
         *map(answer_to, REQUESTS),
     ]

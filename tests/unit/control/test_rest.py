@@ -12,7 +12,16 @@ from appliance.channel import messages
 from appliance.channel.admin import AdminAnswer, AnyRequest, HostEnrol, PolicyLoad, StatusWanted, decode
 from appliance.channel.answers.status import Status
 from appliance.channel.channel import Channel, ChannelClosedError
-from appliance.channel.messages import Asked, TokenKept
+from appliance.channel.messages.api import (
+    ApiLink,
+    Asked,
+    RequestAnswered,
+    RequestMade,
+    RestCalled,
+    RestServed,
+    TokenKept,
+    TokensStated,
+)
 from appliance.control.rest import RestLink
 from appliance.store.tokens import TokenRow, make_token
 from tests.support.answers import example
@@ -28,10 +37,10 @@ def kept(row: TokenRow) -> TokenKept:
     return TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires, row.keys.reading)
 
 
-def loading(number: int, text: str, shown: str = TOKEN) -> messages.RequestMade:
+def loading(number: int, text: str, shown: str = TOKEN) -> RequestMade:
     """A policy to load, as an honest api passes it on."""
     asked = Asked("10.0.0.1", "POST", "/v1/policy", "*", "text/plain", "", text.encode())
-    return messages.RequestMade(number, PolicyLoad(text), shown, asked)
+    return RequestMade(number, PolicyLoad(text), shown, asked)
 
 
 class Everything:
@@ -75,8 +84,8 @@ class Api:
     def __init__(self, world: Everything, link: RestLink) -> None:
         here, there = socket.socketpair()
         self.raw = there
-        self.channel = Channel(there, messages.ApiLink)
-        control = Channel(here, messages.ApiLink)
+        self.channel = Channel(there, ApiLink)
+        control = Channel(here, ApiLink)
         world.ends += [self.channel, control]
         self.closed = asyncio.Event()
         link.attach(control)
@@ -105,7 +114,7 @@ def run(
     asyncio.run(whole())
 
 
-def answer_of(message: messages.RequestAnswered) -> AdminAnswer[Status]:
+def answer_of(message: RequestAnswered) -> AdminAnswer[Status]:
     """What was answered; a status, if anything."""
     return decode(message.answer, StatusWanted())
 
@@ -115,7 +124,7 @@ def test_tokens_are_told_at_once_and_after_every_change() -> None:
 
     async def play(world: Everything, link: RestLink) -> None:
         api = Api(world, link)
-        assert await api.until(1) == [messages.TokensStated([kept(VIEWER), kept(ADMIN)])]
+        assert await api.until(1) == [TokensStated([kept(VIEWER), kept(ADMIN)])]
         link.state_tokens()
         assert len(await api.until(2)) == 2
 
@@ -130,8 +139,8 @@ def test_enrolments_hold_nobody_up() -> None:
         world.go.clear()
         api = Api(world, link)
         for number in range(20):
-            api.channel.send(messages.RequestMade(number, HostEnrol(f"h{number}", "request", "10.0.0.1")))
-        api.channel.send(messages.RequestMade(99, StatusWanted(), TOKEN))
+            api.channel.send(RequestMade(number, HostEnrol(f"h{number}", "request", "10.0.0.1")))
+        api.channel.send(RequestMade(99, StatusWanted(), TOKEN))
         heard = (await api.until(6))[1:]
         assert [answer_of(one).trouble for one in heard if one.number != 99] == ["busy"] * 4
         assert [answer_of(one).ok for one in heard if one.number == 99] == [True]
@@ -149,11 +158,11 @@ def test_what_it_is_recognised_by_is_passed_on() -> None:
     async def play(world: Everything, link: RestLink) -> None:
         api = Api(world, link)
         pin = "sha256//" + "A" * 43 + "="
-        api.channel.send(messages.RestServed(pin))
-        api.channel.send(messages.RequestMade(1, StatusWanted(), TOKEN))
+        api.channel.send(RestServed(pin))
+        api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
         await api.until(2)
         assert pins == [pin]
-        api.channel.send(messages.RestServed("$(reboot)"))
+        api.channel.send(RestServed("$(reboot)"))
         async with asyncio.timeout(20):
             await api.closed.wait()
         assert pins == [pin]
@@ -167,9 +176,7 @@ def test_answers_bear_their_numbers_in_order() -> None:
     async def play(world: Everything, link: RestLink) -> None:
         api = Api(world, link)
         for number in (7, 3, 9):
-            api.channel.send(
-                messages.RequestMade(number, StatusWanted(), VIEWER_TOKEN if number == 3 else TOKEN)
-            )
+            api.channel.send(RequestMade(number, StatusWanted(), VIEWER_TOKEN if number == 3 else TOKEN))
         heard = await api.until(4)
         assert [one.number for one in heard[1:]] == [7, 3, 9]
         assert [answer_of(one).given().nodes for one in heard[1:]] == [1, 2, 3]
@@ -185,7 +192,7 @@ def test_more_than_may_wait_are_told_so_at_once() -> None:
         world.go.clear()
         api = Api(world, link)
         for number in range(200):
-            api.channel.send(messages.RequestMade(number, StatusWanted(), TOKEN))
+            api.channel.send(RequestMade(number, StatusWanted(), TOKEN))
         heard = await api.until(1 + 200 - 65)
         assert {answer_of(one).trouble for one in heard[1:]} == {"busy"}
         world.go.set()
@@ -201,7 +208,7 @@ def test_a_defect_is_one_answer() -> None:
     async def play(world: Everything, link: RestLink) -> None:
         api = Api(world, link)
         api.channel.send(loading(1, "defect"))
-        api.channel.send(messages.RequestMade(2, StatusWanted(), TOKEN))
+        api.channel.send(RequestMade(2, StatusWanted(), TOKEN))
         _tokens, failed, served = await api.until(3)
         assert (answer_of(failed).ok, answer_of(failed).trouble) == (False, "failed")
         assert "secret" not in answer_of(failed).error
@@ -217,7 +224,7 @@ def test_nothing_is_changed_while_the_log_cannot_be_written() -> None:
         world.obstacle = "the audit log cannot be written: disk full"
         api = Api(world, link)
         api.channel.send(loading(1, "[Nodes]"))
-        api.channel.send(messages.RequestMade(2, StatusWanted(), TOKEN))
+        api.channel.send(RequestMade(2, StatusWanted(), TOKEN))
         _tokens, refused, served = await api.until(3)
         assert (answer_of(refused).trouble, answer_of(refused).error) == ("failed", world.obstacle)
         assert answer_of(served).ok
@@ -233,7 +240,7 @@ def test_a_change_in_a_name_that_may_not_is_refused() -> None:
         api = Api(world, link)
         for number, shown in enumerate(("operator", "disk", "", VIEWER_TOKEN)):
             api.channel.send(loading(number, "[Nodes]", shown))
-        api.channel.send(messages.RequestMade(8, StatusWanted(), VIEWER_TOKEN))
+        api.channel.send(RequestMade(8, StatusWanted(), VIEWER_TOKEN))
         api.channel.send(loading(9, "[Nodes]"))
         answers = (await api.until(7))[1:]
         assert [answer_of(one).trouble for one in answers] == ["forbidden"] * 4 + ["", ""]
@@ -251,7 +258,7 @@ def test_what_is_not_of_the_link_ends_it() -> None:
             msgspec.msgpack.encode(token),
             msgspec.msgpack.encode(messages.Stop()),
             b"\xc1nonsense",
-            msgspec.msgpack.encode(messages.TokensStated([])),
+            msgspec.msgpack.encode(TokensStated([])),
         ):
             api = Api(world, link)
             await api.until(1)
@@ -260,7 +267,7 @@ def test_what_is_not_of_the_link_ends_it() -> None:
                 await api.closed.wait()
         assert world.asked == []
         api = Api(world, link)
-        api.channel.send(messages.RequestMade(1, StatusWanted(), TOKEN))
+        api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
         assert answer_of((await api.until(2))[1]).ok
 
     run(play)
@@ -273,11 +280,11 @@ def test_the_next_api_does_not_wait_for_the_last_ones_request() -> None:
         world.go.clear()
         first = Api(world, link)
         for number in range(3):
-            first.channel.send(messages.RequestMade(number, StatusWanted(), VIEWER_TOKEN))
+            first.channel.send(RequestMade(number, StatusWanted(), VIEWER_TOKEN))
         await first.until(1)
         first.channel.close()
         second = Api(world, link)
-        second.channel.send(messages.RequestMade(9, StatusWanted(), TOKEN))
+        second.channel.send(RequestMade(9, StatusWanted(), TOKEN))
         await second.until(1)
         world.go.set()
         assert (await second.until(2))[1].number == 9
@@ -291,11 +298,11 @@ def test_an_api_that_does_not_read_loses_its_link() -> None:
 
     async def play(world: Everything, link: RestLink) -> None:
         here, there = socket.socketpair()
-        control = Channel(here, messages.ApiLink, limit=100_000)
+        control = Channel(here, ApiLink, limit=100_000)
         link.attach(control)
         for _ in range(5000):
             link.state_tokens()
-        peer = Channel(there, messages.ApiLink)
+        peer = Channel(there, ApiLink)
         world.ends += [control, peer]
         heard = 0
         async with asyncio.timeout(20):
@@ -315,9 +322,9 @@ def test_calls_are_recorded_with_their_outcome() -> None:
 
     async def play(world: Everything, link: RestLink) -> None:
         api = Api(world, link)
-        api.channel.send(messages.RestCalled("10.0.0.1", "alice", "GET", "/v1/policy", 200, "", 12))
-        api.channel.send(messages.RestCalled("10.0.0.2", "", "GET", "/" + "x" * 5000, 401, "no token", 5, 3))
-        api.channel.send(messages.RequestMade(1, StatusWanted(), TOKEN))
+        api.channel.send(RestCalled("10.0.0.1", "alice", "GET", "/v1/policy", 200, "", 12))
+        api.channel.send(RestCalled("10.0.0.2", "", "GET", "/" + "x" * 5000, 401, "no token", 5, 3))
+        api.channel.send(RequestMade(1, StatusWanted(), TOKEN))
         await api.until(2)
         served, refused = world.recorded
         assert (served["event"], served["decision"], served["who"]) == ("rest call", "allow", "alice")

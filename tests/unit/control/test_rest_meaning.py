@@ -20,13 +20,13 @@ from appliance.api.gate import Gate
 from appliance.api.history import History
 from appliance.api.journal import Journal
 from appliance.api.services import Services
-from appliance.channel import admin, messages
+from appliance.channel import admin
 from appliance.channel.admin import CHANGES, OPERATIONS, A, AdminAnswer, AdminRequest
 from appliance.channel.answers.graph import Registrations
 from appliance.channel.answers.hosts import Endpoint
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.policy import PolicyKnown
-from appliance.channel.messages import Asked
+from appliance.channel.messages.api import Asked, RequestMade, TokenKept
 from appliance.config import ApiLimits, Settings
 from appliance.control.rest_meaning import NoOrderError, meant
 from appliance.store.tokens import make_token
@@ -96,7 +96,7 @@ class Listening(ControlLink):
 
     def __init__(self) -> None:
         super().__init__(lambda _tokens: None, lambda: None)
-        self.orders: list[messages.RequestMade] = []
+        self.orders: list[RequestMade] = []
 
     async def ask(
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float = 1.0
@@ -116,7 +116,7 @@ def api() -> tuple[Gate, Listening, dict[str, str]]:
     }
     door, control, journal = Doorkeeper(10), Listening(), Journal(lambda _call: None)
     door.state([
-        messages.TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
+        TokenKept(row.id, row.name, row.role, row.salt, row.hash, row.expires)
         for row, _token in made.values()
     ])  # fmt: skip
     limits = ApiLimits(burst=100_000)
@@ -135,7 +135,7 @@ def application(control: ControlLink, door: Doorkeeper, journal: Journal) -> Fas
     return build_app(Services(Settings(), control, door, journal, asyncio.Event(), History(nothing)))
 
 
-def ordered(method: str, target: str, body: Any, tag: str = "*") -> list[messages.RequestMade]:
+def ordered(method: str, target: str, body: Any, tag: str = "*") -> list[RequestMade]:
     """What an honest api asks of control for a request of whoever may make it."""
     gate, control, tokens = api()
     token = tokens["investigator" if target == "/v1/recordings/memory" else "admin"]

@@ -13,10 +13,10 @@ import msgspec
 import pytest
 
 from appliance.audit.record import Severity
-from appliance.channel import admin, messages
+from appliance.channel import admin
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, AnyRequest, TokenAdd, TokenRevoke, decode
 from appliance.channel.channel import Channel
-from appliance.channel.messages import Asked
+from appliance.channel.messages.api import ApiLink, Asked, RequestAnswered, RequestMade
 from appliance.control.rest import RestLink
 from appliance.control.tokens import Tokens
 from appliance.order_proof import proof_of, reading_key, statement
@@ -67,7 +67,7 @@ class Api:
 
     def __init__(self, world: World) -> None:
         here, there = socket.socketpair()
-        self.channel, self.control = Channel(there, messages.ApiLink), Channel(here, messages.ApiLink)
+        self.channel, self.control = Channel(there, ApiLink), Channel(here, ApiLink)
         world.link.attach(self.control)
         self._ear = Heard(self.channel)
         self._answers = 0
@@ -77,10 +77,10 @@ class Api:
     ) -> AdminAnswer[A]:
         """Control's answer."""
         self._answers += 1
-        self.channel.send(messages.RequestMade(self._answers, request, shown, asked))
+        self.channel.send(RequestMade(self._answers, request, shown, asked))
         while True:
             for one in await self._ear.until(len(self._ear.messages)):
-                if isinstance(one, messages.RequestAnswered) and one.number == self._answers:
+                if isinstance(one, RequestAnswered) and one.number == self._answers:
                     return decode(one.answer, request)
             await self._ear.until(len(self._ear.messages) + 1)
 

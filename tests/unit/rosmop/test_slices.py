@@ -15,10 +15,10 @@ from appliance.rosmop.certify.properties import certificates_of
 from appliance.rosmop.compile.specification import compile_files
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.execution import EXPLAINED
+from appliance.rosmop.happened import Sender
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.slices import GROWING_LIMIT, MAX_BINDING
 from appliance.rosmop.syntax.parser import parse
-from appliance.rosmop.why import Sender
 from tests.support.examples import examples
 from tests.unit.rosmop.acting import definitions, load, message, refused
 from tests.unit.rosmop.interpreted import beside, check_same

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from appliance.rosmop import walks
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.execution import OnFault
+from appliance.rosmop.happened import Sender
 from appliance.rosmop.ir.feed import AREA, MAX_EFFECTS
 from appliance.rosmop.ir.layout import LINES
 from appliance.rosmop.ir.places import MOST_TEXTS
@@ -21,7 +22,6 @@ from appliance.rosmop.runtime.context import LogLine, Published
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walks import BEGINNING, Walker
-from appliance.rosmop.why import Sender
 from tests.support.examples import examples
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.interpreted import beside, check_same

@@ -11,11 +11,12 @@ import pytest
 
 from appliance.rosmop import why
 from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.happened import NOBODY, SEQ, Explanation, Happened, Sender
 from appliance.rosmop.logics import mtl, ptcaret, ptltl
 from appliance.rosmop.logics.formula import read_formula
 from appliance.rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError, Run
 from appliance.rosmop.subformulas import Meaning, deciding
-from appliance.rosmop.why import NOBODY, SEQ, ClockedSteps, Explanation, Happened, Sender, Steps, history_of
+from appliance.rosmop.why import ClockedSteps, Steps, history_of
 from tests.unit.rosmop.acting import definitions, message
 from tests.unit.rosmop.logics.driving import compiled, seeded
 from tests.unit.rosmop.logics.temporal import ARITY, BOOLEAN, Printer, draw

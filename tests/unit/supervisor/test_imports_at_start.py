@@ -12,10 +12,15 @@ NEVER: Final = {"rich", "pygments", "typer", "lark", "numpy", "pyroute2", "z3", 
 """What is not needed until somebody asks for help, loads specifications or builds a namespace."""
 
 ENTRIES: Final = {role.name: role.entry.partition(":")[0] for role in ROLES if role.entry is not None}
-_BARE = {"pydantic", "rosbags"}
+_BARE = {"pydantic", "rosbags", "appliance.inventory"}
+_LINKED = _BARE | {"appliance.channel.admin"}
 ALSO: Final = {
-    "signer": _BARE, "relay": _BARE | {"cryptography", "appliance.config"}, "control": _BARE,
-    "charon": _BARE, "syslog": _BARE, "recorder": {"pydantic"},
+    "signer": _LINKED | {"appliance.config"}, "control": _BARE,
+    "relay": _LINKED | {
+        "cryptography", "appliance.config", "appliance.ros.definitions", "appliance.rosmop.logics.formula",
+        "appliance.rosmop.why",
+    },
+    "charon": _LINKED, "syslog": _LINKED, "recorder": {"pydantic", "appliance.channel.admin"},
     "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette", "yaml", "appliance.policy.policy"},
 }  # fmt: skip
 
@@ -40,9 +45,13 @@ def test_a_process_imports_no_library_it_may_never_need(role: str) -> None:
 
 def test_the_supervisor_imports_no_library_it_may_never_need() -> None:
     """Neither does `rosrv up`, which has `typer` for its flags."""
-    assert imported("appliance.cli.main", "appliance.cli.up").isdisjoint(NEVER - {"typer"})
+    assert imported("appliance.cli.main", "appliance.cli.up").isdisjoint(
+        NEVER - {"typer"} | {"appliance.channel.admin", "appliance.inventory"}
+    )
 
 
 def test_the_launcher_of_a_program_has_no_loop_and_no_log() -> None:
     """What becomes rosmaster or rosout at once imports what it takes to give up its rights, no more."""
-    assert imported("appliance.supervisor.child").isdisjoint({"asyncio", "structlog"})
+    assert imported("appliance.supervisor.child").isdisjoint(
+        {"asyncio", "structlog", "appliance.channel.admin"}
+    )
