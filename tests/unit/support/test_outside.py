@@ -1,6 +1,7 @@
 """The tests that are tried a second time: few, each there, each with its reason; no other test is."""
 
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -94,5 +95,8 @@ def test_what_fails_beside_others_is_named_by_ci(tmp_path: Path) -> None:
 
 def by_ci(folder: Path) -> "subprocess.CompletedProcess[str]":
     """What CI makes of the tests there."""
-    command = ["ci/pytest", "-n2", "--dist=loadfile", "--import-mode=importlib", "."]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    command = ["ci/pytest", "-p", "xdist", "-n2", "--dist=loadfile", "--import-mode=importlib", "."]
+    environment = os.environ | {
+        "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"
+    }  # each would cost each process a second
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
