@@ -2,37 +2,50 @@
 
 import contextlib
 import os
+import secrets
 import stat
 import sys
 from pathlib import Path
 
 
+class NotLastingError(OSError):
+    """The file is replaced, and may be as it was before after a power cut: the disk did not say that it has it."""
+
+
 def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | None = None) -> None:
     """Replace a file, on the disk when this returns. Raises `OSError`; the file before is then as it was.
 
-    It is of `owner` (user and group), or of who writes it, before it has its name.
+    It is of `owner` (user and group), or of who writes it, before it has its name. Of several who write it at once it
+    is one's, whole. Raises `NotLastingError` when it is replaced, but not surely on the disk.
     """
-    making = path.with_name(path.name + ".new")
-    making.unlink(missing_ok=True)
-    descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    making = path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
     try:
-        with os.fdopen(descriptor, "wb") as file:
-            if owner is not None:
-                os.fchown(descriptor, *owner)
-            os.fchmod(descriptor, mode)  # whatever the mask is: the folder says who comes by
-            file.write(data)
-            file.flush()
-            os.fsync(descriptor)
+        descriptor = os.open(
+            making, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600
+        )
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                if owner is not None:
+                    os.fchown(descriptor, *owner)
+                os.fchmod(descriptor, mode)  # whatever the mask is: the folder says who comes by
+                file.write(data)
+                file.flush()
+                os.fsync(descriptor)
+            making.rename(path)
+        except BaseException:
+            making.unlink()
+            raise
     except OSError as error:  # a full disk: the system does not say of which file
-        making.unlink()
-        error.filename = str(path)
-        raise
-    making.rename(path)
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        raise OSError(error.errno, error.strerror, str(path)) from error
     try:
-        os.fsync(folder)  # else the file before could come back with the power
-    finally:
-        os.close(folder)
+        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(folder)  # else the file before could come back with the power
+        finally:
+            os.close(folder)
+    except OSError as error:
+        why = f"it is replaced, and may be as before after a power cut: {error.strerror}"
+        raise NotLastingError(error.errno, why, str(path)) from error
 
 
 def write_where_told(path: Path, data: bytes) -> None:

@@ -8,6 +8,7 @@ import datetime
 import json
 import sys
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
@@ -16,6 +17,7 @@ from rich.console import Console
 from rich.text import Text
 
 from appliance.api.moments import in_full
+from appliance.whole_files import NotLastingError, write_where_told
 
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 
@@ -39,6 +41,14 @@ def usage_error(text: str, verb: str = "rosrv") -> typer.Exit:
     """Write what was wrong with the command line; raise the result (exit status 2)."""
     typer.echo(f"{verb}: {printable(text)}", err=True)
     return typer.Exit(2)
+
+
+def write_told(path: Path, data: bytes) -> None:
+    """Write what somebody wants at a place of his choice. Raises `OSError`; what is not surely kept is told."""
+    try:
+        write_where_told(path, data)
+    except NotLastingError as error:
+        typer.echo(f"rosrv: {printable(str(path))}: {error.strerror}", err=True)
 
 
 def refused(findings: Iterable[object]) -> typer.Exit:

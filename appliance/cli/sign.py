@@ -8,10 +8,9 @@ from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key, load_ssh_private_key
 
-from appliance.cli.output import Json, say, say_json, usage_error
+from appliance.cli.output import Json, say, say_json, usage_error, write_told
 from appliance.site_keys import name_of, public_line
 from appliance.site_keys import sign as signature_of
-from appliance.whole_files import write_where_told
 
 _OPENSSH = b"-----BEGIN OPENSSH PRIVATE KEY-----"
 
@@ -34,7 +33,7 @@ def sign(
     for file, text in signatures.items():
         beside = file.with_name(f"{file.name}.sig")
         try:
-            write_where_told(beside, text.encode())
+            write_told(beside, text.encode())
         except OSError as error:
             raise usage_error(f"cannot write {beside}: {error.strerror}", verb="rosrv sign") from error
         if as_json:

@@ -1,6 +1,8 @@
 """Tests of `appliance.whole_files`."""
 
+import errno
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -8,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from appliance.whole_files import write_where_told, write_whole
+from appliance.cli.output import write_told
+from appliance.whole_files import NotLastingError, write_where_told, write_whole
 from tests.support.requirements import need_root
 
 
 def test_a_file_is_replaced_with_the_mode_that_is_said(tmp_path: Path) -> None:
-    """Whatever the mask is, and whatever an earlier life left half written; nothing stays beside it."""
+    """Whatever the mask is; nothing stays beside it."""
     path = tmp_path / "key.pem"
     path.write_text("before")
-    (tmp_path / "key.pem.new").write_text("half")
     mask = os.umask(0o077)
     try:
         write_whole(path, b"after", 0o644)
@@ -27,13 +29,52 @@ def test_a_file_is_replaced_with_the_mode_that_is_said(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_written_leaves_the_file_before(tmp_path: Path) -> None:
-    """The disk refuses: the file is as it was."""
+    """What is there is no file: it is as it was, and nothing stays beside it."""
     path = tmp_path / "position"
-    path.write_text("before")
-    (tmp_path / "position.new").mkdir()
-    with pytest.raises(OSError, match=r"position\.new"):
+    path.mkdir()
+    with pytest.raises(IsADirectoryError, match=r"/position'$"):
         write_whole(path, b"after", 0o600)
-    assert path.read_text() == "before"
+    assert [*tmp_path.rglob("*")] == [path]
+
+
+def test_of_several_who_write_a_file_at_once_it_is_one_s(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each has written its own, whole, before it takes the name: none takes what another has begun."""
+    path = tmp_path / "policy.ini"
+    rename = Path.rename
+
+    def meanwhile(making: Path, name: Path) -> Path:
+        monkeypatch.setattr(Path, "rename", rename)
+        write_whole(path, b"of another", 0o600)
+        assert making.read_bytes() == b"one's own"
+        return rename(making, name)
+
+    monkeypatch.setattr(Path, "rename", meanwhile)
+    write_whole(path, b"one's own", 0o600)
+    assert path.read_bytes() == b"one's own"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_is_not_surely_kept_is_not_told_as_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The folder cannot be brought to the disk: the file is replaced, and whoever ordered it reads what that means."""
+    path = tmp_path / "policy.ini"
+    fsync = os.fsync
+
+    def refused(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", refused)
+    with pytest.raises(NotLastingError, match=r"it is replaced, .*: Input/output error.*policy\.ini"):
+        write_whole(path, b"first", 0o600)
+    write_told(path, b"after")
+    assert path.read_bytes() == b"after"
+    said = f"rosrv: {path}: it is replaced, and may be as before after a power cut: Input/output error\n"
+    assert capsys.readouterr() == ("", said)
 
 
 def test_it_outlasts_the_machines_power(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,7 +89,9 @@ def test_it_outlasts_the_machines_power(tmp_path: Path, monkeypatch: pytest.Monk
 
     monkeypatch.setattr(os, "fsync", noted)
     write_whole(tmp_path / "key.pem", b"key", 0o600)
-    assert synced == [("key.pem.new", ["key.pem.new"]), (tmp_path.name, ["key.pem"])]
+    (making, there), folder = synced
+    assert re.fullmatch(r"key\.pem\.[0-9a-f]{8}\.new", making)
+    assert (there, folder) == ([making], (tmp_path.name, ["key.pem"]))
 
 
 def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:

@@ -9,14 +9,13 @@ import typer
 
 from appliance.cli.monitor.bag import Recorded
 from appliance.cli.monitor.input import BESIDE, Bags, usage_error
-from appliance.cli.output import Json, counted, say, say_json
+from appliance.cli.output import Json, counted, say, say_json, write_told
 from appliance.cli.progress import progress
 from appliance.learning.learner import LearningError, Learnt, learn
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.ros.message_text import BUILTINS
 from appliance.ros.standard import standard_definitions
-from appliance.whole_files import write_where_told
 
 
 def learn_monitors(
@@ -102,7 +101,7 @@ def _write(out: Path, learnt: Learnt, recorded: Definitions) -> None:
     try:
         for path, text in files.items():
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_where_told(path, text.encode("utf-8", "surrogateescape"))
+            write_told(path, text.encode("utf-8", "surrogateescape"))
     except OSError as error:
         raise usage_error(f"cannot write {out}: {error.strerror}") from error
 

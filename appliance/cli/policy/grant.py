@@ -11,11 +11,10 @@ from appliance.channel.admin import PolicyLoad, PolicyWanted
 from appliance.channel.answers.policy import Granted, Why
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.audit.errors import Errors, fail
-from appliance.cli.output import printable, say, say_json, usage_error
+from appliance.cli.output import printable, say, say_json, usage_error, write_told
 from appliance.cli.policy.in_force import say_loaded
 from appliance.cli.target import Appliance, speaks
 from appliance.cli.trials import ConfirmWithin, seconds_within
-from appliance.whole_files import write_where_told
 
 
 @speaks
@@ -86,7 +85,7 @@ def grant(
         raise typer.Exit(1)
     if write is not None:
         try:
-            write_where_told(write, _with_ends_of(write, found.text))
+            write_told(write, _with_ends_of(write, found.text))
         except OSError as error:
             raise usage_error(f"cannot write {write}: {error.strerror}") from None
     if load:

@@ -146,9 +146,10 @@ def test_the_number_of_the_list_grows_whatever_the_clock_does(
     authority = Authority(tmp_path)  # the signer was started again
     numbers += [number_of(authority.revocations([])) for _ in range(2)]
     (tmp_path / LIST_FILE).unlink()
-    (tmp_path / f"{LIST_FILE}.new").mkdir()  # nothing can be written any more
+    (tmp_path / LIST_FILE).mkdir()  # nothing can be written any more
     numbers.append(number_of(authority.revocations([])))
     assert numbers == sorted(set(numbers))
+    (tmp_path / LIST_FILE).rmdir()
     (tmp_path / LIST_FILE).write_bytes(b"")
     with pytest.raises(SignerKeyError, match="damaged"):
         Authority(tmp_path)
