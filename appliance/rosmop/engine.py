@@ -117,17 +117,22 @@ class MonitorSet:
         self._tapped_topics: frozenset[str] = frozenset()
         self.warnings: tuple[Finding, ...] = compiled.warnings
         self.compiled = compiled
+        self.interpreter = compiled.interpreter()
         self.on_fault: OnFault = on_fault
         self.patience = patience
         nodes = {node.name: node for file in files for node in file.specifications}
         self._order = tuple(nodes)
         self._monitors = monitors_of(
-            compiled, [nodes[specification.name] for specification in compiled.specifications], 0, slices
+            compiled,
+            self.interpreter,
+            [nodes[specification.name] for specification in compiled.specifications],
+            0,
+            slices,
         )
         self.steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
         self._requests: dict[tuple[str, str], tuple[Step, ...]] = {}
-        self._execution = Execution(compiled, on_fault)
+        self._execution = Execution(self.interpreter, on_fault)
         self._agenda = Agenda(self._monitors, self._execution, patience)
         self.began: tuple[str, ...] = ()
         self._walks = Walks()
@@ -138,7 +143,7 @@ class MonitorSet:
             for comparison in specification.comparisons
         ):
             for left, right in (comparison.when_true, comparison.when_false):
-                compiled.namespace |= {left: math.inf, right: 0.0}
+                self.interpreter.variables |= {left: math.inf, right: 0.0}
         self._index()
         # What is replaced goes at once: a garbage collector that had to look for it would hold up all messages.
         weakref.finalize(self, self._agenda.let_go).atexit = False
@@ -285,7 +290,7 @@ class MonitorSet:
 
     def write_module(self) -> None:
         """Write the module that `walker` offers the walks of."""
-        self._walks = walks_of(self.compiled, self._monitors, self._agenda.when_due)
+        self._walks = walks_of(self.compiled, self.interpreter, self._monitors, self._agenda.when_due)
 
     def explain_when(self, asked: Asked, tried: Asked) -> None:
         """Explain only verdicts that are asked for, by themselves and the source of the message; and those on trial."""
@@ -321,19 +326,19 @@ class MonitorSet:
         """What a shared variable of a running specification is now; raises KeyError."""
         monitor = self.monitor(name)
         monitor.come_home()
-        return self.compiled.namespace[monitor.code.variables[variable]]
+        return self.interpreter.variables[monitor.code.variables[variable]]
 
     def take_margins(self) -> Iterator[Margin]:
         """How close the comparisons of numbers came since this was asked last: of each that came up in this time, the
         nearest while it was true and the nearest while it was not.
         """
-        namespace = self.compiled.namespace
+        variables = self.interpreter.variables
         for monitor in self.monitors:
             for number, comparison in enumerate(monitor.code.comparisons):
                 for holds, sides in ((True, comparison.when_true), (False, comparison.when_false)):
-                    left, right = (namespace[name] for name in sides)
+                    left, right = (variables[name] for name in sides)
                     if not math.isinf(left):
-                        namespace[sides[0]] = math.inf
+                        variables[sides[0]] = math.inf
                         yield Margin(
                             monitor.name,
                             number,
@@ -393,7 +398,7 @@ class MonitorSet:
         `incomplete` have not seen all messages on trial: they begin anew when they are not on trial any more.
         """
         known = {
-            monitor.name: (monitor, part.compiled)
+            monitor.name: (monitor, part.interpreter.variables)
             for part in (before, *before.trials)
             for monitor in part.monitors
         }
@@ -410,17 +415,17 @@ class MonitorSet:
         return self._with_trials(outcome, tried)
 
     def _follow(
-        self, known: Mapping[str, tuple[Monitor, Compiled]], redefined: frozenset[str], time_ns: int
+        self, known: Mapping[str, tuple[Monitor, Mapping[str, Any]]], redefined: frozenset[str], time_ns: int
     ) -> Outcome:
         fresh = []
         for monitor in self.monitors:
-            earlier, compiled = known.get(monitor.name, (None, self.compiled))
+            earlier, variables = known.get(monitor.name, (None, {}))
             if (
                 earlier is not None
                 and earlier.node == monitor.node
                 and (not redefined or redefined.isdisjoint(reached(monitor.node, self.definitions)))
             ):
-                self._take_over(monitor, earlier, compiled)
+                self._take_over(monitor, earlier, variables)
             else:
                 fresh.append(monitor)
         self._index()
@@ -505,9 +510,9 @@ class MonitorSet:
 
     # The set
 
-    def _take_over(self, monitor: Monitor, before: Monitor, compiled: Compiled) -> None:
+    def _take_over(self, monitor: Monitor, before: Monitor, variables: Mapping[str, Any]) -> None:
         for name, code in monitor.code.variables.items():
-            self.compiled.namespace[code] = compiled.namespace[before.code.variables[name]]
+            self.interpreter.variables[code] = variables[before.code.variables[name]]
         for running, old in zip(monitor.properties, before.properties, strict=True):
             running.run = old.run
             running.history = running.history.follow(old.history)

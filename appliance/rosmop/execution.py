@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
-from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.faults import explain
 from appliance.rosmop.happened import NOBODY, Sender
+from appliance.rosmop.ir.interpreter import Interpreter
 from appliance.rosmop.logics.interface import Categories, RunFaultError
 from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step
 from appliance.rosmop.outcomes import DROPPED, Fault, Outcome, Verdict
@@ -32,13 +32,12 @@ EXPLAINED = 20
 class Execution:
     """Carries out what compiled specifications say, on the state that their monitors have."""
 
-    def __init__(self, compiled: Compiled, on_fault: OnFault) -> None:
+    def __init__(self, interpreter: Interpreter, on_fault: OnFault) -> None:
         self.on_fault: OnFault = on_fault
         self.asked: Asked | None = None
         """Which verdicts to explain: by themselves and the source of the message; None: all."""
-        self._module = compiled.module
-        self._namespace = compiled.namespace
-        self._turn = compiled.turn
+        self._interpreter = interpreter
+        self._turn = interpreter.turn
         self._sender = NOBODY
         self._bound: Bound | None = None
         self._explains = True
@@ -132,7 +131,7 @@ class Execution:
         """Take what was put out, published and looked at since it was collected last."""
         turn = self._turn
         outcome.log, outcome.published, outcome.looked = turn.log, turn.published, turn.looked
-        outcome.sites = self._module.sites
+        outcome.sites = self._interpreter.sites
         turn.log, turn.published, turn.looked = [], [], {}
 
     # One event
@@ -142,7 +141,8 @@ class Execution:
         try:
             has_happened = step.function(message)
         except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
-            if self._module.has_begun(step.event.action_line, error):
+            failed = self._interpreter.failed
+            if error is failed.error and failed.happened:
                 outcome.events = (*outcome.events, step.name)
             self._fault(error, step.monitor, step.event.position, outcome)
             self._block(message, outcome)
@@ -293,11 +293,11 @@ class Execution:
             if outcome.fatal is not None:
                 outcome.dropped_at = outcome.fatal.position
             elif message.cause is not None:
-                outcome.dropped_at = self._module.sites[message.cause].position
+                outcome.dropped_at = self._interpreter.sites[message.cause].position
         elif message.changed:
             outcome.result = "changed"
             outcome.buffer = message.buffer
-            sites = self._module.sites
+            sites = self._interpreter.sites
             outcome.changed_by = tuple([step.name for step, _ in writers])
             outcome.changed_at = tuple([sites[site].position for _, at in writers for site in at])
 
@@ -401,7 +401,7 @@ class Execution:
             outcome.fatal = outcome.faults[-1]
 
     def _fault(self, error: Exception, monitor: Monitor, otherwise: Position, outcome: Outcome) -> None:
-        fault: Fault = explain(error, self._module, monitor.name, otherwise)
+        fault: Fault = explain(error, self._interpreter, monitor.name, otherwise)
         monitor.faults += 1
         outcome.faults = (*outcome.faults, fault)
 
@@ -422,7 +422,7 @@ class Execution:
         for stage in range(3):
             for monitor in tuple(beginning):
                 try:
-                    self._namespace[monitor.code.start[stage]]()
+                    self._interpreter.function(monitor.code.start[stage])()
                 except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of its beginning and is recorded
                     self._fault(error, monitor, monitor.node.position, outcome)
                     monitor.broken = True

@@ -1,26 +1,26 @@
-"""From an exception of generated code to a place in the text and the values of variables."""
+"""From an exception to a place in the text and the values of variables."""
 
 import struct
 
-from appliance.rosmop.compile.module import Module, Site
+from appliance.rosmop.ir.interpreter import Failed, Interpreter
+from appliance.rosmop.ir.sites import Site, showing
 from appliance.rosmop.outcomes import Fault
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.context import FaultError, MalformedError
 
 
-def explain(error: Exception, module: Module, monitor: str, otherwise: Position) -> Fault:
-    """The fault that an exception is. `otherwise` is where it stands if the code has no better place."""
-    number, variables = module.place_of(error)
-    site = module.sites[number] if number >= 0 else Site(otherwise)
+def explain(error: Exception, interpreter: Interpreter, monitor: str, otherwise: Position) -> Fault:
+    """The fault that an exception is. `otherwise` is where it stands if there is no better place."""
+    failed = interpreter.failed if error is interpreter.failed.error else Failed()
+    site = interpreter.sites[failed.site] if failed.site >= 0 else Site(otherwise)
     values = {}
-    for name, code, show, _ in site.variables:
-        value = variables.get(code, module.namespace.get(code, _MISSING))
-        if value is not _MISSING:
-            values[name] = show(value)
+    for variable in site.variables:
+        try:
+            value = interpreter.value(variable.code, failed.variables)
+        except KeyError:  # it has none yet
+            continue
+        values[variable.name] = showing(variable.type)(value)
     return Fault(monitor, site.position, _text(error), values)
-
-
-_MISSING = object()
 
 
 def _text(error: Exception) -> str:

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from appliance.rosmop.compile.events import EventCode
 from appliance.rosmop.compile.specification import Compiled, PropertyCode, SpecificationCode
+from appliance.rosmop.ir.interpreter import Interpreter
 from appliance.rosmop.logics.interface import Run
 from appliance.rosmop.runtime.context import Context
 from appliance.rosmop.runtime.wire import Message
@@ -120,40 +121,44 @@ class Monitor:
 
 
 def monitors_of(
-    compiled: Compiled, nodes: list[tree.Specification], time_ns: int, slices: int
+    compiled: Compiled,
+    interpreter: Interpreter,
+    nodes: list[tree.Specification],
+    time_ns: int,
+    slices: int,
 ) -> tuple[Monitor, ...]:
     """The running forms of compiled specifications, in their initial state; each with at most so many slices."""
     return tuple(
-        _monitor(compiled, code, node, time_ns, slices)
+        _monitor(interpreter, code, node, time_ns, slices)
         for code, node in zip(compiled.specifications, nodes, strict=True)
     )
 
 
 def _monitor(
-    compiled: Compiled, code: SpecificationCode, node: tree.Specification, time_ns: int, slices: int
+    interpreter: Interpreter, code: SpecificationCode, node: tree.Specification, time_ns: int, slices: int
 ) -> Monitor:
-    names = compiled.namespace
+    function = interpreter.function
     properties = tuple(
         RunningProperty(
             index,
             declared,
-            tuple((category, names[declared.handlers[category]]) for category in declared.order),
+            tuple((category, function(declared.handlers[category])) for category in declared.order),
             declared.property.start(time_ns),
             history_of(declared.property, time_ns),
         )
         for index, declared in enumerate(code.properties)
     )
-    monitor = Monitor(code, node, names[code.context], properties)
+    monitor = Monitor(code, node, interpreter.contexts[code.context], properties)
     if code.slicing is not None:
-        monitor.slices = Slices(code, names, slices)
+        monitor.slices = Slices(code, interpreter.variables, slices)
     steps = [
         Step(
             monitor,
             event,
             index,
             f"{code.name}.{event.name}",
-            names[event.function],
-            key=names[event.key] if event.key else None,
+            function(event.function),
+            key=function(event.key) if event.key else None,
         )
         for index, event in enumerate(code.events)
     ]

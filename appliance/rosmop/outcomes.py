@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Literal
 
-from appliance.rosmop.compile.module import Site
 from appliance.rosmop.happened import Explanation
+from appliance.rosmop.ir.sites import Site, showing
 from appliance.rosmop.logics.interface import Source
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.context import LogLine, Published
@@ -119,7 +119,8 @@ class Outcome:
         """Where the conditions stand that were met, and the values that they compared."""
         return {
             str(site.position): {
-                name: show(value) for (name, _, show, _), value in zip(site.compared, values, strict=True)
+                each.name: showing(each.type)(value)
+                for each, value in zip(site.compared, values, strict=True)
             }
             for site, values in ((self.sites[number], values) for number, values in self.looked.items())
         }

@@ -31,8 +31,8 @@ from operator import contains, getitem
 from typing import Any
 
 from appliance.rosmop.compile.events import EventCode
-from appliance.rosmop.compile.scope import showing
 from appliance.rosmop.compile.specification import PropertyCode, SpecificationCode
+from appliance.rosmop.ir.sites import showing
 from appliance.rosmop.logics.interface import FiniteProperty, Run
 from appliance.rosmop.types import kinds
 

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, Protocol
 from appliance.rosmop.compile.program import groups
 from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, SOONER, TOLD, Feed, FeedModule, module_of
+from appliance.rosmop.ir.interpreter import Interpreter
 from appliance.rosmop.ir.kept import KeptMessage
 from appliance.rosmop.ir.layout import POSITION, REST, ROOM, SURE, UNDO, Cells
 from appliance.rosmop.ir.output import HEAD
@@ -106,7 +107,7 @@ class Home:
         self,
         machine: Machine,
         cells: Cells,
-        namespace: dict[str, Any],
+        interpreter: Interpreter,
         running: Sequence[RunningProperty],
         throttles: Sequence[tuple[Context, int, int]],
         *,
@@ -117,7 +118,7 @@ class Home:
         self.machine = machine
         self._memory = machine.memory
         self._base = cells.base
-        self._namespace = namespace
+        self._contexts, self._values = interpreter.contexts, interpreter.variables
         self._running = running
         self._throttles = throttles
         self._names = [*cells.variables]
@@ -159,7 +160,7 @@ class Home:
 
     def _enter(self) -> None:
         states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
-        values = [self._namespace[name] for name in self._names]
+        values = [self._values[name] for name in self._names]
         if self._generation:
             _LENGTH.pack_into(self._memory, self._generation, 0)
         for place, buffer in self._texts:
@@ -168,7 +169,7 @@ class Home:
             values[place] = self._entered_vector(values[place], buffer, code)
         self._cells.pack_into(self._memory, self._base, *states, *values)
         for name, kept in self._records.items():
-            kept.enter(self._memory, self._namespace[name], self._entered)
+            kept.enter(self._memory, self._values[name], self._entered)
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
         for running, address in self._clocks:
@@ -200,7 +201,7 @@ class Home:
 
     def named(self, context: str) -> str:
         """The monitor whose context has this name."""
-        return self._namespace[context].monitor  # type: ignore[no-any-return]  # a `Context`
+        return self._contexts[context].monitor
 
     def leave(self) -> None:
         """Give it back to Python."""
@@ -217,18 +218,18 @@ class Home:
         for place, _ in self._texts:
             name = self._names[place]
             at, size = found[name] & _ADDRESS, found[name] >> 32
-            found[name] = self._namespace[name] if size == BEYOND else bytes(self._memory[at : at + size])
+            found[name] = self._values[name] if size == BEYOND else bytes(self._memory[at : at + size])
         for place, _, code in self._vectors:
             name = self._names[place]
             at, count = found[name] & _ADDRESS, found[name] >> 32
             found[name] = (
-                self._namespace[name]
+                self._values[name]
                 if count == BEYOND
                 else [*struct.unpack_from(f"<{count}{code}", self._memory, at)]
             )
         for name, kept in self._records.items():
-            found[name] = kept.left(self._memory, self._namespace[name])
-        self._namespace.update(found)
+            found[name] = kept.left(self._memory, self._values[name])
+        self._values.update(found)
 
 
 def _cell(kind: Type) -> str:
@@ -513,7 +514,7 @@ class Walks(NamedTuple):
     area: memoryview | None = None
 
 
-def walks_of(compiled: Compiled, monitors: Sequence[Monitor], due: Due) -> Walks:
+def walks_of(compiled: Compiled, interpreter: Interpreter, monitors: Sequence[Monitor], due: Due) -> Walks:
     """The walkers of all topics that can have one; their monitors are told where their state is."""
     found = list(groups(compiled.specifications))
     components = [group.component for group in found]
@@ -531,11 +532,11 @@ def walks_of(compiled: Compiled, monitors: Sequence[Monitor], due: Due) -> Walks
             kept.move(machine, machine.memory[address:])
         contexts = {compiled.specifications[number].context for number in group.specifications}
         throttles = [
-            (compiled.namespace[context], site, address)
+            (interpreter.contexts[context], site, address)
             for (context, site), address in module.throttles.items()
             if context in contexts
         ]
-        home = Home(machine, cells, compiled.namespace, running, throttles, values=values, due=due)
+        home = Home(machine, cells, interpreter, running, throttles, values=values, due=due)
         for number in group.specifications:
             monitors[number].home = home
         for (topic, _), events in zip(group.component.topics, group.events, strict=True):

@@ -42,8 +42,6 @@ class EventCode:
     part: str | None = None
     service_type: str | None = None
     period_ns: int | None = None
-    action_line: int = 0
-    """The line of the code at which the action begins: what faults there has happened."""
     binds: tuple[int, ...] = ()
     """The parameters of the specification that it binds, by their numbers."""
     key: str = ""
@@ -60,7 +58,7 @@ def compile_event(
     shared: Shared, names: SpecificationNames, specification: tree.Specification, event: tree.Event
 ) -> EventCode:
     """Write the function of an event."""
-    function = shared.module.fresh("e")
+    function = shared.symbols.fresh("e")
     if isinstance(event.trigger, tree.TimerTrigger):
         return replace(_timer(shared, names, event, function), creates=creates(specification, event))
     trigger = event.trigger
@@ -72,7 +70,7 @@ def compile_event(
     bound = _bind(scope, event, trigger, kind)
     happens = _assemble(scope, event, bound, *_body(scope, event, trigger))
     whole = scope.function(function, ("m",), happens=happens)
-    action_line = shared.define(whole)
+    shared.define(whole)
     service = trigger.type if trigger.part is not None else None
     return EventCode(
         event.name,
@@ -82,7 +80,6 @@ def compile_event(
         kind,
         trigger.part,
         service,
-        action_line=action_line,
         binds=binds(names, event),
         key=_key(shared, names, event, trigger, kind) if names.parameters else "",
         creates=creates(specification, event),
@@ -107,7 +104,7 @@ def _key(
         variable.used = True
     read_fields(scope, bound)
     scope.add(form.Return(site, form.Literal(kinds.BOOL, True), tuple(variable.code for variable in values)))
-    function = shared.module.fresh("k")
+    function = shared.symbols.fresh("k")
     shared.define(scope.function(function, ("m",), happens=len(scope.lines.found)))
     return function
 
@@ -203,9 +200,9 @@ def _bind_one(scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Pa
             f"the parameter {shown(parameter.name)} of the specification is {sliced.type}, and {target} here"
         )
         raise SpecificationError.at(parameter.position, text)
-    variable = Variable(parameter.name, target, scope.module.fresh("v"), parameter.position)
+    variable = Variable(parameter.name, target, scope.symbols.fresh("v"), parameter.position)
     variable.constant = parameter.type.constant
-    variable.flag = scope.module.fresh("f")
+    variable.flag = scope.symbols.fresh("f")
     scope.declare(variable)
     return Bound(binding, field, variable)
 

@@ -16,10 +16,10 @@ from appliance.rosmop.compile import (
 from appliance.rosmop.compile.conversion import condition, constant_value, convert, number
 from appliance.rosmop.compile.margins import noted
 from appliance.rosmop.compile.places import CharacterPlace, Value, Variable, VariablePlace
-from appliance.rosmop.compile.python import constant_of
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.compile.standard_functions import CONSTANTS
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.interpreter import constant_of
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.runtime.context import FaultError
 from appliance.rosmop.runtime.numbers import f32
@@ -102,7 +102,7 @@ def _integer(scope: Scope, node: tree.Number, text: str, suffix: str) -> Value:
     raise SpecificationError.at(node.position, f"{shown(node.text)} is larger than any integer type holds")
 
 
-def folded(scope: Scope, operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
+def folded(operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
     """The value that `make` makes of the operands; if all are numbers that are known, so is what comes of them."""
     if not all(isinstance(operand.constant, int | float) for operand in operands):
         return make(*operands)
@@ -115,7 +115,7 @@ def folded(scope: Scope, operands: tuple[Value, ...], make: Callable[..., Value]
     if not kinds.is_number(value.type):
         return value
     try:
-        constant = constant_of(value.form, scope.values)
+        constant = constant_of(value.form)
     except FaultError:
         return value
     return constant_value(value.position, value.type, constant)
@@ -174,7 +174,7 @@ def _message(scope: Scope, node: tree.Expression) -> Value:
             "function": "a function has no message; pass it what it needs",
         }.get(scope.role, "there is no message here")
         raise SpecificationError.at(node.position, f"`MESSAGE` has no meaning here: {hint}")
-    scope.pending = scope.pending or scope.module.fresh("u")
+    scope.pending = scope.pending or scope.symbols.fresh("u")
     whole = form.Whole(kinds.Record(scope.message_type), scope.pending, scope.lines.site)
     return Value(whole, node.position)
 
@@ -188,7 +188,6 @@ def _unary(scope: Scope, node: tree.Unary) -> Value:
         )
     site = scope.site(node)
     return folded(
-        scope,
         (value_of(scope, node.operand),),
         lambda operand: operators.unary(node.operator, operand, node.position, site),
     )
@@ -209,7 +208,6 @@ def _step(scope: Scope, node: tree.Step) -> Value:
 def _binary(scope: Scope, node: tree.Binary) -> Value:
     operands, site = (value_of(scope, node.left), value_of(scope, node.right)), scope.site(node)
     value = folded(
-        scope,
         operands,
         lambda left, right: operators.binary(
             node.operator, operators.Operands(scope, node.position, left, right, site)
@@ -259,7 +257,7 @@ def _assigned(scope: Scope, target: Value, value: Value, site: int) -> form.Expr
 
 def _conditional(scope: Scope, node: tree.Conditional) -> Value:
     values = tuple(value_of(scope, part) for part in (node.condition, node.yes, node.no))
-    return folded(scope, values, lambda test, yes, no: _either(scope, node.position, test, yes, no))
+    return folded(values, lambda test, yes, no: _either(scope, node.position, test, yes, no))
 
 
 def _either(scope: Scope, position: Position, tested: Value, yes: Value, no: Value) -> Value:
@@ -308,7 +306,6 @@ def _member(scope: Scope, node: tree.Member) -> Value:
 def _cast(scope: Scope, node: tree.Cast) -> Value:
     target = resolve(node.type, scope.messages)
     return folded(
-        scope,
         (value_of(scope, node.operand),),
         lambda value: Value(convert(scope, value, target), node.position),
     )

@@ -69,7 +69,7 @@ def _slots(scope: Scope, field: Bound) -> list[int | str]:
 def read_fields(scope: Scope, bound: list[Bound]) -> None:
     """Write what finds and reads the fields that are used, and compares those that have constants."""
     layout = scope.messages.definitions.layout(scope.message_type or "")
-    walk = Walk(Locator(scope.module, scope.lines.found, scope.lines.site), layout, Spot(None, 0))
+    walk = Walk(Locator(scope.symbols, scope.lines.found, scope.lines.site), layout, Spot(None, 0))
     fixed: list[Bound] = []
     variable_size: list[Bound] = []
     for field in bound:

@@ -31,7 +31,7 @@ def declare_variables(shared: Shared, names: SpecificationNames, specification: 
                 names.misdeclared.add(declarator.name)
                 continue
             names.variables[declarator.name] = variable
-            shared.measures[variable.code] = shared.values.measure(variable.type)
+            shared.types[variable.code] = variable.type
 
 
 def _shared_variable(
@@ -56,7 +56,7 @@ def _shared_variable(
     return Variable(
         declarator.name,
         kind,
-        shared.module.fresh("g"),
+        shared.symbols.fresh("g"),
         declarator.position,
         shared=True,
         constant=declaration.type.constant,
@@ -91,7 +91,7 @@ def compile_start(
         write(scopes[-1], init.body)
     if len(specification.inits) > 1:
         raise SpecificationError.at(specification.inits[1].position, "`init` occurs twice")
-    functions = tuple(shared.module.fresh("i") for _ in scopes)
+    functions = tuple(shared.symbols.fresh("i") for _ in scopes)
     for scope, function in zip(scopes, functions, strict=True):
         shared.define(scope.function(function, ()))
     return functions
@@ -200,7 +200,7 @@ def _signature(shared: Shared, names: SpecificationNames, node: tree.Function) -
         variable = Variable(
             parameter.name,
             kind,
-            shared.module.fresh("v"),
+            shared.symbols.fresh("v"),
             parameter.position,
             constant=parameter.type.constant and parameter.type.reference,
             copied=(kind == kinds.CHARACTERS and not parameter.type.reference)
@@ -210,7 +210,7 @@ def _signature(shared: Shared, names: SpecificationNames, node: tree.Function) -
         if parameter.type.reference and not parameter.type.constant:
             references.append(variable)
     return HelperFunction(
-        node.name, shared.module.fresh("h"), result, tuple(parameters), tuple(references), node
+        node.name, shared.symbols.fresh("h"), result, tuple(parameters), tuple(references), node
     )
 
 
@@ -278,6 +278,6 @@ def compile_handler(
     scope = Scope(shared, names, "handler")
     scope.drop_refused = drop_refused
     write(scope, handler.body)
-    function = shared.module.fresh("j")
+    function = shared.symbols.fresh("j")
     shared.define(scope.function(function, ("m",)))
     return function

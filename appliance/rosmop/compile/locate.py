@@ -5,9 +5,9 @@ array of variable length is computed when a message comes, once for all fields t
 """
 
 from appliance.ros.layout import ArrayPart, FixedPart, Layout, Leaf, Part, StringPart
-from appliance.rosmop.compile.module import Module
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.form import Spot
+from appliance.rosmop.ir.sites import Symbols
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
@@ -116,9 +116,9 @@ class Locator:
     """Writes the statements that find fields into `found`; `inner`: for an element that is skipped."""
 
     def __init__(
-        self, module: Module, found: list[form.Statement], site: int, *, inner: bool = False
+        self, symbols: Symbols, found: list[form.Statement], site: int, *, inner: bool = False
     ) -> None:
-        self._module = module
+        self._symbols = symbols
         self._found = found
         self._site = site
         self._inner = inner
@@ -128,7 +128,7 @@ class Locator:
         """Where a part that begins at `start` ends."""
         if isinstance(part, FixedPart):
             return start.plus(part.size)
-        end = self._module.fresh("p")
+        end = self._symbols.fresh("p")
         if isinstance(part, StringPart):
             self._found.append(form.AfterText(self._site, end, start))
             return Spot(end, 0)
@@ -156,7 +156,7 @@ class Locator:
             return start.plus(index * item.element_size)
         if not index:
             return start
-        end = self._module.fresh("p")
+        end = self._symbols.fresh("p")
         self._skip(end, start, index, item)
         return Spot(end, 0)
 
@@ -164,7 +164,7 @@ class Locator:
         least = item.element_size
         if least is None:
             least = item.layout.minimum if item.layout is not None else 4
-        count = self._module.fresh("q")
+        count = self._symbols.fresh("q")
         self._found.append(form.Count(self._site, count, start, least))
         return count
 
@@ -175,7 +175,7 @@ class Locator:
     def _skipper(self, layout: Layout) -> form.Skipper:
         if id(layout) not in self._skippers:
             inner: list[form.Statement] = []
-            name = self._module.fresh("k")
-            end = Walk(Locator(self._module, inner, -1, inner=True), layout, Spot("p", 0)).end()
+            name = self._symbols.fresh("k")
+            end = Walk(Locator(self._symbols, inner, -1, inner=True), layout, Spot("p", 0)).end()
             self._skippers[id(layout)] = form.Skipper(name, tuple(inner), end)
         return self._skippers[id(layout)]

@@ -35,7 +35,7 @@ def noted(scope: Scope, node: tree.Binary, left: Value, right: Value, value: Val
     if node not in known:
         if len(known) >= MOST_NOTED:
             return value
-        variables = [(scope.module.fresh("g"), scope.module.fresh("g")) for _truth in range(2)]
+        variables = [(scope.symbols.fresh("g"), scope.symbols.fresh("g")) for _truth in range(2)]
         constant = (side for side, operand in enumerate((left, right)) if operand.constant is not None)
         known[node] = Comparison(node.position, next(constant, None), *variables)
     comparison = known[node]

@@ -3,12 +3,11 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
-from appliance.rosmop.compile.module import Module, Site
 from appliance.rosmop.compile.places import Variable
-from appliance.rosmop.compile.python import Printer
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.sites import Site, SiteVariable, Symbols
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.syntax import tree
@@ -131,23 +130,23 @@ class Statements:
 class Shared:
     """What all functions of all specifications share while they are compiled."""
 
-    def __init__(self, module: Module, messages: Messages, *, margins: bool = False) -> None:
-        self.module = module
+    def __init__(self, messages: Messages, *, margins: bool = False) -> None:
+        self.symbols = Symbols()
         self.margins = margins
         self.messages = messages
         self.values = Values(messages)
         self.functions: dict[str, form.Function] = {}
         self.specifications: list[SpecificationNames] = []
-        self.measures: dict[str, Callable[[Any], int]] = {}
+        self.types: dict[str, Type] = {}
+        """Those of variables, by their names in the form."""
         self.findings: list[Finding] = []
         self.publications: list[Publication] = []
         self.partial = False
         """Files of the set could not be read: a name that is not known here may be declared there."""
 
-    def define(self, function: form.Function) -> int:
-        """Add a function; returns the line of the code at which its event happens."""
+    def define(self, function: form.Function) -> None:
+        """Add a function."""
         self.functions[function.name] = function
-        return Printer(self.module, self.values, function.context).function(function)
 
     def foreign(
         self, own: SpecificationNames, name: str, position: Position
@@ -176,7 +175,7 @@ class Scope:
         self.shared = shared
         self.names = names
         self.role: Role = role
-        self.module = shared.module
+        self.symbols = shared.symbols
         self.values = shared.values
         self.messages = shared.messages
         self.context = names.context
@@ -232,11 +231,11 @@ class Scope:
             )
         block[variable.name] = variable
         if variable.alias is None:
-            self.shared.measures[variable.code] = self.values.measure(variable.type)
+            self.shared.types[variable.code] = variable.type
 
     def local(self, name: str, kind: Type, position: Position, *, constant: bool = False) -> Variable:
         """A new local variable."""
-        variable = Variable(name, kind, self.module.fresh("v"), position, constant=constant)
+        variable = Variable(name, kind, self.symbols.fresh("v"), position, constant=constant)
         self.declare(variable)
         return variable
 
@@ -279,11 +278,11 @@ class Scope:
 
     def temporary(self, prefix: str = "t") -> str:
         """A name for an intermediate value."""
-        return self.module.fresh(prefix)
+        return self.symbols.fresh(prefix)
 
     def site(self, node: tree.Node) -> int:
         """The site of a node: where it stands, and the variables in it."""
-        return self.module.site(Site(node.position, tuple(self._variables(node))))
+        return self.symbols.site(Site(node.position, tuple(self._variables(node))))
 
     @contextmanager
     def at(self, node: tree.Node) -> Iterator[None]:
@@ -328,7 +327,7 @@ class Scope:
         shared = tuple(sorted(self.written))
         return form.Function(name, self.context, parameters, tuple(self.lines.found), shared, happens)
 
-    def _variables(self, node: tree.Node) -> Iterator[tuple[str, str, Callable[[Any], object], bool]]:
+    def _variables(self, node: tree.Node) -> Iterator[SiteVariable]:
         seen: set[str] = set()
         for name in names_in(node):
             if name in seen or len(seen) >= 16:
@@ -340,7 +339,7 @@ class Scope:
                 continue
             if variable is not None and variable.alias is None:
                 steady = kinds.is_scalar(variable.type) or isinstance(variable.type, kinds.String)
-                yield name, variable.code, showing(variable.type), steady
+                yield SiteVariable(name, variable.code, variable.type, steady)
 
 
 def names_in(node: object) -> Iterator[str]:
@@ -355,23 +354,3 @@ def names_in(node: object) -> Iterator[str]:
             waiting += current
         elif isinstance(current, tree.Node) and (current is node or not isinstance(current, tree.Statement)):
             waiting += [getattr(current, name) for name in reversed(current.__dataclass_fields__)]
-
-
-def showing(kind: Type) -> Callable[[Any], object]:
-    """How a value of a type is shown where a fault is told: something JSON has."""
-    if isinstance(kind, kinds.String | kinds.Characters):
-        return lambda value: _short(value[:200].split(b"\0")[0].decode("utf-8", "replace"))
-    if isinstance(kind, kinds.Time | kinds.Duration):
-        return lambda value: value / 1e9
-    if isinstance(kind, kinds.Vector):
-        inner = showing(kind.element)
-        return lambda values: [inner(value) for value in values[:8]] + ["…"] * (len(values) > 8)
-    if isinstance(kind, kinds.Floating):
-        return lambda value: value if value - value == 0 else str(value)
-    if isinstance(kind, kinds.Record):
-        return lambda value: _short(str(value)[:200])
-    return lambda value: value
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= 80 else text[:79] + "…"

@@ -47,12 +47,12 @@ def declare_parameters(shared: Shared, names: SpecificationNames, specification:
             shared.findings += error.findings
             names.misdeclared.add(parameter.name)
             continue
-        code = shared.module.fresh("g")
+        code = shared.symbols.fresh("g")
         variable = Variable(
             parameter.name, kind, code, parameter.position, shared=True, constant=True, sliced=True
         )
         names.variables[parameter.name] = names.parameters[parameter.name] = variable
-        shared.measures[code] = shared.values.measure(kind)
+        shared.types[code] = kind
     if len(specification.parameters) > MOST_PARAMETERS:
         text = f"a specification has at most {MOST_PARAMETERS} parameters"
         shared.findings.append(Finding(specification.parameters[-1].position, "error", text))

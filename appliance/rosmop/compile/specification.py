@@ -4,9 +4,9 @@ Specifications of one set see each other's variables. Everything wrong with any 
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.compile.enforcement import (
@@ -24,8 +24,6 @@ from appliance.rosmop.compile.functions import (
     declare_variables,
 )
 from appliance.rosmop.compile.lint import lint_property, unused_events
-from appliance.rosmop.compile.module import Module, TooComplexError
-from appliance.rosmop.compile.python import NAMESPACE
 from appliance.rosmop.compile.scope import Comparison, Publication, Shared, SpecificationNames
 from appliance.rosmop.compile.slicing import (
     Slicing,
@@ -35,12 +33,15 @@ from appliance.rosmop.compile.slicing import (
     unsliceable,
 )
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.interpreter import Interpreter
+from appliance.rosmop.ir.sites import Site
 from appliance.rosmop.logics.catalogue import compile_property
 from appliance.rosmop.logics.interface import CompiledProperty, FormulaError
 from appliance.rosmop.positions import Finding
-from appliance.rosmop.runtime.context import MAX_BYTES, Context, Turn
+from appliance.rosmop.runtime.context import MAX_BYTES
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import Messages, nearest, shown
 
 _T = TypeVar("_T")
@@ -89,17 +90,21 @@ class SpecificationCode:
 
 @dataclass(eq=False)
 class Compiled:
-    """A set of specifications, ready to run: the namespace of the code, and what is in it."""
+    """A set of specifications: their functions in the intermediate form, by name, and what is in them."""
 
-    module: Module
-    namespace: dict[str, Any]
     specifications: tuple[SpecificationCode, ...]
-    turn: Turn
     warnings: tuple[Finding, ...]
-    publications: tuple[Publication, ...] = ()
-    messages: Messages = field(default_factory=lambda: Messages(Definitions({})))
-    functions: Mapping[str, form.Function] = field(default_factory=dict)
-    """The same in the intermediate form, by name."""
+    functions: Mapping[str, form.Function]
+    sites: Sequence[Site]
+    types: Mapping[str, Type]
+    """Those of variables, by their names in the form."""
+    messages: Messages
+    publications: tuple[Publication, ...]
+
+    def interpreter(self) -> Interpreter:
+        """What runs them, on a state of its own."""
+        contexts = {one.context: one.name for one in self.specifications}
+        return Interpreter(self.functions, self.sites, self.types, contexts, self.messages)
 
     def is_stamped(self, message_type: str | None) -> bool:
         """Whether messages of a type begin with a `std_msgs/Header`."""
@@ -123,48 +128,35 @@ def compile_files(files: Sequence[tree.File], definitions: Definitions, *, margi
 
     With `margins` the comparisons of numbers are noted (`margins.py`).
     """
-    shared, turn = Shared(Module(), Messages(definitions), margins=margins), Turn()
-    module, messages = shared.module, shared.messages
+    shared = Shared(Messages(definitions), margins=margins)
     pairs = [(file, specification) for file in files for specification in file.specifications]
-    compiled = _compile_all(shared, turn, pairs)
+    compiled = _compile_all(shared, pairs)
     findings = list(dict.fromkeys(shared.findings))
     if any(finding.severity == "error" for finding in findings):
         raise SpecificationError(findings)
-    try:
-        namespace = module.run()
-    except TooComplexError as error:
-        position = pairs[0][1].position
-        raise SpecificationError.at(
-            position, f"too complex to compile ({error}); split expressions and functions"
-        ) from None
-    warnings = tuple(sorted(findings, key=lambda finding: finding.position))
     return Compiled(
-        module,
-        namespace,
         tuple(compiled),
-        turn,
-        warnings,
-        tuple(shared.publications),
-        messages,
+        tuple(sorted(findings, key=lambda finding: finding.position)),
         shared.functions,
+        shared.symbols.sites,
+        shared.types,
+        shared.messages,
+        tuple(shared.publications),
     )
 
 
 def findings_of(files: Sequence[tree.File], definitions: Definitions) -> list[Finding]:
     """What is wrong with these files while others of their set cannot be read; names may be declared in those."""
-    shared = Shared(Module(), Messages(definitions))
+    shared = Shared(Messages(definitions))
     shared.partial = True
-    _compile_all(
-        shared, Turn(), [(file, specification) for file in files for specification in file.specifications]
-    )
+    _compile_all(shared, [(file, specification) for file in files for specification in file.specifications])
     return list(dict.fromkeys(shared.findings))
 
 
 def _compile_all(
-    shared: Shared, turn: Turn, pairs: Sequence[tuple[tree.File, tree.Specification]]
+    shared: Shared, pairs: Sequence[tuple[tree.File, tree.Specification]]
 ) -> list[SpecificationCode]:
-    _offer(shared.module, shared.measures)
-    names = [_declare(shared, shared.module, turn, specification) for _, specification in pairs]
+    names = [_declare(shared, specification) for _, specification in pairs]
     _check_names(shared, [specification for _, specification in pairs])
     compiled = []
     for (file, specification), own in zip(pairs, names, strict=True):
@@ -175,18 +167,8 @@ def _compile_all(
     return compiled
 
 
-def _offer(module: Module, measures: Mapping[str, Callable[[Any], int]]) -> None:
-    """Put into the namespace what generated code may use, and nothing else."""
-    module.namespace |= NAMESPACE
-    module.namespace["__rv__"] = measures
-
-
-def _declare(
-    shared: Shared, module: Module, turn: Turn, specification: tree.Specification
-) -> SpecificationNames:
-    context = module.fresh("c")
-    module.namespace[context] = Context(specification.name, turn, shared.measures)
-    names = SpecificationNames(specification.name, context)
+def _declare(shared: Shared, specification: tree.Specification) -> SpecificationNames:
+    names = SpecificationNames(specification.name, shared.symbols.fresh("c"))
     shared.specifications.append(names)
     declare_parameters(shared, names, specification)
     declare_variables(shared, names, specification)

@@ -1,4 +1,4 @@
-"""What the form of an event means, as terms: line by line the interpreter of the tests, for every message at once.
+"""What the form of an event means, as terms: line by line `ir/interpreter.py`, for every message at once.
 
 - Positions and counts are 64 bits here and any number there: a function without loops adds up a few products of a
   count below 2**32 and a size, and never comes to more. Times are 64 bits, too, and sums of two of them fit.

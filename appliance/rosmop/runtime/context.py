@@ -8,10 +8,8 @@ Invariants:
    something long says so to `allocate`; when enough has been said, the live values are measured.
 """
 
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from types import FrameType
 from typing import Any, NamedTuple
 
 BUDGET = 1_000_000
@@ -91,29 +89,34 @@ class Context:
 
     __slots__ = (
         "_allocated",
+        "_live",
         "_measures",
         "_pending",
         "budget",
-        "live",
         "monitor",
         "most",
         "throttled",
         "turn",
     )
 
-    def __init__(self, monitor: str, turn: Turn, measures: Mapping[str, Measure]) -> None:
+    def __init__(
+        self,
+        monitor: str,
+        turn: Turn,
+        measures: Mapping[str, Measure],
+        live: Callable[[], Sequence[Mapping[str, object]]],
+    ) -> None:
+        """`live` says which variables have values, once for those that specifications share and once for each call;
+        `measures` how much one holds, by their names.
+        """
         self.monitor = monitor
         self.turn = turn
         self.most = BUDGET
         self.budget = BUDGET
         self.throttled: dict[int, int] = {}
         self._allocated = 0
-        self._measures = measures  # of the variables of the specifications, by name
-        self.live: Callable[[], list[Mapping[str, object]]] | None = None
-        """Says which variables have values, once for those that specifications share and once for each call.
-
-        None: those of generated code have.
-        """
+        self._measures = measures
+        self._live = live
         self._pending = 0
 
     def begin(self) -> None:
@@ -169,23 +172,11 @@ class Context:
 
     def _measure(self, size: int, site: int) -> None:
         held = size + sum(len(message.data) for message in self.turn.published)
-        held += sum(map(self._held, (self.live or self._generated)()))
+        held += sum(map(self._held, self._live()))
         self._allocated = 0
         self.spend(held // (BYTES_PER_INSTRUCTION * 16), site)
         if held > MAX_BYTES:
             raise FaultError(site, f"{_TOO_LARGE}: {held} bytes")
-
-    def _generated(self) -> list[Mapping[str, object]]:
-        """The variables of generated code, which are those of Python's frames."""
-        found: list[Mapping[str, object]] = []
-        frame: FrameType | None = sys._getframe(1)
-        shared: Mapping[str, object] = {}
-        while frame is not None:
-            if frame.f_globals.get("__rv__") is self._measures:
-                shared = frame.f_globals
-                found.append(frame.f_locals)
-            frame = frame.f_back
-        return [shared, *found]
 
     def _held(self, variables: Mapping[str, object]) -> int:
         measures = self._measures

@@ -1,4 +1,4 @@
-"""The bytes of messages: pieces of decoding and encoding that generated code is made of.
+"""The bytes of messages: pieces of decoding and encoding.
 
 `buffer` is anything with the buffer interface that indexes bytes (bytes, bytearray, memoryview); positions count
 from its start. Reading past the end raises `MalformedError` or `struct.error`.

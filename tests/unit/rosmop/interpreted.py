@@ -1,64 +1,19 @@
-"""Monitors whose functions the interpreter runs, beside those that run generated code: both do the same."""
+"""The same monitors once more, whose messages go nowhere but through the interpreter: what a module is held against."""
 
-from collections.abc import Mapping
-from dataclasses import replace
-from functools import partial
-from typing import Any
-
-from appliance.rosmop.compile.module import Module
-from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.outcomes import Fault, Outcome
-from appliance.rosmop.runtime.context import Context, Turn
-from tests.unit.rosmop.interpreter import Interpreter
-
-
-class _Interpreted(Module):
-    """Knows where faults of the interpreter were, by the sites of the generated code."""
-
-    def __init__(self, module: Module, interpreter: Interpreter) -> None:
-        super().__init__()
-        self.sites = module.sites
-        self._interpreter = interpreter
-
-    def place_of(self, error: Exception) -> tuple[int, Mapping[str, Any]]:
-        """The site of a fault, and the variables there."""
-        fault = self._interpreter.fault
-        return (fault.site, fault.variables) if error is fault.error else (-1, {})
-
-    def has_begun(self, line: int, error: Exception) -> bool:
-        """Whether the event had happened."""
-        return error is self._interpreter.fault.error and self._interpreter.fault.happened
-
-
-def interpreted(compiled: Compiled) -> Compiled:
-    """The same set of specifications with the interpreter in the place of generated code, and a state of its own."""
-    turn, measures = Turn(), compiled.namespace["__rv__"]
-    contexts = {one.context: Context(one.name, turn, measures) for one in compiled.specifications}
-    namespace: dict[str, Any] = {**contexts}
-    interpreter = Interpreter(compiled.functions, namespace, contexts, compiled.messages)
-    events = {event.function for one in compiled.specifications for event in one.events}
-    keys = {event.key for one in compiled.specifications for event in one.events}
-    for name in compiled.functions:
-        run = interpreter.key if name in keys else interpreter.event if name in events else interpreter.action
-        namespace[name] = partial(run, name)
-    return replace(
-        compiled, namespace=namespace, turn=turn, module=_Interpreted(compiled.module, interpreter)
-    )
 
 
 def beside(monitors: MonitorSet) -> MonitorSet:
-    """The set of the interpreter that belongs to one of generated code; not started."""
-    return MonitorSet(interpreted(monitors.compiled), monitors.files, monitors.on_fault, monitors.patience)
+    """The same set with a state of its own and no module; not started."""
+    return MonitorSet(monitors.compiled, monitors.files, monitors.on_fault, monitors.patience)
 
 
 def check_same(one: Outcome, other: Outcome) -> None:
-    """Fail if generated code (the first) and the interpreter came to different outcomes."""
+    """Fail if two ways came to different outcomes."""
     assert _told(one) == _told(other)
-    for fault, interpreted_fault in zip(one.faults, other.faults, strict=True):
-        told = repr(sorted(fault.values.items()))
-        known = {name: interpreted_fault.values.get(name) for name in fault.values}
-        assert told == repr(sorted(known.items()))  # the interpreter may know more variables
+    for fault, other_fault in zip(one.faults, other.faults, strict=True):
+        assert repr(sorted(fault.values.items())) == repr(sorted(other_fault.values.items()))
     for before, other_before in zip(one.before, other.before, strict=True):
         check_same(before, other_before)
 

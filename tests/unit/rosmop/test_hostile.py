@@ -1,6 +1,5 @@
 """Specifications that mean harm are refused, or fault, in bounded time and memory."""
 
-import builtins
 import time
 import tracemalloc
 
@@ -230,7 +229,7 @@ def test_no_string_of_a_specification_becomes_code() -> None:
 
 
 def test_identifiers_are_not_those_of_the_generated_code() -> None:
-    """Names that Python or the generated code use are ordinary variables."""
+    """Names that mean something to Python are ordinary variables."""
     names = [
         "None",
         "lambda",
@@ -253,22 +252,6 @@ def test_identifiers_are_not_those_of_the_generated_code() -> None:
         f"a() {{ {declared} event e(int x) /t std_msgs/Int32 '{{data:x}}' {{ ROS_INFO(\"%d\", {total}); }} }}"
     )
     assert load(shared).process("/t", message("std_msgs/Int32"), 0).log[0].text == str(sum(range(len(names))))
-
-
-def test_the_namespace_of_generated_code_has_no_builtins() -> None:
-    """Nothing that Python offers is in reach: no import, no attribute of a class, no file."""
-    monitors = load("a() { event e(int x) /t std_msgs/Int32 '{data:x}' { x = 1; } }")
-    namespace = monitors.compiled.namespace
-    assert namespace["__builtins__"] == {}
-    dangerous = {
-        builtins.eval,
-        builtins.exec,
-        builtins.open,
-        builtins.getattr,
-        builtins.__import__,
-        builtins.type,
-    }
-    assert not [name for name, value in namespace.items() if callable(value) and value in dangerous]
 
 
 HUGE_COUNTS = [

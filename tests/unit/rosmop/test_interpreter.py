@@ -1,7 +1,4 @@
-"""The interpreter of the intermediate form does what generated code does: bytes, records, faults, state.
-
-`acting.act` compares the two for every action that the tests of the language run: so with the C++ compiler's answers.
-"""
+"""What the module takes is what the interpreter makes of it, of any specifications: bytes, records, faults, state."""
 
 from pathlib import Path
 from typing import Any
@@ -30,15 +27,14 @@ FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthChec
 def check(monitors: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> None:
     """Fail if the two ways differ anywhere on the way of these messages, or in the variables at the end."""
     other = beside(monitors)
+    monitors.write_module()
     check_same(monitors.start(0), other.start(0))
     for number, (topic, body) in enumerate(traffic):
         time = number * step_ns
-        check_same(
-            monitors.process(topic, bytearray(body), time), other.process(topic, bytearray(body), time)
-        )
+        check_same(monitors.judge(topic, bytearray(body), time), other.process(topic, bytearray(body), time))
     for one in monitors.compiled.specifications:
-        for code in one.variables.values():
-            known, found = (each.compiled.namespace[code] for each in (monitors, other))
+        for variable in one.variables:
+            known, found = (each.value(one.name, variable) for each in (monitors, other))
             assert repr(known) == repr(found)  # a NaN is one, too
 
 

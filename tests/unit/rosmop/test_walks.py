@@ -153,7 +153,7 @@ class Fed:
 def _state(monitors: MonitorSet) -> list[str]:
     state = []
     for monitor in monitors.monitors:
-        names = monitors.compiled.namespace
+        names = monitors.interpreter.variables
         state += [f"{name} {names.get(code)!r}" for name, code in monitor.code.variables.items()]
         state += [str(one.run.state) for one in monitor.properties if isinstance(one.run, FiniteRun)]
         clocked = [one.run for one in monitor.properties if isinstance(one.run, ClockedRun)]

@@ -199,7 +199,7 @@ def test_what_is_kept_goes_on_in_a_set_that_replaces_another() -> None:
         fed.check([STAMPED], "/stamped")
     before = fed.state()
     following, _ = fed.monitors.replaced({"0.rv": first, "1.rv": second}, definitions(), 5)
-    names = following.compiled.namespace
+    names = following.interpreter.variables
     kept = [
         f"{name} {names.get(code)!r}"
         for one in following.monitors

@@ -158,7 +158,7 @@ def test_strings_go_to_the_set_that_follows() -> None:
     following, _ = fed.monitors.replaced(
         {"0.rv": text, "1.rv": OTHER}, fed.monitors.compiled.messages.definitions, 5
     )
-    names = following.compiled.namespace
+    names = following.interpreter.variables
     values = [names[code] for code in following.monitors[0].code.variables.values()]
     assert values[:3] == [b"two\0\xff", b"one", b"abc"]
 

@@ -287,7 +287,9 @@ def test_it_is_charged_as_in_the_interpreter(body: str) -> None:
     assert fed.came == {"together": 2, "passed": 2}
     assert fed.monitors.area is not None
     memory = memoryview(fed.monitors.area.obj).cast("B")
-    assert struct.unpack_from("<q", memory, address)[0] == fed.interpreter.compiled.namespace[context].budget
+    assert (
+        struct.unpack_from("<q", memory, address)[0] == fed.interpreter.interpreter.contexts[context].budget
+    )
 
 
 def test_vectors_go_to_the_set_that_follows() -> None:
@@ -299,7 +301,7 @@ def test_vectors_go_to_the_set_that_follows() -> None:
     following, _ = fed.monitors.replaced(
         {"0.rv": text, "1.rv": OTHER}, fed.monitors.compiled.messages.definitions, 5
     )
-    names = following.compiled.namespace
+    names = following.interpreter.variables
     values = [names[code] for code in following.monitors[0].code.variables.values()]
     assert values[:3] == [[1.0, 2.0], [1.0, 2.0], [7.0, 5.0, 0.0, 0.0]]
 

@@ -127,7 +127,7 @@ class Monitored:
         state: list[object] = []
         for monitor in self.set.monitors:
             state.append((monitor.name, monitor.seen, monitor.faults, monitor.held))
-            names = self.set.compiled.namespace
+            names = self.set.interpreter.variables
             state += [(name, repr(names.get(code))) for name, code in monitor.code.variables.items()]
             state += [
                 one.run.state for one in monitor.properties if isinstance(one.run, FiniteRun | ClockedRun)

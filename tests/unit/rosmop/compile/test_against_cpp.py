@@ -190,7 +190,7 @@ def printed(body: str, before: str, directory: Path, *options: str) -> list[str]
 def test_the_language_agrees_with_a_compiler(
     seed: int, make: tuple[Callable[[Random], str], str], tmp_path: Path
 ) -> None:
-    """More than a hundred values of each random program are the compiler's: by engine, interpreter and module."""
+    """More than a hundred values of each random program are the compiler's: by interpreter and module."""
     write, before = make
     body = write(Random(seed))  # noqa: S311  draws examples, not keys
     expected = [line.replace("-nan", "nan") for line in printed(body, before, tmp_path)]

@@ -165,7 +165,7 @@ class Programs:
 
 
 def check(programs: Programs, count: int, directory: Path | None) -> Fed:
-    """Fail unless the compiler, engine, interpreter and module have the same after each of so many statements.
+    """Fail unless the compiler, interpreter and module have the same after each of so many statements.
 
     Without a directory nothing is compiled.
     """
@@ -189,7 +189,7 @@ def check(programs: Programs, count: int, directory: Path | None) -> Fed:
 def test_effects_come_in_the_order_of_the_compiler(
     seed: int, *, numbers: bool, taken: int, tmp_path: Path
 ) -> None:
-    """By engine and interpreter, and by the module where it does not leave the statement to the engine."""
+    """By the interpreter, and by the module where it does not leave the statement to it."""
     fed = check(Programs(seed, numbers=numbers), 60, tmp_path)
     assert fed.came["together"] >= taken
 
@@ -197,7 +197,7 @@ def test_effects_come_in_the_order_of_the_compiler(
 @pytest.mark.parametrize("numbers", [True, False], ids=["numbers", "others"])
 @pytest.mark.parametrize("seed", range(2))
 def test_what_has_any_order_in_cpp_has_one_here(seed: int, *, numbers: bool) -> None:
-    """Engine, interpreter and module agree on what C++ leaves open, too."""
+    """Interpreter and module agree on what C++ leaves open, too."""
     check(Programs(seed, numbers=numbers, orders=False), 60, None)
 
 
