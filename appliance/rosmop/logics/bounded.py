@@ -5,7 +5,7 @@ bound passes. What is certain is found part by part: `x or y` is once one of the
 come in time and `x` held until then, or `x` has failed, or the time is over.
 
 Theory of operation. A `Program` (`past.py`) has the distinct parts of the formula. Those that look back only are
-computed at their event by straight-line code. Of the others a *cell* stands for the value of one part at one event
+computed at their event (`Steps`). Of the others a *cell* stands for the value of one part at one event
 while that is open; a cell tells its *users* when it is decided. Cells are made for what is asked for only: of
 `fire => eventually[0,1s] safe` nothing is kept but the events `fire` that wait.
 
@@ -21,17 +21,15 @@ A run waits for at most `MOST_OPEN` events; a step beyond that is a fault, and i
 from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass
-from typing import Any
 
 from appliance.rosmop.logics.formula import Formula
 from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
-from appliance.rosmop.logics.past import VERDICTS, Instruction, Program, Window, generate, loaded
+from appliance.rosmop.logics.past import FOREVER, VERDICTS, Instruction, Program, Window, steps_of
 
 MOST_OPEN = 10_000
-FOREVER = 10**30
-"""Later than any time."""
 
 _LATER = ("until", "next")
 
@@ -311,14 +309,14 @@ class _OpenSince(_Rows):
     def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
         super().__init__(run, number, instruction)
         self.window = Window(self.low, self.high)
-        self.least, self.most = self.window.copy(), self.window.copy()
+        self.least, self.most = copy(self.window), copy(self.window)
 
     def take(self, now: int) -> None:
         self._judge(self.keep(now))
         self._forget()
 
     def settle(self) -> None:
-        self.least, self.most = self.window.copy(), self.window.copy()
+        self.least, self.most = copy(self.window), copy(self.window)
         for row in self.rows:
             self._judge(row)
         self._forget()
@@ -397,22 +395,14 @@ class BoundedProperty(CompiledProperty):
         self.program = program = Program(formula, source.events)
         self.later: set[int] = set()
         """The instructions whose value may come after their event."""
-        needed = {program.result}
-        for number in range(program.result, -1, -1):
-            if number in needed:
-                needed.update(program.instructions[number].operands)
         for number, instruction in enumerate(program.instructions):
-            if number in needed and (
-                instruction.operator in _LATER or not self.later.isdisjoint(instruction.operands)
-            ):
+            if instruction.operator in _LATER or not self.later.isdisjoint(instruction.operands):
                 self.later.add(number)
-        at_once = sorted(needed - self.later)
-        result = ["None"] * (program.result + 1)
-        for number in at_once:
-            result[number] = f"v{number}"
-        self.make: Callable[[int], tuple[Callable[[int, int], list[Value | None]], Any]] = loaded(
-            generate(program, at_once, f"[{', '.join(result)}]")
-        )
+        asked = {operand for number in self.later for operand in program.instructions[number].operands}
+        at_once = sorted(asked - self.later)
+        self.steps = steps_of(program, at_once)
+        self.at_once = {number: index for index, number in enumerate(at_once)}
+        """Those that these need to know at their event, as `steps` has them."""
         self.order = {
             number: sorted(program.instructions[number].operands, key=self.later.__contains__)
             for number in self.later
@@ -481,12 +471,13 @@ class BoundedRun:
 
     def __init__(self, compiled: BoundedProperty, time_ns: int) -> None:
         self._compiled = compiled
-        self._at_once, _ = compiled.make(time_ns)
+        self._at_once = compiled.steps.start()
         self.later = compiled.later
         self.place = 0
         self._operators = compiled.operators(self)
         self._now = time_ns
-        self._values: list[Value | None] = []
+        self._places: tuple[int, ...] = ()
+        self._values: dict[int, Value] = {}
         self._decided: list[Cell] = []
         self._looked_at: set[_Operator] = set()
         self._told: dict[bool, int] = {}
@@ -508,7 +499,8 @@ class BoundedRun:
         if sum(len(operator.rows) for operator in self._operators.values()) >= MOST_OPEN:
             raise RunFaultError(f"more than {MOST_OPEN} events wait for what follows them")
         self.place += 1
-        self._values = self._at_once(event, self._now)
+        self._places = self._compiled.steps.take(self._at_once, event, self._now)
+        self._values = {}
         whole = self.value(self._compiled.program.result)
         if isinstance(whole, Cell):
             whole.tells = self.place
@@ -530,7 +522,10 @@ class BoundedRun:
 
     def value(self, number: int) -> Value:
         """What an instruction is worth at the event that happens now: a cell only while it is open."""
-        value = self._values[number]
+        index = self._compiled.at_once.get(number)
+        if index is not None:
+            return bool(self._at_once[self._places[index]])
+        value = self._values.get(number)
         if value is None:
             value = self._values[number] = self._find(number)
         known = _known(value)

@@ -10,7 +10,7 @@ table.
 
 from appliance.rosmop.logics.automaton import Automaton, TooManyStatesError, explore
 from appliance.rosmop.logics.ere import with_fail
-from appliance.rosmop.logics.grammar import prepare, read_grammar
+from appliance.rosmop.logics.grammar import Grammar, prepare, read_grammar
 from appliance.rosmop.logics.interface import (
     Categories,
     CompiledProperty,
@@ -34,9 +34,9 @@ MAX_TABLE_FRAMES = 500
 class GrammarProperty(CompiledProperty):
     """A grammar that needs a stack."""
 
-    def __init__(self, source: Source, recogniser: Recogniser) -> None:
+    def __init__(self, source: Source, grammar: Grammar) -> None:
         super().__init__(source, CATEGORIES)
-        self.recogniser = recogniser
+        self.recogniser = Recogniser(grammar)
 
     def start(self, _time_ns: int) -> Run:
         """A fresh run; the time plays no part."""
@@ -68,11 +68,10 @@ class GrammarRun(UntimedRun):
 def compile_cfg(source: Source) -> CompiledProperty:
     """Compile a ``cfg`` formula. Raises FormulaError."""
     grammar = prepare(read_grammar(source))
-    recogniser = Recogniser(grammar)
-    automaton = _table(recogniser, len(source.events))
+    automaton = _table(Recogniser(grammar), len(source.events))
     if automaton is not None:
         return FiniteProperty(source, CATEGORIES, with_fail(automaton))
-    return GrammarProperty(source, recogniser)
+    return GrammarProperty(source, grammar)
 
 
 def _table(recogniser: Recogniser, events: int) -> Automaton | None:

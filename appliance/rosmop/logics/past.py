@@ -5,31 +5,31 @@ follows its operands, with only ``previously`` and ``since`` left of the tempora
 ``true since b``). A step computes all of them from the event and from what the last step left behind
 (Havelund and Rosu, 2002):
 
-- ``previously``: the value of the operand at the last event, and the time of it;
-- ``since`` without bounds: its own last value;
-- ``since[0,u]``: when the right operand held last; ``since[l,inf]``: when it held first;
-- ``since[l,u]``: the intervals of time in which it will hold if the left operand goes on to hold. Intervals
-  that touch are merged, so there are at most about ``l/(u-l)`` of them (and never more than events within
-  ``l``).
+- ``previously``: the value of the operand at the last event;
+- ``since``: its own last value;
+- either with bounds: the intervals of time in which it will hold if the left operand goes on to hold (`Window`).
 
-Without time bounds the values are bits and the program a finite automaton, which is built if it is small
-enough. Otherwise the program becomes a Python function of straight-line code.
+Which atoms hold is known of each event, so what is left of the program at it is worked out beforehand, as data
+(`Steps`). Without time bounds the values are bits and the program a finite automaton, which is built if it is small
+enough.
 """
 
 import copy
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial, reduce
 from typing import Any
 
 from appliance.rosmop.logics.automaton import (
+    MAX_STATES,
     Automaton,
     TooManyStatesError,
     explore,
     letter_classes,
     spread,
 )
-from appliance.rosmop.logics.formula import Formula, event_names
+from appliance.rosmop.logics.formula import Bounds, Formula, event_names
 from appliance.rosmop.logics.interface import (
     Categories,
     CompiledProperty,
@@ -37,16 +37,17 @@ from appliance.rosmop.logics.interface import (
     Run,
     Source,
     UntimedRun,
+    twin,
 )
 
 VERDICTS = ("violation", "validation")
-MAX_TABLE_STATES = 4_096
-"""Formulas whose automaton would be larger are computed instead of looked up."""
+TOLD: tuple[Categories, Categories] = VERDICTS[:1], VERDICTS[1:]
 MAX_TABLE_WORK = 2_000_000
 """How many values may be computed to build a table."""
-
-NEVER = -(10**30)
-"""A time before all times."""
+MAX_FOLDED = 50_000
+"""How many operands may be looked at to find what is left at each event; beyond that all is left at all of them."""
+FOREVER = 10**30
+"""Later than any time."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +66,17 @@ class Instruction:
         """Whether the time of events plays a part."""
         return self.low > 0 or self.high is not None
 
+    @property
+    def plain(self) -> str:
+        """The operator, whether it is about the abstract past or not."""
+        return self.operator.removeprefix("abstract ")
+
 
 class Program:
     """The distinct subformulas of a formula, operands first; the last one is the formula."""
 
     def __init__(self, formula: Formula, events: Sequence[str]) -> None:
-        self._events = {name: index for index, name in enumerate(events)}
+        self.events = {name: index for index, name in enumerate(events)}
         self._numbers: dict[Instruction, int] = {}
         self.instructions: list[Instruction] = []
         self.result = self._add(formula)
@@ -96,7 +102,7 @@ class Program:
     def _add(self, formula: Formula) -> int:
         """The number of a subformula, itself and its operands added if they are new."""
         if formula.operator == "event":
-            return self._emit("event", event=self._events[formula.name])
+            return self._emit("event", event=self.events[formula.name])
         operands = [self._add(operand) for operand in formula.operands]
         operator = formula.operator
         if operator == "not":
@@ -127,118 +133,223 @@ _OF_ONE = {"once": "since", "historically": "since", "eventually": "until", "alw
 """Operators that are said by another one, whose left operand is `true`."""
 
 
+Operation = tuple[str, int, int, int, int]
+"""An operator, the place of its value, those of its operands, and that of its `Window`. Of an `event` the number is in
+the place of an operand."""
+Residue = tuple[tuple[Operation, ...], tuple[int, ...]]
+"""What is left at an event: operations, and where the values are that were asked for."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """How a program is stepped over a list of *values*: `False`, `True` (so a place below 2 says what is in it), what
+    one step leaves to the next, and what is of use within one.
+
+    ``bounds`` are those of the windows among what is left to the next step, ``abstract`` the places in it that abstract
+    operators have. ``residues`` has one residue for each event, and behind them that of an event that is not named.
+    """
+
+    bounds: tuple[Bounds | None, ...]
+    abstract: tuple[int, ...]
+    residues: tuple[Residue, ...]
+    size: int
+
+    @property
+    def kept(self) -> slice:
+        """The places of what one step leaves to the next."""
+        return slice(2, 2 + len(self.bounds))
+
+    def start(self) -> list[Any]:
+        """The values before the first event."""
+        kept = [False if bounds is None else Window(*bounds) for bounds in self.bounds]
+        return [False, True, *kept, *[False] * (self.size - 2 - len(kept))]
+
+    def take(self, values: list[Any], event: int, now: int) -> tuple[int, ...]:
+        """Let the event happen; where the values are that were asked for."""
+        operations, results = self.residues[event]
+        compute(operations, values, event, now)
+        return results
+
+
+def compute(operations: Sequence[Operation], values: list[Any], event: int, now: int) -> None:
+    """Carry out the operations of an event."""
+    for operator, place, left, right, window in operations:
+        if operator == "or":
+            values[place] = values[left] or values[right]
+        elif operator == "xor":
+            values[place] = values[left] is not values[right]
+        elif operator == "window":
+            values[place] = values[window].step(values[left], values[right], now)
+        elif operator == "and":
+            values[place] = values[left] and values[right]
+        elif operator == "since":
+            values[place] = values[right] or (values[left] and values[place])
+        else:
+            values[place] = left == event
+
+
+def steps_of(program: Program, wanted: Sequence[int]) -> Steps:
+    """How to compute these instructions."""
+    needed = {*wanted}
+    for number in range(max(wanted), -1, -1):
+        if number in needed:
+            needed.update(program.instructions[number].operands)
+    chosen = {number: program.instructions[number] for number in sorted(needed)}
+    looking = {number: one for number, one in chosen.items() if one.plain in ("since", "previously")}
+    kept = {number: place for place, number in enumerate(looking, 2)}
+    events = {one.event for one in chosen.values()} | {-1}
+    folded = sum(1 + len(one.operands) for one in chosen.values()) * len(events) <= MAX_FOLDED
+    folds = {event: _Fold(chosen, kept, event if folded else None) for event in (events if folded else {-1})}
+    residues = {event: fold.residue(wanted) for event, fold in folds.items()}
+    return Steps(
+        tuple((one.low, one.high) if one.bounded else None for one in looking.values()),
+        tuple(kept[number] for number, one in looking.items() if one.plain != one.operator),
+        tuple(residues.get(event, residues[-1]) for event in (*program.events.values(), -1)),
+        max(fold.size for fold in folds.values()),
+    )
+
+
+class _Fold:
+    """What is left of instructions at an event (None: at any). ``kept`` are the places of those that look back."""
+
+    def __init__(self, chosen: dict[int, Instruction], kept: dict[int, int], event: int | None) -> None:
+        self._chosen = chosen
+        self._kept = kept
+        self._event = event
+        self._places: dict[int, int] = {}
+        self._operations: list[Operation] = []
+        self.size = 2 + len(kept)
+
+    def residue(self, wanted: Sequence[int]) -> Residue:
+        """The operations without those whose value nobody needs."""
+        for number, instruction in self._chosen.items():
+            self._places[number] = self._place(number, instruction)
+        before = {
+            place: one
+            for number, place in self._kept.items()
+            if (one := self._chosen[number]).plain == "previously"
+        }
+        # What is wanted of these is looked at after they have become what they will be at the next event.
+        places = [self._places[number] for number in wanted]
+        results = tuple(self._emit("or", place, 0) if place in before else place for place in places)
+        for place, instruction in reversed(before.items()):
+            operand = self._places[instruction.operands[0]]
+            if instruction.bounded:
+                self._emit("window", 0, operand, place)
+            else:
+                self._operations.append(("or", place, operand, 0, 0))
+        needed, left = {*results}, []
+        for operation in reversed(self._operations):
+            _, place, *operands, window = operation
+            # A window changes unless its left operand holds and its right one does not.
+            if place in needed or place < 2 + len(self._kept) or (window and operands != [1, 0]):
+                left.append(operation)
+                needed.update(operands)
+        return tuple(reversed(left)), results
+
+    def _place(self, number: int, instruction: Instruction) -> int:
+        """Where the value of an instruction is: below 2 if it is known."""
+        operands = [self._places[operand] for operand in instruction.operands]
+        operator, kept = instruction.plain, self._kept.get(number, 0)
+        if operator == "event" and self._event is None:
+            return self._emit("event", instruction.event, 0)
+        known = {"event": instruction.event == self._event, "true": True, "false": False}.get(operator)
+        if known is not None:
+            return int(known)
+        if operator == "not":
+            return self._join("xor", operands[0], 1)
+        if kept and instruction.bounded:
+            left, right = operands if operator == "since" else (1, 0)
+            return self._emit("window", left, right, kept)
+        if kept:
+            if operator == "since" and operands != [1, 0]:
+                self._operations.append(("since", kept, operands[0], operands[1], 0))
+            return kept
+        return reduce(partial(self._join, operator), operands)
+
+    def _join(self, operator: str, left: int, right: int) -> int:
+        neutral = int(operator == "and")
+        if left == neutral:
+            return right
+        if right == neutral:
+            return left
+        if 1 - neutral in (left, right) and operator != "xor":
+            return 1 - neutral
+        return 0 if left == right == 1 else self._emit(operator, left, right)
+
+    def _emit(self, operator: str, left: int, right: int, window: int = 0) -> int:
+        self._operations.append((operator, self.size, left, right, window))
+        self.size += 1
+        return self.size - 1
+
+
 def compile_past(source: Source, formula: Formula) -> CompiledProperty:
-    """The monitor of a past formula: a table where it is finite and small, else a function."""
+    """The monitor of a past formula: a table where it is finite and small, else its steps."""
     program = Program(formula, source.events)
+    steps = steps_of(program, [program.result])
     if not program.bounded:
         named = event_names(formula)
         of_event, classes = letter_classes(source.events, named)
         letters = [source.events.index(named[index]) if index >= 0 else -1 for index in classes]
         try:
-            automaton = _table(program, letters)
+            automaton = _table(steps, letters)
         except TooManyStatesError:
             pass
         else:
             return FiniteProperty(source, VERDICTS, spread(automaton, of_event))
-    return PastProperty(source, program)
+    return PastProperty(source, steps)
 
 
-class Stepper:
-    """Steps a program without time bounds; what it remembers of an event are bits."""
-
-    def __init__(self, program: Program) -> None:
-        self._program = program
-        remembered = [
-            (number, instruction)
-            for number, instruction in enumerate(program.instructions)
-            if instruction.operator.removeprefix("abstract ") in ("since", "previously")
-        ]
-        self._place = {number: 1 << index for index, (number, _) in enumerate(remembered)}
-        self._kept = [
-            (
-                self._place[number],
-                number if instruction.operator.endswith("since") else instruction.operands[0],
-            )
-            for number, instruction in remembered
-        ]
-        self.abstract = sum(
-            self._place[number] for number, instruction in remembered if instruction.operator[0] == "a"
-        )
-        """The bits of what abstract operators remember."""
-
-    def step(self, bits: int, event: int) -> tuple[int, bool]:
-        """What is remembered of an event, given that of the last one, and whether the formula holds."""
-        values = _evaluate(self._program, self._place, bits, event)
-        return sum(place for place, number in self._kept if values[number]), values[self._program.result]
-
-
-def _table(program: Program, letters: Sequence[int]) -> Automaton:
+def _table(steps: Steps, letters: Sequence[int]) -> Automaton:
     """The automaton over letters, of which the formula names ``letters[i]`` (-1: none of its events)."""
-    stepper = Stepper(program)
+    values, kept = steps.start(), steps.kept
+
+    def step(state: tuple[tuple[bool, ...], bool], letter: int) -> tuple[tuple[bool, ...], bool]:
+        values[kept] = state[0]
+        (result,) = steps.take(values, letters[letter], 0)
+        return tuple(values[kept]), values[result]
+
+    work = sum(1 + len(steps.residues[letter][0]) for letter in letters)
     return explore(
-        (0, False),
+        (tuple(values[kept]), False),
         len(letters),
-        lambda state, letter: stepper.step(state[0], letters[letter]),
-        lambda state: ("validation",) if state[1] else ("violation",),
-        min(MAX_TABLE_STATES, 1 + MAX_TABLE_WORK // (len(program.instructions) * len(letters))),
+        step,
+        lambda state: TOLD[state[1]],
+        min(MAX_STATES, 1 + MAX_TABLE_WORK // work),
     )
 
 
-def _evaluate(program: Program, place: dict[int, int], bits: int, event: int) -> list[bool]:
-    """The values of all subformulas at an event, given the bits that the last one left."""
-    values: list[bool] = []
-    for number, instruction in enumerate(program.instructions):
-        operands = [values[operand] for operand in instruction.operands]
-        operator = instruction.operator.removeprefix("abstract ")
-        if operator == "event":
-            value = instruction.event == event
-        elif operator in ("true", "false"):
-            value = operator == "true"
-        elif operator == "not":
-            value = not operands[0]
-        elif operator == "and":
-            value = all(operands)
-        elif operator == "or":
-            value = any(operands)
-        elif operator == "xor":
-            value = sum(operands) % 2 == 1
-        elif operator == "previously":
-            value = bool(bits & place[number])
-        else:
-            value = operands[1] or (operands[0] and bool(bits & place[number]))
-        values.append(value)
-    return values
-
-
 class Window:
-    """``since[low,high]`` with both bounds: the intervals of time in which it will hold."""
+    """``since[low,high]``: the intervals of time in which it will hold if the left operand goes on to hold.
+
+    Intervals that touch are merged, so there are at most about ``low/(high-low)`` of them, and never more than events
+    within ``low``.
+    """
 
     __slots__ = ("_high", "_intervals", "_low")
 
-    def __init__(self, low: int, high: int) -> None:
+    def __init__(self, low: int, high: int | None) -> None:
         self._low = low
-        self._high = high
+        self._high = FOREVER if high is None else high
         self._intervals: deque[list[int]] = deque()
-
-    def copy(self) -> "Window":
-        """Another one that has seen the same."""
-        other = Window(self._low, self._high)
-        other._intervals.extend(interval.copy() for interval in self._intervals)
-        return other
 
     def step(self, unbroken: bool, anchor: bool, now: int) -> bool:
         """The value at ``now``, where the left operand is ``unbroken`` and the right one ``anchor``."""
         intervals = self._intervals
-        if not unbroken:
+        if intervals and not unbroken:
             intervals.clear()
         if anchor:
-            if intervals and now + self._low <= intervals[-1][1] + 1:
-                intervals[-1][1] = now + self._high
+            begin, end = now + self._low, now + self._high
+            if intervals and begin <= intervals[-1][1] + 1:
+                intervals[-1][1] = end
             else:
-                intervals.append([now + self._low, now + self._high])
-        while intervals and intervals[0][1] < now:
+                intervals.append([begin, end])
+        while intervals:
+            begin, end = intervals[0]
+            if end >= now:
+                return begin <= now
             intervals.popleft()
-        return bool(intervals) and intervals[0][0] <= now
+        return False
 
     def __copy__(self) -> "Window":
         twin = Window(self._low, self._high)
@@ -249,153 +360,43 @@ class Window:
         return len(self._intervals)
 
 
-StepFunction = Callable[[int, int], Categories]
-Made = tuple[StepFunction, Callable[[], Any]]
-
-
 class PastRun(UntimedRun):
-    """A run of a past formula; ``step`` is the compiled function itself, ``twin`` makes one that goes on from here."""
+    """A run of a past formula: its values, and the time."""
 
-    __slots__ = ("step", "twin")
+    __slots__ = ("_residues", "now", "values")
 
-    def __init__(self, step: StepFunction, twin: "Callable[[], Made]") -> None:
-        self.step = step
-        self.twin = twin
+    def __init__(self, steps: Steps, time_ns: int) -> None:
+        self._residues = steps.residues
+        self.values = steps.start()
+        self.now = time_ns
 
     def __copy__(self) -> "PastRun":
-        return PastRun(*self.twin())
+        made: PastRun = twin(self)
+        made.values = list(map(copy.copy, self.values))
+        return made
+
+    def step(self, event: int, time_ns: int) -> Categories:
+        """Take the event."""
+        if time_ns > self.now:  # noqa: PLR1730  `max` takes as long as the rest
+            self.now = time_ns
+        operations, (result,) = self._residues[event]
+        if operations:
+            compute(operations, self.values, event, self.now)
+        return TOLD[self.values[result]]
 
 
 class PastProperty(CompiledProperty):
-    """A past formula as a function. ``code`` is its source text, for the curious."""
+    """A past formula without a table."""
 
-    def __init__(self, source: Source, program: Program) -> None:
+    def __init__(self, source: Source, steps: Steps) -> None:
         super().__init__(source, VERDICTS)
-        self._timed = program.bounded
-        everything = range(len(program.instructions))
-        self.code = generate(program, everything, f"VALIDATION if v{program.result} else VIOLATION")
-        self._make: Callable[[int], Made] = loaded(self.code)
+        self._steps = steps
 
     @property
     def timed(self) -> bool:
         """Whether the formula has time bounds."""
-        return self._timed
+        return any(self._steps.bounds)
 
     def start(self, time_ns: int) -> Run:
         """A fresh run."""
-        return PastRun(*self._make(time_ns))
-
-
-def generate(program: Program, computed: Iterable[int], result: str) -> str:
-    """The text of ``make(now)``: it returns a step function with the state of one run in its closure,
-    and a function that makes the same once more, to go on from there.
-
-    ``computed`` are the instructions that it computes, operands first (``v`` and the number is the value of one), and
-    ``result`` is what a step gives.
-    """
-    return _Generator(program).text(computed, result)
-
-
-def loaded(code: str) -> Callable[[int], Any]:
-    """The function that ``generate`` has written."""
-    namespace: dict[str, Any] = {
-        "Window": Window,
-        "VALIDATION": VERDICTS[1:],
-        "VIOLATION": VERDICTS[:1],
-        "copy": copy.copy,
-    }
-    exec(compile(code, "<past formula>", "exec"), namespace)  # noqa: S102  # made of numbers only
-    make: Callable[[int], Any] = namespace["make"]
-    return make
-
-
-class _Generator:
-    def __init__(self, program: Program) -> None:
-        self._program = program
-        self._state: dict[str, str] = {}
-        self._body: list[str] = []
-        self._after: list[str] = []
-
-    def text(self, computed: Iterable[int], result: str) -> str:
-        program = self._program
-        for number in computed:
-            self._write(number, program.instructions[number])
-        if program.bounded:
-            self._state["now"] = "now"
-            clock = ["if t < now: t = now"]
-            self._after.append("now = t")
-        else:
-            clock = []
-        lines = [*clock, *self._body, *self._after]
-        assigned = [name for name, initial in self._state.items() if not initial.startswith("Window")]
-        if assigned:
-            lines.insert(0, f"nonlocal {', '.join(assigned)}")
-        lines.append(f"return {result}")
-        initial = {name: value for name, value in self._state.items() if name != "now"}
-        kept = "".join(f"copy({name}), " for name in initial)
-        names, values = ("".join(f"{item}, " for item in items) for items in (initial, initial.values()))
-        return "\n".join(
-            [
-                "def make(now, kept=None):",
-                f"    {names} = kept or ({values})" if names else "",
-                "    def step(e, t):",
-                *(f"        {line}" for line in lines),
-                "    def twin():",
-                f"        return make(now, ({kept}))",
-                "    return step, twin",
-                "",
-            ]
-        )
-
-    def _write(self, number: int, instruction: Instruction) -> None:
-        operator = instruction.operator
-        names = [f"v{operand}" for operand in instruction.operands]
-        if operator == "since":
-            self._since(number, instruction)
-        elif operator == "previously":
-            self._previously(number, instruction)
-        else:
-            expressions = {
-                "event": f"e == {instruction.event}",
-                "true": "True",
-                "false": "False",
-                "not": f"not {names[0]}" if names else "",
-                "and": " and ".join(names),
-                "or": " or ".join(names),
-                "xor": f"sum(({', '.join(names)},)) % 2 == 1" if len(names) > 2 else " ^ ".join(names),
-            }
-            self._body.append(f"v{number} = {expressions[operator]}")
-
-    def _previously(self, number: int, instruction: Instruction) -> None:
-        kept = f"p{number}"
-        self._state[kept] = "False"
-        tests = [kept]
-        if instruction.low:
-            tests.append(f"t - now >= {instruction.low}")
-        if instruction.high is not None:
-            tests.append(f"t - now <= {instruction.high}")
-        self._body.append(f"v{number} = {' and '.join(tests)}")
-        self._after.append(f"{kept} = v{instruction.operands[0]}")
-
-    def _since(self, number: int, instruction: Instruction) -> None:
-        left, right = (f"v{operand}" for operand in instruction.operands)
-        always = self._program.instructions[instruction.operands[0]].operator == "true"
-        kept, low, high = f"s{number}", instruction.low, instruction.high
-        if not instruction.bounded:
-            self._state[kept] = "False"
-            self._body.append(f"v{number} = {kept} = {right} or ({kept} and {left})")
-        elif low and high is not None:
-            self._state[kept] = f"Window({low}, {high})"
-            self._body.append(f"v{number} = {kept}.step({left}, {right}, t)")
-        elif high is not None:
-            self._state[kept] = str(NEVER)
-            self._body.append(f"if {right}: {kept} = t")
-            if not always:
-                self._body.append(f"elif not {left}: {kept} = {NEVER}")
-            self._body.append(f"v{number} = t - {kept} <= {high}")
-        else:
-            self._state[kept] = str(-NEVER)
-            if not always:
-                self._body.append(f"if not {left}: {kept} = {-NEVER}")
-            self._body.append(f"if {right} and {kept} > t: {kept} = t")
-            self._body.append(f"v{number} = t - {kept} >= {low}")
+        return PastRun(self._steps, time_ns)

@@ -12,6 +12,8 @@ An ``end`` to which no ``begin`` belongs begins the abstract past anew. Calls th
 bound beyond which a ``begin`` is a fault of the specification. (Rosu, Chen and Ball, 2008.)
 """
 
+from itertools import zip_longest
+
 from appliance.rosmop.logics.formula import NOT, Formula, Level, Syntax, boolean_levels, nodes, read_formula
 from appliance.rosmop.logics.interface import (
     Categories,
@@ -22,7 +24,7 @@ from appliance.rosmop.logics.interface import (
     UntimedRun,
     twin,
 )
-from appliance.rosmop.logics.past import VERDICTS, Program, Stepper
+from appliance.rosmop.logics.past import TOLD, VERDICTS, Program, Steps, steps_of
 from appliance.rosmop.logics.ptltl import SYNTAX as PTLTL
 
 MAX_DEPTH = 10_000
@@ -61,15 +63,16 @@ def compile_ptcaret(source: Source) -> CompiledProperty:
         )
     if CALL not in source.events and any(node.name == CALL for node in nodes(formula)):
         raise source.error(0, "`@bc` needs the event `call` of the specification")
-    return CaretProperty(source, Program(formula, source.events))
+    program = Program(formula, source.events)
+    return CaretProperty(source, steps_of(program, [program.result]))
 
 
 class CaretProperty(CompiledProperty):
     """A formula with a stack: what the abstract operators remember, for each call that is open."""
 
-    def __init__(self, source: Source, program: Program) -> None:
+    def __init__(self, source: Source, steps: Steps) -> None:
         super().__init__(source, VERDICTS)
-        self.stepper = Stepper(program)
+        self.steps = steps
         places = [source.events.index(name) if name in source.events else -1 for name in (BEGIN, END)]
         self.begin, self.end = places
 
@@ -79,33 +82,34 @@ class CaretProperty(CompiledProperty):
 
 
 class CaretRun(UntimedRun):
-    """A run: what is remembered of the last event, and the abstract past before each open call."""
+    """A run: its values, and those about the abstract past before each open call."""
 
-    __slots__ = ("_begin", "_bits", "_end", "_mask", "_stack", "_step")
+    __slots__ = ("_compiled", "_stack", "_values")
 
     def __init__(self, compiled: CaretProperty) -> None:
-        self._step = compiled.stepper.step
-        self._mask = compiled.stepper.abstract
-        self._begin, self._end = compiled.begin, compiled.end
-        self._bits = 0
-        self._stack: list[int] = []
+        self._compiled = compiled
+        self._values = compiled.steps.start()
+        self._stack: list[tuple[bool, ...]] = []
 
     def __copy__(self) -> "CaretRun":
         made: CaretRun = twin(self)
-        made._stack = self._stack.copy()
+        made._values, made._stack = self._values.copy(), self._stack.copy()
         return made
 
     def step(self, event: int, _time_ns: int) -> Categories:
         """Take the event; the time plays no part. Raises RunFaultError, and is unchanged then."""
-        if event == self._begin:
-            if len(self._stack) >= MAX_DEPTH:
+        compiled, values, stack = self._compiled, self._values, self._stack
+        abstract = compiled.steps.abstract
+        if event == compiled.begin:
+            if len(stack) >= MAX_DEPTH:
                 raise RunFaultError(f"more than {MAX_DEPTH} calls are open: an `end` is missing")
-            self._stack.append(self._bits & self._mask)
-        bits, holds = self._step(self._bits, event)
-        if event == self._end:
-            bits = (bits & ~self._mask) | (self._stack.pop() if self._stack else 0)
-        self._bits = bits
-        return ("validation",) if holds else ("violation",)
+            stack.append(tuple(values[place] for place in abstract))
+        (result,) = compiled.steps.take(values, event, 0)
+        holds = values[result]
+        if event == compiled.end:
+            for place, before in zip_longest(abstract, stack.pop() if stack else (), fillvalue=False):
+                values[place] = before
+        return TOLD[holds]
 
 
 def plain(formula: Formula) -> Formula:

@@ -3,17 +3,20 @@
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, get_type_hints
 
+import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.rosmop.logics.catalogue import LOGICS, compile_property
-from appliance.rosmop.logics.interface import FormulaError
+from appliance.rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError
 from appliance.rosmop.positions import Position
 from tests.support.examples import examples
-from tests.unit.rosmop.logics.driving import ABC, ORIGIN, compiled, refusal
+from tests.unit.rosmop.logics.driving import ABC, ORIGIN, compiled, play, refusal, seeded
 
 EXAMPLES = {
     "fsm": "s [ a -> s ]",
@@ -46,6 +49,52 @@ def test_every_logic_in_any_case(logic: str) -> None:
     """Each logic is found by its name in any case, and names its categories."""
     for name in (logic, logic.upper(), logic.title()):
         assert compile_property(name, EXAMPLES[logic], ABC, ORIGIN).categories == CATEGORIES[logic]
+
+
+@pytest.mark.parametrize(
+    ("logic", "formula"),
+    [
+        *EXAMPLES.items(),
+        ("tfsm", "s [ a -> t, timeout 2ns -> t ] t [ b -> s ] alias end = t"),
+        ("cfg", "S -> S a S b | epsilon"),
+        ("pattern", "after a until c: a causes b within 3ns"),
+        ("pattern", "globally: some b within 3ns enforced by f"),
+        ("ptltl", " xor ".join("(*) " * number + "a" for number in range(1, 16))),
+        ("mtl", "a => (!c since[2ns,inf] b) or previously[0,3ns] c"),
+        ("mtl", "once[0,3ns] (a => eventually[0,2ns] b)"),
+        ("ptcaret", "a => <*a> b"),
+    ],
+)
+def test_every_property_is_made_anew_from_data(
+    logic: str, formula: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it is made of can be written down and read by another process, and tells the same."""
+    given: list[Any] = []
+
+    def noting(begin: Callable[..., None]) -> Callable[..., None]:
+        def noted(self: CompiledProperty, *arguments: Any) -> None:
+            given[:] = arguments
+            begin(self, *arguments)
+
+        return noted
+
+    events = (*ABC, "begin", "end")
+    kinds = [*CompiledProperty.__subclasses__(), *ClockedProperty.__subclasses__()]
+    with monkeypatch.context() as patched:
+        for kind in kinds:
+            if "__init__" in vars(kind):
+                patched.setattr(kind, "__init__", noting(kind.__init__))
+        one = compiled(logic, formula, events)
+    hints = [hint for name, hint in get_type_hints(type(one).__init__).items() if name != "return"]
+    read = [
+        msgspec.msgpack.decode(msgspec.msgpack.encode(argument), type=hint)
+        for argument, hint in zip(given, hints, strict=True)
+    ]
+    other = type(one)(*read)
+    random = seeded(5)
+    for _ in range(20):
+        trace = list(zip(sorted(random.choices(range(30), k=20)), random.choices(events, k=20), strict=True))
+        assert play(one.start(0), events, trace, 40) == play(other.start(0), events, trace, 40)
 
 
 @pytest.mark.parametrize("logic", LOGICS)

@@ -1,12 +1,15 @@
 """``mtl`` over the past: against the definition of its operators, and against another monitor."""
 
+from copy import copy
 from random import Random
 from typing import Any
 
+import pytest
 import reelay
 
+from appliance.rosmop.logics import past
 from appliance.rosmop.logics.interface import FiniteProperty, Run
-from appliance.rosmop.logics.past import Window
+from appliance.rosmop.logics.past import PastRun, Window
 from tests.unit.rosmop.logics.driving import ABC, compiled, refusal, seeded
 from tests.unit.rosmop.logics.temporal import Printer, Tree, draw
 
@@ -94,8 +97,13 @@ def timed_trace(random: Random, length: int, gap: int) -> Timed:
     return trace
 
 
-def test_random_formulas_by_definition() -> None:
-    """Validation exactly where the formula holds: 1500 formulas with bounds of all kinds, two traces each."""
+@pytest.mark.parametrize("folded", [past.MAX_FOLDED, 0])
+def test_random_formulas_by_definition(folded: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Validation exactly where the formula holds: 1500 formulas with bounds of all kinds, two traces each.
+
+    Also of formulas that are too large to find what is left of them at each event.
+    """
+    monkeypatch.setattr(past, "MAX_FOLDED", folded)
     random = seeded(9)
     for _ in range(1500):
         tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 6)
@@ -195,6 +203,33 @@ def test_time_does_not_run_backwards() -> None:
     """An event with an earlier time counts as of the latest time seen."""
     run = compiled("mtl", "once[5ns,inf] a").start(0)
     assert verdicts(run, [(10, "a"), (3, "b"), (15, "b")]) == [False, False, True]
+
+
+def test_a_copy_of_a_run_goes_on_by_itself() -> None:
+    """What happens to one of the two changes nothing for the other."""
+    random = seeded(12)
+    for _ in range(300):
+        tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 6)
+        run = compiled("mtl", PRINTER.show(tree, random)).start(0)
+        begun = timed_trace(random, 5, 4)
+        verdicts(run, begun)
+        runs = run, copy(run)
+        traces = [
+            [*begun, *((begun[-1][0] + time, event) for time, event in timed_trace(random, 5, 4))]
+            for _ in runs
+        ]
+        for place in range(5, 10):
+            for one, trace in zip(runs, traces, strict=True):
+                assert verdicts(one, trace[place : place + 1]) == [holds(tree, trace, place)], (tree, trace)
+
+
+def test_memory_of_what_is_not_asked_for_is_bounded() -> None:
+    """However many events happen at which the formula holds anyway, no window grows."""
+    run = compiled("mtl", "a => once[1s,2s] b or previously[1s,2s] b").start(0)
+    assert isinstance(run, PastRun)
+    for second in range(0, 3_000, 3):
+        assert run.step(1, second * 10**9) == ("validation",)
+    assert all(len(value) <= 2 for value in run.values if isinstance(value, Window))
 
 
 def test_memory_of_a_window_is_bounded_by_its_bounds() -> None:

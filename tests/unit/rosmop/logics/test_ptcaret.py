@@ -1,6 +1,7 @@
 """``ptcaret``: against the definition, which looks back through the whole trace for every question."""
 
 from collections.abc import Sequence
+from copy import copy
 
 import pytest
 
@@ -84,6 +85,24 @@ def test_random_formulas() -> None:
             show(tree),
             trace,
         )
+
+
+def test_a_copy_of_a_run_goes_on_by_itself() -> None:
+    """What happens to one of the two, calls and returns too, changes nothing for the other."""
+    random = seeded(13)
+    for _ in range(200):
+        tree = draw(random, 3, TEMPORAL, UNARY, EVENTS)
+        begun, *ends = ([random.choice(EVENTS) for _ in range(6)] for _ in range(3))
+        run = compiled("ptcaret", show(tree), EVENTS).start(0)
+        for event in begun:
+            run.step(EVENTS.index(event), 0)
+        runs = run, copy(run)
+        found: tuple[list[tuple[str, ...]], ...] = [], []
+        for events in zip(*ends, strict=True):
+            for one, event, told_of_it in zip(runs, events, found, strict=True):
+                told_of_it.append(one.step(EVENTS.index(event), 0))
+        for end, told_of_it in zip(ends, found, strict=True):
+            assert told_of_it == verdicts(tree, [*begun, *end])[6:], (show(tree), begun, end)
 
 
 BEGIN, CALL, A = ("event", "begin"), ("event", "call"), ("event", "a")
