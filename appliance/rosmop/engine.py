@@ -37,12 +37,12 @@ from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.reach import reached, redefined
 from appliance.rosmop.runtime.context import TRIAL_BUDGET, Context
 from appliance.rosmop.runtime.wire import Buffer, Message
-from appliance.rosmop.sharing import sharing
+from appliance.rosmop.sharing import sharing, way_of
 from appliance.rosmop.slices import LIMIT
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.syntax.parser import parse
-from appliance.rosmop.walks import Walker, Walks, walks_of
+from appliance.rosmop.walks import Prepared, Walker, Walks, walks_of
 
 
 def _never() -> bool:
@@ -114,7 +114,7 @@ class MonitorSet:
         self.files = tuple(files)
         self.trials = trials
         self.tapped: list[Tapped] = []
-        self._tapped_topics: frozenset[str] = frozenset()
+        self._tapped_ways: frozenset[str] = frozenset()
         self.warnings: tuple[Finding, ...] = compiled.warnings
         self.compiled = compiled
         self.interpreter = compiled.interpreter()
@@ -131,7 +131,6 @@ class MonitorSet:
         )
         self.steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
-        self._requests: dict[tuple[str, str], tuple[Step, ...]] = {}
         self._execution = Execution(self.interpreter, on_fault)
         self._agenda = Agenda(self._monitors, self._execution, patience)
         self.began: tuple[str, ...] = ()
@@ -269,7 +268,7 @@ class MonitorSet:
 
     def taps(self, topic: str) -> bool:
         """Whether messages on this topic may be copied into `tapped`."""
-        return topic in self._tapped_topics
+        return topic in self._tapped_ways
 
     def type_of(self, topic: str, *, tried: bool = False) -> str | None:
         """The message type of a topic that `wants`; None where none does, or (unless `tried`) only on trial."""
@@ -283,7 +282,7 @@ class MonitorSet:
     def service_type_of(self, service: str, *, tried: bool = False) -> str | None:
         """The type of a service with an enabled event; None of another, or (unless `tried`) where it is on trial."""
         for part in ("request", "response"):
-            for step in self._requests.get((service, part), ()):
+            for step in self.steps.get(way_of(service, part), ()):
                 if tried or not isinstance(step, _Tap):
                     return step.event.service_type
         return None
@@ -308,7 +307,7 @@ class MonitorSet:
         return self._contexts.get(topic, ())
 
     def walker(self, topic: str) -> Walker | None:
-        """The walk for messages on this topic; None if there is none."""
+        """The walk for messages on this topic, or `way_of` a service; None if there is none."""
         return self._walks.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
 
     def walks(self, walker: Walker, time_ns: int) -> bool:
@@ -471,33 +470,39 @@ class MonitorSet:
 
     def process(self, topic: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY) -> Outcome:
         """What is to be done with a message: the bytes of its fields, received at this time on this topic."""
-        return self._process(self.steps.get(topic, ()), buffer, time_ns, sender)
-
-    def judge(self, topic: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY) -> Outcome:
-        """What `process` says, by the walk where that takes the message: as in the relay."""
-        walker = self.walker(topic)
-        walks = walker is not None and self.walks(walker, time_ns)
-        taken = walker.take(buffer, time_ns, sender.source) if walker is not None and walks else None
-        if taken is None:
-            return self.process(topic, buffer, time_ns, sender)
-        outcome = Outcome(buffer, time_ns)
-        outcome.events, outcome.log = taken
-        return outcome
-
-    def process_service(
-        self, service: str, part: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY
-    ) -> Outcome:
-        """The same for the `request` or `response` (the `part`) of a service."""
-        return self._process(self._requests.get((service, part), ()), buffer, time_ns, sender)
-
-    def _process(self, steps: tuple[Step, ...], buffer: Buffer, time_ns: int, sender: Sender) -> Outcome:
-        outcome = Outcome(buffer, time_ns)
+        outcome, steps = Outcome(buffer, time_ns), self.steps.get(topic, ())
         if self._agenda.has_come(time_ns):
             outcome.before = self._agenda.advance(time_ns)
         if steps:
             self._execution.message(steps, buffer, outcome, sender)
             self._agenda.schedule()
         return outcome
+
+    def judge(self, topic: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY) -> Outcome:
+        """What `process` says, by the walk where that takes the message: as in the relay."""
+
+        def silent(walker: Walker) -> Prepared:
+            return walker.prepare(loud=True, told=[True] * len(walker.events), source=sender.source)
+
+        taken = self.taken(topic, buffer, time_ns, silent)
+        return self.process(topic, buffer, time_ns, sender) if taken is None else taken
+
+    def taken(
+        self, topic: str, buffer: Buffer, time_ns: int, prepare: Callable[[Walker], Prepared]
+    ) -> Outcome | None:
+        """What `process` says of a message on a topic, or `way_of` a service, if its walk takes it (`Walker.take`, with
+        what `prepare` says); None: nothing was done.
+        """
+        walker = self.walker(topic)
+        if walker is None or not self.walks(walker, time_ns):
+            return None
+        return walker.take(buffer, time_ns, prepare(walker))
+
+    def process_service(
+        self, service: str, part: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY
+    ) -> Outcome:
+        """The same for the `request` or `response` (the `part`) of a service."""
+        return self.process(way_of(service, part), buffer, time_ns, sender)
 
     @property
     def next_due(self) -> int | None:
@@ -528,39 +533,33 @@ class MonitorSet:
         monitor.faults = before.faults
 
     def _index(self) -> None:
-        """Which steps a message on which topic takes."""
+        """Which steps a message on which topic, or part of a service, takes."""
         steps: dict[str, list[Step]] = {}
-        requests: dict[tuple[str, str], list[Step]] = {}
         standing = {monitor.name: monitor.steps for monitor in self._monitors if monitor.enabled}
         standing |= {trial._order[0]: self._taps(trial) for trial in self.trials}
         for step in (step for name in self._order for step in standing.get(name, ())):
-            topic, part = step.event.topic or "", step.event.part
-            if part is None:
-                steps.setdefault(topic, []).append(step)
-            else:
-                requests.setdefault((topic, part), []).append(step)
-        for found in (*steps.values(), *requests.values()):
+            steps.setdefault(step.event.way or "", []).append(step)
+        for found in steps.values():
             acting = [step for step in found if not isinstance(step, _Tap)]
             for place, step in enumerate(acting):
                 step.first = not place or acting[place - 1].monitor is not step.monitor
             for step in found if acting else ():
                 if isinstance(step, _Tap):
                     step.monitor = acting[0].monitor  # whose state has to come home
-        self._tapped_topics = frozenset(
-            topic for topic, found in steps.items() if any(isinstance(step, _Tap) for step in found)
+        self._tapped_ways = frozenset(
+            way for way, found in steps.items() if any(isinstance(step, _Tap) for step in found)
         )
-        self.steps = {topic: tuple(found) for topic, found in steps.items()}
-        self._requests = {key: tuple(found) for key, found in requests.items()}
+        self.steps = {way: tuple(found) for way, found in steps.items()}
         self._contexts = {
-            topic: tuple(step.monitor.context for step in found if step.first)
-            for topic, found in self.steps.items()
+            way: tuple(step.monitor.context for step in found if step.first)
+            for way, found in self.steps.items()
         }
 
     def _taps(self, trial: "MonitorSet") -> tuple[Step, ...]:
         """A tap for each topic and part of a service on which the trial has an enabled event."""
         return tuple(
             _Tap(found[0].monitor, found[0].event, 0, "", self._tap(trial, found[0].event))
-            for found in (*trial.steps.values(), *trial._requests.values())
+            for found in trial.steps.values()
         )
 
     def _tap(self, trial: "MonitorSet", event: EventCode) -> Callable[[Message | None], bool]:

@@ -28,3 +28,8 @@ def connected(keys: Sequence[Iterable[object]]) -> Iterable[Sequence[int]]:
     for number in range(len(keys)):
         together.setdefault(find(number), []).append(number)
     return together.values()
+
+
+def way_of(service: str, part: str) -> str:
+    """What stands for the `request` or `response` (the `part`) of a service where topics stand: none has a blank."""
+    return f"{service} {part}"

@@ -1,4 +1,4 @@
-"""Runs the module of a set (`ir/feed.py`): when a topic's walk may be used, and what it has done.
+"""Runs the module of a set (`ir/feed.py`): when a walk of a topic, or part of a service, may be used, and what it does.
 
 Invariants:
 - A walk ends before the first message that it leaves to the engine; of that message nothing has happened yet.
@@ -27,7 +27,7 @@ from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
 from appliance.rosmop.ir.values import Values, struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
-from appliance.rosmop.outcomes import Verdict
+from appliance.rosmop.outcomes import Outcome, Verdict
 from appliance.rosmop.runtime.context import Context, LogLine, Published
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.types import kinds
@@ -251,7 +251,7 @@ def _element_code(kind: Type) -> str:
 
 
 class Walker:
-    """The walk of one topic."""
+    """The walk of one topic, or part of a service."""
 
     def __init__(
         self,
@@ -378,13 +378,11 @@ class Walker:
                 dropped, told = self._counted() if run != begun or said & TOLD else ((), ())
                 return Walked(position, run, dropped, told, sooner, output, seconds)
 
-    def take(
-        self, message: Buffer, time_ns: int, source: int = 0
-    ) -> tuple[Sequence[str], Sequence[LogLine]] | None:
-        """Take a message of which nothing is to be told but which events happened and what was put out: they. None if
-        it is left, as one is that publishes.
+    def take(self, message: Buffer, time_ns: int, prepared: Prepared) -> Outcome | None:
+        """What is to be done with one message; None if it is left. Verdicts are not explained, and it is not said where
+        it was changed.
 
-        Only as `walk`, and where nobody asks what has `happened`.
+        Only as `walk`, with what is prepared for this alone, and where nobody asks what has `happened`.
         """
         end = self._frames + 4 + len(message)
         if end > self._frames + AREA:
@@ -392,13 +390,26 @@ class Walker:
         frame = self._memory[self._frames : end]
         _LENGTH.pack_into(frame, 0, len(message))
         frame[4:] = message
-        prepared = self.prepare(loud=True, told=[True] * len(self.events), source=source)
+        prepared.changed.clear()
         walked = self.walk(frame, 0, 0, [], time_ns, prepared)
         if walked is not None and not walked.position:
             return None
-        events = tuple(name for (name,), count in zip(self.events, self.happened(), strict=True) if count)
-        output = walked.output if walked is not None else ()
-        return events, [line for _, line in output if isinstance(line, LogLine)]
+        outcome = Outcome(message, time_ns)
+        outcome.events = tuple(
+            name for (name,), count in zip(self.events, self.happened(), strict=True) if count
+        )
+        for who in prepared.changed:
+            outcome.result, outcome.buffer, outcome.changed_by = (
+                "changed",
+                bytes(frame[4:]),
+                self.writers(who),
+            )
+        if walked is not None:
+            outcome.log = [each for _, each in walked.output if isinstance(each, LogLine)]
+            outcome.published = [each for _, each in walked.output if isinstance(each, Published)]
+            counts = zip(self.verdicts, walked.told, strict=False)  # none is counted where there is none
+            outcome.verdicts = tuple(verdict for verdict, count in counts for _ in range(count))
+        return outcome
 
     def _walk_elsewhere(  # noqa: PLR0917  as `walk`
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
@@ -508,7 +519,9 @@ def _verdict(monitor: Monitor, place: int, handler: int) -> Verdict:
 
 
 class Walks(NamedTuple):
-    """The walkers of a set by topic, and the part of their module's memory to receive frames into, if there is one."""
+    """The walkers of a set by topic (see `EventCode.way`), and the part of their module's memory to receive frames
+    into, if there is one.
+    """
 
     of_topic: Mapping[str, Walker] = MappingProxyType({})
     area: memoryview | None = None

@@ -1,4 +1,4 @@
-"""What `rosrv monitor check --prove` says: of each event on a topic, whether its module is proved to be the same."""
+"""What `rosrv monitor check --prove` says: of each event on a topic or service, whether its module is proved right."""
 
 import time
 

@@ -39,10 +39,13 @@ from appliance.relay.monitors.trials import Trials
 from appliance.relay.report import Reporter
 from appliance.rosmop.happened import Sender
 from appliance.rosmop.runtime.context import Published
+from appliance.rosmop.sharing import way_of
 
 if TYPE_CHECKING:
     from appliance.rosmop.engine import MonitorSet
     from appliance.rosmop.monitor import Monitor
+    from appliance.rosmop.outcomes import Outcome
+    from appliance.rosmop.walks import Prepared, Walker
 
 _AFTER_DEFECT = 1.0
 
@@ -80,6 +83,8 @@ class Middle:
         self._awaited: SpecificationsStated | None = None
         self.spent = 0.0
         self.sight = object()
+        self._prepared: dict[tuple[Place, str], Prepared] = {}
+        """For the walks of requests and replies until there is another `sight`: at most a second."""
         self._timer: Timer | None = None
         self._due: int | None = None
         self._compiler = Compiler(loop, self.compiled)
@@ -239,8 +244,9 @@ class Middle:
         return Lane(self, place)
 
     def look_again(self) -> None:
-        """Something has happened that may change what lanes have prepared."""
+        """Something has happened that may change what lanes have prepared, and what is prepared here."""
         self.sight = object()
+        self._prepared.clear()
 
     def request(self, place: Place, body: bytes) -> Judged:
         """What becomes of a client's request to a service."""
@@ -283,17 +289,21 @@ class Middle:
             return Judged(body)
         if self.spent > LONGEST:
             return Judged(b"", TOO_LONG)
-        self.look_again()
-        now, began = self.now(), time.thread_time()
+        now, began, due = self.now(), time.thread_time(), self.monitors.next_due
         view = memoryview(body)
-        try:
-            outcome = self.monitors.process_service(
-                service, part, bytearray(body), now, Sender(self.senders.number(place))
-            )
-        except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
-            outcome = dropped(view, now, self.observer.defect(error, place, now))
-        if self.monitors.tapped:
-            self.trials.wait(place, None)
+        outcome = self._walked(self.monitors, place, way_of(service, part), body, now)
+        if outcome is None:
+            self.look_again()
+            try:
+                outcome = self.monitors.process_service(
+                    service, part, bytearray(body), now, Sender(self.senders.number(place))
+                )
+            except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
+                outcome = dropped(view, now, self.observer.defect(error, place, now))
+            if self.monitors.tapped:
+                self.trials.wait(place, None)
+        elif self.monitors.next_due != due:
+            self.look_again()
         self.observer.told(outcome, place)
         self.spent += time.thread_time() - began
         self.schedule()
@@ -304,6 +314,32 @@ class Middle:
             self.observer.changed(outcome, place, body[:SHOWN], len(body))
             return Judged(bytes(outcome.buffer))
         return Judged(body)
+
+    def _walked(self, monitors: MonitorSet, place: Place, way: str, body: bytes, now: int) -> Outcome | None:
+        """What the module says, if nothing is to be told of it but how much there was; a refusal is told its client."""
+        observer = self.observer
+
+        def prepare(walker: Walker) -> Prepared:
+            prepared = self._prepared.get((place, way))
+            if prepared is None:
+                prepared = self._prepared[place, way] = walker.prepare(
+                    loud=walker.changes and observer.shows(place),
+                    told=[True] * len(walker.events),
+                    counted=[observer.hides_verdict(verdict, place) for verdict in walker.verdicts],
+                    source=self.senders.number(place),
+                    published=[observer.hides_publication(*each, place) for each in walker.publishes],
+                )
+            return prepared
+
+        try:
+            outcome = monitors.taken(way, body, now, prepare)
+        except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
+            observer.defect(error, place, now)
+            return None
+        if outcome is not None and outcome.published:
+            observer.published(outcome.published, place, now)
+            outcome.published = ()
+        return outcome
 
     # --- time ---
 

@@ -19,6 +19,7 @@ from appliance.rosmop.compile.statements import check_topic, write
 from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.numbers import f32
+from appliance.rosmop.sharing import way_of
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
@@ -52,6 +53,11 @@ class EventCode:
     """Where its key is known it has happened, and there is nothing to do."""
     acts: bool = False
     """Its action does more than to change the slice's own variables."""
+
+    @property
+    def way(self) -> str | None:
+        """What its messages come on: the topic, or the part of a service (see `way_of`); None of a timer."""
+        return self.topic if self.topic is None or self.part is None else way_of(self.topic, self.part)
 
 
 def compile_event(

@@ -12,7 +12,7 @@ from appliance.rosmop.sharing import connected
 @dataclass(frozen=True)
 class Group:
     """A component, with the numbers of its specifications and of its properties with tables (specification, property),
-    and for each topic the events on it (specification, event).
+    and for each topic, and part of a service, the events on it (specification, event).
     """
 
     component: form.Component
@@ -27,7 +27,7 @@ def groups(specifications: Sequence[SpecificationCode]) -> Iterator[Group]:
         [
             specification.name,
             *specification.uses,
-            *((event.topic, event.part) for event in specification.events if event.topic is not None),
+            *(event.way for event in specification.events if event.way is not None),
         ]
         for specification in specifications
     ])  # fmt: skip
@@ -51,8 +51,8 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
             and specification.slicing is None
         ]
         for index, event in enumerate(specification.events):
-            if event.topic is not None and event.part is None:
-                topics.setdefault(event.topic, []).append((number, index))
+            if event.way is not None:
+                topics.setdefault(event.way, []).append((number, index))
     rows = []
     # A message of a parametric specification is always for Python, which has the slices.
     topics = {

@@ -692,7 +692,8 @@ class Event:
 @dataclass(frozen=True, slots=True)
 class Component:
     """Specifications that share topics or variables, and nothing with others: the variables of each of them, how many
-    properties with tables they have, and their topics with the events on each, in order.
+    properties with tables they have, and their topics (of services the request or response, by a name that no topic
+    has) with the events on each, in order.
 
     `noted` are variables more, in which is noted what nothing depends on and the same message notes again.
     """

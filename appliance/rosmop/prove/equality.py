@@ -61,7 +61,9 @@ _LATEST = 1 << 62
 
 @dataclass(frozen=True)
 class Finding:
-    """What is known of an event on a topic. `answer` is `EQUAL`, or says why it is not known to be, or what differs.
+    """What is known of an event on a topic, or part of a service.
+
+    `answer` is `EQUAL`, or says why it is not known to be, or what differs.
 
     `differs`: the two are not equal, which is a defect of what writes modules.
     """
@@ -75,7 +77,7 @@ class Finding:
 def findings_of(
     compiled: Compiled, clock: Callable[[], float], patience: float = PATIENCE
 ) -> Iterator[Finding]:
-    """What is known of every event of a set on a topic, in their order; `patience` in seconds of the clock for each."""
+    """What is known of every event of a set but timers, in their order; `patience` in seconds of the clock for each."""
     found = list(groups(compiled.specifications))
     values = Values(compiled.messages)
     module = module_of(compiled.functions, [group.component for group in found], values)
@@ -89,8 +91,8 @@ def findings_of(
     in_module = {numbers for group in found for events in group.events for numbers in events}
     for number, specification in enumerate(compiled.specifications):
         for index, event in enumerate(specification.events):
-            if event.topic is not None and event.part is None and (number, index) not in in_module:
-                yield Finding(event.topic, f"{specification.name}.{event.name}", IN_PYTHON)
+            if event.way is not None and (number, index) not in in_module:
+                yield Finding(event.way, f"{specification.name}.{event.name}", IN_PYTHON)
 
 
 class Validation:

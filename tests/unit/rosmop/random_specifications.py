@@ -8,15 +8,32 @@ from random import Random
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
 
+_OF_PLAIN = (
+    "uint8 kind\nint32 count\nfloat64 x\nfloat32 y\nbool on\ntime when\nint64[3] three\nuint8[] rest\n"
+)
+_OF_STAMPED = (
+    "string frame\ntime when\nfloat64 x\nint16 count\nfloat64[] values\nuint8 kind\nstring[] names\n"
+)
 OWN = Definitions.from_files(
     {
-        "own/Plain.msg": "uint8 kind\nint32 count\nfloat64 x\nfloat32 y\nbool on\ntime when\nint64[3] three\n"
-        "uint8[] rest\n",
-        "own/Stamped.msg": "string frame\ntime when\nfloat64 x\nint16 count\nfloat64[] values\nuint8 kind\n"
-        "string[] names\n",
+        "own/Plain.msg": _OF_PLAIN,
+        "own/Stamped.msg": _OF_STAMPED,
+        "own/Serve.srv": f"{_OF_PLAIN}---\n{_OF_STAMPED}",
     }
 )
-TOPICS = {"/plain": "own/Plain", "/stamped": "own/Stamped"}
+TRIGGERS = {
+    "/plain": "/plain own/Plain", "/stamped": "/stamped own/Stamped",
+    "/serve request": "service /serve own/Serve request", "/serve response": "service /serve own/Serve response",
+}  # fmt: skip
+PLAIN = ("/plain", "/serve request")
+
+
+def ways(seed: int) -> tuple[str, ...]:
+    """What to draw a topic from, or a part of a service, which some seeds have."""
+    served = ("/serve request", "/serve request", "/serve response", "/plain")
+    return served if seed % 4 == 3 else ("/plain", "/plain", "/stamped")
+
+
 _PLAIN = {"kind": "int", "count": "int", "x": "double", "y": "float", "on": "bool", "when": "ros::Time",
           "three[1]": "long", "x ": "int", "three": "std::vector<long>", "rest": "uint8_t[]"}  # fmt: skip
 _STAMPED = {"frame": "std::string", "x": "double", "count": "int", "values[1]": "double", "kind": "int",
@@ -49,7 +66,7 @@ def definitions() -> Definitions:
 
 @dataclass(frozen=True)
 class Traffic:
-    """Messages of one topic as frames one after the other, and how many."""
+    """Messages of one topic (`EventCode.way`) as frames one after the other, and how many."""
 
     topic: str
     frames: bytes
@@ -69,6 +86,7 @@ class Specifications:
 
     def __init__(self, seed: int) -> None:
         self._random = Random(seed)  # noqa: S311  draws examples, not keys
+        self._ways = ways(seed)
 
     def texts(self) -> list[str]:
         """One to three specifications."""
@@ -90,8 +108,8 @@ class Specifications:
 
     def _event(self, index: int) -> str:
         random = self._random
-        topic = random.choice(("/plain", "/plain", "/stamped"))
-        fields = _PLAIN if topic == "/plain" else _STAMPED
+        topic = random.choice(self._ways)
+        fields = _PLAIN if topic in PLAIN else _STAMPED
         chosen = random.sample(sorted(fields), random.randint(0, 3))
         arrays = {one for one in chosen if f"{one}[1]" in chosen}
         chosen = [one for one in chosen if one not in arrays]
@@ -109,8 +127,9 @@ class Specifications:
         readable = [*numbers, "total", "level", "seen"]
         when = f"when ({self._condition(readable)})" if random.random() < 0.3 else ""
         body = " ".join(self._statement(names, readable, 2) for _ in range(random.randint(0, 4)))
-        kind = TOPICS[topic]
-        return f"event e{index}({parameters}) {topic} {kind} '{{{', '.join(pattern)}}}' {when} {{ {body} }}"
+        return (
+            f"event e{index}({parameters}) {TRIGGERS[topic]} '{{{', '.join(pattern)}}}' {when} {{ {body} }}"
+        )
 
     def _property(self) -> str:
         logic = self._random.choice(_LOGICS)
@@ -211,16 +230,17 @@ class Specifications:
 
 
 class Messages:
-    """Random messages of the two topics."""
+    """Random messages of the two topics, and of a service (`EventCode.way`)."""
 
     def __init__(self, seed: int) -> None:
         self._random = Random(seed)  # noqa: S311  draws examples, not keys
+        self._ways = ways(seed)
 
     def traffic(self) -> Traffic:
         """Some messages of one topic; mostly equally long, now and then not even of their type."""
         random = self._random
-        topic = random.choice(("/plain", "/plain", "/stamped"))
-        make = self._plain if topic == "/plain" else self._stamped
+        topic = random.choice(self._ways)
+        make = self._plain if topic in PLAIN else self._stamped
         alike = random.random() < 0.7
         count = random.choice((1, 1, 2, 5, 12, 30))
         shape = random.randrange(1 << 30)

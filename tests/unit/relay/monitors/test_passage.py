@@ -90,6 +90,8 @@ class Monitored:
         self, traffic: Traffic, first: int = 1, publisher: str = "/talker"
     ) -> tuple[int, bytes, bytes]:
         """What is left of the messages: how many, all of them, the last."""
+        if " " in traffic.topic:
+            return self._asked(traffic, publisher)
         scratch = Scratch()
         scratch.move(self.set.area)
         receiver = FrameReceiver(scratch, 1 << 20, share(1 << 30))
@@ -104,6 +106,14 @@ class Monitored:
         if left is None:
             return 0, b"", b""
         return left.messages, bytes(left.view), bytes(left.keep_last().view)
+
+    def _asked(self, traffic: Traffic, client: str) -> tuple[int, bytes, bytes]:
+        """The same of requests or replies, one by one; of those that are refused what is read instead."""
+        service, part = traffic.topic.split()
+        judge = self.middle.request if part == "request" else self.middle.response
+        judged = [judge(Place("key", service, "10.0.0.7", client), body) for body in traffic.bodies()]
+        left = [one.body if one.refused is None else one.refused.encode() for one in judged]
+        return sum(one.refused is None for one in judged), b"\0".join(left), left[-1]
 
     def told(self) -> list[str]:
         """Everything that was sent to control, the counts of a second in a fixed order."""
@@ -308,6 +318,40 @@ def test_shipped_monitors_do_the_same_together() -> None:
     texts = {path.name: path.read_text() for path in sorted(MONITORS.glob("*.rv"))}
     for seed in range(5):
         agree(texts, known, _shipped_traffic(seed))
+
+
+def test_requests_and_replies_need_the_engine_only_for_what_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a second: the first verdict, change and publication, and all refusals."""
+    text = """s() { int n = 0; std_msgs::Bool b;
+        event ask(bool wish) service /mode std_srvs/SetBool request '{data:wish}' {
+            n++; ROS_INFO("%d", n); if (n % 10 == 9) { return; } if (wish) { wish = false; } }
+        event answer(bool ok) service /mode std_srvs/SetBool response '{success:ok}' {
+            b.data = ok; PUBLISH(/answered, std_msgs/Bool, b); }
+        fsm: a [ ask -> b, answer -> a ] b [ answer -> a, ask -> b ] @b { } }"""
+    monitored = Monitored({"x.rv": text}, definitions(), together=True)
+    asked: list[bytes] = []
+    process = monitored.set.process_service
+
+    def noted(*arguments: Any) -> Any:
+        asked.append(bytes(arguments[2]))
+        return process(*arguments)
+
+    monkeypatch.setattr(monitored.set, "process_service", noted)
+    request, response = Place("k", "/mode", "10.0.0.7", "/client"), Place("k", "/mode", "10.0.0.8", "/server")
+    answer = b"\1" + struct.pack("<I", 2) + b"ok"
+    try:
+        for second in range(2):
+            left = [monitored.middle.request(request, bytes([number % 2])) for number in range(40)]
+            assert [one.body for one in left if one.refused is None] == [b"\0"] * 36
+            assert [monitored.middle.response(response, answer).body for _ in range(40)] == [answer] * 40
+            assert len(asked) == 4 + 3
+            asked.clear()
+            (row,) = monitored.rows()
+            counted = row.events, row.verdicts, row.drops, row.changes
+            assert counted == tuple(count * (second + 1) for count in (80, 36, 4, 20))
+            monitored.told()
+    finally:
+        monitored.close()
 
 
 def test_most_messages_are_taken_together(monkeypatch: pytest.MonkeyPatch) -> None:

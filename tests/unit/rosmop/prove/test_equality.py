@@ -59,6 +59,8 @@ PROVED = {
         "a = y; b = y; c = x; d = c; e = a; x = y;", "long x, double y", "three[0]:x, x:y",
         "int8_t a = 0; unsigned long b = 0; float c = 0; double d = 0; uint16_t e = 0;",
     ),
+    "a service": "s() { bool open = false; event e(bool wish) service /mode std_srvs/SetBool request '{data:wish}' {"
+    " if (open) { return; } open = wish; wish = !wish; } }",
     "rounding": event("y = floor(y) + trunc(fabs(y)) - rint(y) + ceil(y);", "double y", "x:y"),
     "times": event(
         "last = t; t.sec = 7; if (t.nsec > 5 && t > last) { n++; }",
