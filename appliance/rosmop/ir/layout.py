@@ -143,6 +143,7 @@ class Layout:
         self.places: list[range] = []
         """Where messages stand that are made or kept here, and whether what is published is only counted."""
         self._used = FIRST
+        self._spare = 0
         self.said = self.take(LINES)
         """Where lines stand."""
 
@@ -262,6 +263,11 @@ class Layout:
         at = self.take(size)
         self.rooms.append(range(at, at + size))
         return at
+
+    def spare(self) -> int:
+        """The address of memory for a vector that nothing is kept in."""
+        self._spare = self._spare or self.room(ROOM)
+        return self._spare
 
     def constant(self, raw: bytes) -> int:
         """Where these bytes stand from the beginning."""

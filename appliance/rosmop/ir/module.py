@@ -11,7 +11,7 @@ arrays (`records.py`).
   bits (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`, `RESET`.
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
   it is taken back. Within what it calls it is a trap. Beyond are strings that are made or changed, vectors of anything
-  but numbers, of more than `ROOM` bytes, of the message that are changed, handed back or by reference, or compared,
+  but numbers, of more than `ROOM` bytes, of the message that are changed, handed back or by reference,
   messages (and `MESSAGE`) of more than `MOST_MADE` bytes or with what is beyond, what is published with a string of
   more than `MOST_KEPT`, or first of its kind of a second, recursion, `sin` and its like. An event of which no message
   can come past such a place has no module: `NotScalarError` names what is beyond.
@@ -40,10 +40,11 @@ from appliance.rosmop.ir.layout import (
     machine_type,
 )
 from appliance.rosmop.ir.output import BYTES, HEAD, Line, is_text
+from appliance.rosmop.ir.places import loaded
 from appliance.rosmop.ir.records import Records
-from appliance.rosmop.ir.texts import mismatch, settling
+from appliance.rosmop.ir.texts import settling
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
-from appliance.rosmop.ir.vectors import OF_VECTORS, made_in, sorting
+from appliance.rosmop.ir.vectors import OF_VECTORS, made_in
 from appliance.rosmop.ir.wasm import (
     COMPARE,
     DROP,
@@ -61,7 +62,6 @@ from appliance.rosmop.ir.wasm import (
 )
 from appliance.rosmop.runtime.wire import FEW
 from appliance.rosmop.types import kinds
-from appliance.rosmop.types.kinds import Type
 
 HAPPENED, DROPPED, CHANGED, RESET = 1, 2, 4, 16
 
@@ -121,17 +121,11 @@ class Writer(Layout):
             self.written.append(written)
         return self._numbers[key]
 
-    def mismatch(self) -> int:
-        """The number of the function that says where two strings differ."""
-        if ("mismatch",) not in self._numbers:
-            self._numbers["mismatch",] = self._added((I32, I32, I32), mismatch())
-        return self._numbers["mismatch",].number
-
-    def sorting(self, element: Type) -> int:
-        """The number of the function that sorts elements of this type."""
-        if ("sorting", element) not in self._numbers:
-            self._numbers["sorting", element] = self._added((I32, I32), sorting(element))
-        return self._numbers["sorting", element].number
+    def routine(self, key: tuple[object, ...], parameters: int, write: Callable[[], bytes]) -> int:
+        """The number of a function of so many addresses, which is written once."""
+        if key not in self._numbers:
+            self._numbers[key] = self._added((I32,) * parameters, write())
+        return self._numbers[key].number
 
     def settling(self, cells: Cells) -> int:
         """The number of the function that copies the strings of variables, which must all be known."""
@@ -204,11 +198,9 @@ class _Body(Records):
             frozenset(self._publishes),
         )
 
-    def _mismatch(self) -> int:
-        return self._writer.mismatch()
-
-    def _sorting(self, element: Type) -> int:
-        return self._writer.sorting(element)
+    def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
+        number = self._writer.routine((write, *given), parameters, partial(write, *given))
+        return b"\x10" + unsigned(number)
 
     # Statements
 
@@ -264,7 +256,7 @@ class _Body(Records):
         elif isinstance(kind, kinds.Record):
             each = self._get(at) + self._set(f"place of {node.name}")
         else:
-            each = self._loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
+            each = loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
         following = self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
         code = first + place + self._set(at) + count + self._set(left, I64)
         with self._apart(node.values):
@@ -488,7 +480,7 @@ class _Body(Records):
         )
         added = form.Convert(node.type, form.Arithmetic(node.wide, "+", one, other, node.site))
         span = form.Assign(node.type, total, added)
-        summed = self._loaded(self._get(at), 0, kind) + self._set(each, machine_type(kind))
+        summed = loaded(self._get(at), 0, kind) + self._set(each, machine_type(kind))
         summed += self._evaluate(form.Evaluate(node.site, span))
         summed += self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
         self._brief = False

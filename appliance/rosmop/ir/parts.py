@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.layout import Layout, NotScalarError
@@ -34,6 +35,10 @@ class Parts(ABC):
     @abstractmethod
     def _value(self, node: form.Expression) -> bytes:
         """What puts the value of an expression of numbers on the stack. Raises `NotScalarError` for another."""
+
+    @abstractmethod
+    def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
+        """A call of a function of so many addresses (i32), which `write` writes of what it is given."""
 
     def _local(self, name: str, machine: int) -> bytes:
         number, known = self._locals.setdefault(name, (len(self._locals), machine))

@@ -43,16 +43,6 @@ class Places(Arithmetic):
         base = self._get("at") + (b"" if at.base is None else self._get(at.base, I64) + b"\xa7\x6a")
         return base, bytes((opcode, 0)) + unsigned(at.offset)
 
-    def _loaded(self, place: bytes, offset: int, kind: Type) -> bytes:
-        """A number or time so many bytes behind a place."""
-        codes = struct_code(kind) or ""
-        if len(codes) == 2:
-            extend = b"\xad" if codes[0] == "I" else b"\xac"
-            seconds, rest = (place + b"\x28\x00" + unsigned(offset + more) + extend for more in (0, 4))
-            return seconds + constant(I64, BILLION) + b"\x7e" + rest + b"\x7c"
-        code = place + bytes((LOAD[codes], 0)) + unsigned(offset)
-        return code + (b"\x45\x45" if codes == "?" else b"")
-
     def _after_text(self, node: form.AfterText) -> bytes:
         length = b"".join(self._at(node.at, 0x28)) + b"\xad"
         end = self._position(node.at.plus(4)) + length + b"\x7c"
@@ -79,7 +69,7 @@ class Places(Arithmetic):
         for name, kind, offset in node.fields:
             place = self._get("at")
             place += b"" if node.at.base is None else self._get(node.at.base, I64) + b"\xa7\x6a"
-            code += self._loaded(place, node.at.offset + offset, kind) + self._set(name, machine_type(kind))
+            code += loaded(place, node.at.offset + offset, kind) + self._set(name, machine_type(kind))
         return code
 
     def _read_value(self, node: form.ReadValue) -> bytes:
@@ -190,12 +180,23 @@ class Places(Arithmetic):
 
     def _element_at(self, node: form.Call) -> bytes:
         code = self._address_of(node) + self._set("element")
-        return code + self._loaded(self._get("element"), 0, node.type)
+        return code + loaded(self._get("element"), 0, node.type)
 
     def _item(self, node: form.Item) -> bytes:
         machine_type(node.type)
         first, place = self._place(node.base)
-        return first + self._loaded(place, self._layout.offset(node.base.type, node.number), node.type)
+        return first + loaded(place, self._layout.offset(node.base.type, node.number), node.type)
+
+
+def loaded(place: bytes, offset: int, kind: Type) -> bytes:
+    """A number or time so many bytes behind a place."""
+    codes = struct_code(kind) or ""
+    if len(codes) == 2:
+        extend = b"\xad" if codes[0] == "I" else b"\xac"
+        seconds, rest = (place + b"\x28\x00" + unsigned(offset + more) + extend for more in (0, 4))
+        return seconds + constant(I64, BILLION) + b"\x7e" + rest + b"\x7c"
+    code = place + bytes((LOAD[codes], 0)) + unsigned(offset)
+    return code + (b"\x45\x45" if codes == "?" else b"")
 
 
 def root_of(node: form.Expression) -> str:

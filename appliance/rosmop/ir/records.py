@@ -13,19 +13,16 @@ from functools import partial
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.layout import LINES, MOST_MADE, POSITION, SAID, NotScalarError, machine_type
 from appliance.rosmop.ir.output import HEAD, Line, Publication
-from appliance.rosmop.ir.places import root, root_of
+from appliance.rosmop.ir.places import loaded, root, root_of
 from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
 from appliance.rosmop.ir.values import struct_code, struct_size
 from appliance.rosmop.ir.vectors import Vectors
-from appliance.rosmop.ir.wasm import COMPARE, F32, F64, I32, I64, STORE, constant, unsigned
+from appliance.rosmop.ir.wasm import COMPARE, F32, F64, I32, I64, MOVES, STORE, constant, unsigned
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
 _CHANGING = ("a_slot", "a_put")
 """Functions that put something into a message, or into an array of fixed length in one."""
-
-_LOADS = {8: 0x29, 4: 0x28, 2: 0x2F, 1: 0x2D}
-_STORES = {4: 0x36, 2: 0x3B, 1: 0x3A, 8: 0x37}
 
 
 class Records(Vectors):
@@ -186,7 +183,7 @@ class Records(Vectors):
             return b"".join(
                 place
                 + constant(I64 if some == 8 else I32, 0)
-                + bytes((_STORES[some], 0))
+                + bytes((STORE[some], 0))
                 + unsigned(offset + at)
                 for at, some in _pieces(size)
             )
@@ -211,15 +208,15 @@ class Records(Vectors):
             return b"".join(
                 place
                 + from_there
-                + bytes((_LOADS[some], 0))
+                + bytes((MOVES[some][0], 0))
                 + unsigned(at)
-                + bytes((_STORES[some], 0))
+                + bytes((STORE[some], 0))
                 + unsigned(offset + at)
                 for at, some in _pieces(self._layout.extent(kind))
             )
         self._layout.size(kind)  # fixed: it stands as in a message
         return b"".join(
-            self._put_number(place, offset + at, leaf, self._loaded(from_there, at, leaf))
+            self._put_number(place, offset + at, leaf, loaded(from_there, at, leaf))
             for at, leaf in self._layout.leaves(kind)
         )
 
@@ -236,7 +233,7 @@ class Records(Vectors):
             size = self._layout.size(leaf)
             base = self._get("at") + (b"" if at.base is None else self._get(at.base, I64) + b"\xa7\x6a")
             code += self._within(at, size)
-            code += self._put_number(place, offset + to, leaf, self._loaded(base, at.offset, leaf))
+            code += self._put_number(place, offset + to, leaf, loaded(base, at.offset, leaf))
             at = at.plus(size)
         for write in self._assigned_fields[node.pending]:
             kind: Type = node.type

@@ -9,8 +9,6 @@ A string longer than `MOST_KEPT` is not kept here: the message that brings it is
 only that is known (`BEYOND`); the message that looks at it is left.
 """
 
-from abc import abstractmethod
-
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.layout import Cells, Layout, NotScalarError
 from appliance.rosmop.ir.places import Places
@@ -38,15 +36,9 @@ MOST_KEPT = 1024
 BEYOND = 0xFFFFFFFF
 """In the place of the length of a longer one."""
 
-_CALL = b"\x10"
-
 
 class Texts(Places):
     """Writes what looks at strings."""
-
-    @abstractmethod
-    def _mismatch(self) -> int:
-        """The number of the function that `mismatch` writes."""
 
     def _elements(self, node: form.Expression) -> tuple[bytes, bytes, bytes]:
         if not isinstance(node.type, kinds.String):
@@ -119,7 +111,7 @@ class Texts(Places):
             code += self._when(long, lambda: self._spend(spent))
         if not any(self._is_bounded(side) for side in (node.left, node.right)):
             self._brief = False
-        call = _CALL + unsigned(self._mismatch())
+        call = self._routine(3, mismatch)
         if node.operator in ("==", "!="):
             same = place + other + count + b"\xa7" + call + b"\xad" + count + b"\x51"
             alike = count + length + b"\x51" + IF + bytes((I32,)) + same + ELSE + constant(I32, 0) + END

@@ -9,25 +9,25 @@ A local variable that is changed, or holds what may change meanwhile, has a plac
 copied from: in the message.
 """
 
-from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.layout import ROOM, NotScalarError, is_signed, machine_type
-from appliance.rosmop.ir.places import root_of
+from appliance.rosmop.ir.places import loaded, root_of
 from appliance.rosmop.ir.texts import Texts, turns
 from appliance.rosmop.ir.values import struct_code, struct_size
 from appliance.rosmop.ir.wasm import (
     COMPARE,
+    ELSE,
     END,
     F32,
     F64,
     I32,
     I64,
     IF,
-    LOAD,
+    MOVES,
     NOTHING,
     RETURN,
     SELECT,
@@ -36,16 +36,15 @@ from appliance.rosmop.ir.wasm import (
     row,
     unsigned,
 )
+from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION
+from appliance.rosmop.runtime.vectors import LARGE
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
 _WRAP, _ADD, _SUB, _SAME = b"\xa7", b"\x7c", b"\x7d", b"\x46"
 _OVER, _AT_LEAST = b"\x56", b"\x5a"  # without a sign
+_PLUS, _MINUS = b"\x6a", b"\x6b"
 _COPY, _FILL = b"\xfc\x0a\x00\x00", b"\xfc\x0b\x00"
-
-
-MOST_SORTED = 64
-"""Elements that are sorted at once."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +70,6 @@ class Vectors(Texts):
 
     _made: frozenset[str] = frozenset()
     """The local variables that have a place of their own."""
-
-    @abstractmethod
-    def _sorting(self, element: Type) -> int:
-        """The number of the function that `sorting` writes."""
 
     def _room(self, node: form.Read | form.Assign) -> _Room:
         kind, cells = node.type, self._layout.shared.get(node.name)
@@ -161,6 +156,25 @@ class Vectors(Texts):
         room = self._room(node)
         place, count = self._place_in(room), self._count_in(room)
         return (b"", place, count) if room.cell is None else self._noted(place + count, ROOM // room.size)
+
+    def _compare(self, node: form.Compare) -> bytes:
+        kind = node.left.type
+        if not isinstance(kind, kinds.Vector) or struct_code(kind.element) is None:
+            return super()._compare(node)
+        _, size = self._layout.element(kind)
+        code, place, count = self._noted(b"".join(self._elements(node.left)))
+        held = count + constant(I64, size) + b"\x7e"
+        spent = held + constant(I64, BYTES_PER_INSTRUCTION) + b"\x80"
+        code += self._when(held + constant(I64, LARGE) + _OVER, lambda: self._spend(spent))
+        with self._apart(node.left):
+            first, other, length = self._noted(b"".join(self._elements(node.right)))
+        self._brief = False
+        end = place + count + _WRAP + constant(I32, size) + b"\x6c" + _PLUS
+        call = place + end + other + self._routine(3, alike, kind.element)
+        same = f"same {len(self._locals)}"
+        code += first + count + length + b"\x51" + IF + bytes((I32,)) + call + ELSE + constant(I32, 0) + END
+        code += self._set(same) + self._when(self._get(same) + constant(I32, 2) + _SAME, self._elsewhere)
+        return code + self._get(same) + (b"\x45" if node.operator == "!=" else b"")
 
     # Assigned
 
@@ -304,12 +318,23 @@ class Vectors(Texts):
         room, code, (first, last) = self._opened(node)
         many = last + first + _SUB
         code += self._within_span(first, last, self._count_in(room))
-        code += self._when(many + constant(I64, MOST_SORTED) + _OVER, self._elsewhere)
         code += self._spend(many + constant(I64, 64) + many + b"\x79" + _SUB + b"\x7e") + self._changing(room)
         self._brief = False
-        call = b"\x10" + unsigned(self._sorting(room.element))
+        call = self._routine(2, sorting, room.element, self._layout.spare())
         code += self._when(self._behind(room, first) + self._behind(room, last) + call, self._elsewhere)
         return code + constant(I32, 0)
+
+    def _reverse(self, node: form.Call) -> bytes:
+        room, code, (first, last) = self._opened(node)
+        code += self._within_span(first, last, self._count_in(room))
+        code += self._spend(last + first + _SUB + constant(I64, 4) + b"\x80") + self._changing(room)
+        self._brief = False
+        return (
+            code
+            + self._behind(room, first)
+            + self._behind(room, last)
+            + self._routine(2, reversing, room.size)
+        )
 
     def _within_span(self, first: bytes, last: bytes, count: bytes) -> bytes:
         """The message is left unless 0 <= first <= last <= count."""
@@ -321,6 +346,7 @@ OF_VECTORS: Mapping[str, Callable[[Vectors, form.Call], bytes]] = MappingProxyTy
         "a_put": Vectors._put,
         "k_erase": Vectors._erase,
         "k_insert": Vectors._insert,
+        "k_reverse": Vectors._reverse,
         "k_sort": Vectors._sort,
         "l_append": Vectors._append,
         "l_clear": Vectors._clear,
@@ -331,27 +357,118 @@ OF_VECTORS: Mapping[str, Callable[[Vectors, form.Call], bytes]] = MappingProxyTy
 """What writes each function that changes a vector."""
 
 
-def sorting(element: Type) -> bytes:
-    """A function of two addresses (i32), between which elements are put into order, equal ones as they were; it returns
-    whether there is one that has no order.
-    """
-    codes, machine = struct_code(element) or "", machine_type(element)
-    size = struct_size(codes)
-    more = COMPARE[machine][">"] + (machine in (I32, I64) and not is_signed(element))
-    first, end, at, to, value = (b"\x20" + unsigned(local) for local in range(5))
-    set_at, set_to, set_value = (b"\x21" + unsigned(local) for local in (2, 3, 4))
-    load, store = bytes((LOAD[codes], 0, 0)), bytes((_stores(machine, size), 0, 0))
-    before = to + constant(I32, size) + b"\x6b"
-    unordered = (
-        value + value + bytes((COMPARE[machine]["!="],)) + IF + NOTHING + constant(I32, 1) + RETURN + END
-    )
-    above = before + load + value + bytes((more,)) + b"\x45"
-    moved = turns(to + first + _SAME + b"\x0d\x01" + above, to + before + load + store, before + set_to)
-    each = at + load + set_value + unordered + at + set_to + moved + to + value + store
-    ordered = turns(at + end + _SAME, each, at + constant(I32, size) + b"\x6a" + set_at)
-    made = row([unsigned(2) + bytes((I32,)), unsigned(1) + bytes((machine,))])
-    whole = made + first + set_at + ordered + constant(I32, 0) + END
+def _function(made: Sequence[bytes], *code: bytes) -> bytes:
+    """A function with so many local variables of types."""
+    whole = row(made) + b"".join(code) + END
     return unsigned(len(whole)) + whole
+
+
+def _here(local: int) -> bytes:
+    return b"\x20" + unsigned(local)
+
+
+def _put(local: int, value: bytes) -> bytes:
+    return value + b"\x21" + unsigned(local)
+
+
+def _moved(size: int, to: bytes, source: bytes) -> bytes:
+    """Bring an element as it stands to another place."""
+    load, store = MOVES[size]
+    return to + source + bytes((load, 0, 0, store, 0, 0))
+
+
+def _unlike_itself(value: bytes, machine: int, answer: int) -> bytes:
+    """Answer where a number is NaN."""
+    none = value + value + bytes((COMPARE[machine]["!="],))
+    return none + IF + NOTHING + constant(I32, answer) + RETURN + END if machine in (F32, F64) else b""
+
+
+def sorting(element: Type, room: int) -> bytes:
+    """A function of two addresses, between which elements are put into order, equal ones as they were; it returns
+    whether there is one that has no order. `room` is where as many have room.
+
+    Runs of one element, of two, of four and so on are merged into the room and copied back.
+    """
+    machine, size = machine_type(element), struct_size(struct_code(element) or "")
+    more = COMPARE[machine][">"] + (machine in (I32, I64) and not is_signed(element))
+    first, end, width, low, middle, high, at, to, out = map(_here, range(9))
+
+    def on(local: int, by: bytes) -> bytes:
+        return _put(local, _here(local) + by + _PLUS)
+
+    one, length = constant(I32, size), end + first + _MINUS
+
+    def bounded(begin: bytes) -> bytes:
+        """So many bytes on, at most where all end."""
+        span = begin + width + _PLUS
+        return span + end + span + end + b"\x49" + SELECT
+
+    known = turns(
+        at + end + _SAME, _put(9, loaded(at, 0, element)), _unlike_itself(_here(9), machine, 1), on(6, one)
+    )
+    after = loaded(at, 0, element) + loaded(to, 0, element) + bytes((more,))
+    is_second = to + high + b"\x47" + IF + bytes((I32,)) + after + ELSE + constant(I32, 0) + END
+    merged = turns(
+        at + middle + _SAME,
+        is_second + IF + NOTHING + _moved(size, out, to) + on(7, one) + ELSE,
+        _moved(size, out, at) + on(6, one) + END,
+        on(8, one),
+    )
+    rest = out + to + high + to + _MINUS + _COPY + on(8, high + to + _MINUS)
+    pair = _put(4, bounded(low)) + _put(5, bounded(middle)) + _put(6, low) + _put(7, middle)
+    pass_over = turns(low + end + _SAME, pair, merged, rest, _put(3, high))
+    return _function(
+        [unsigned(7) + bytes((I32,)), unsigned(1) + bytes((machine,))],
+        _put(6, first) + known if machine in (F32, F64) else b"",
+        _put(2, one),
+        turns(
+            length + width + b"\x4d",
+            _put(3, first) + _put(8, constant(I32, room)) + pass_over,
+            first + constant(I32, room) + length + _COPY + _put(2, width + width + _PLUS),
+        ),
+        constant(I32, 0),
+    )
+
+
+def reversing(size: int) -> bytes:
+    """A function of two addresses, between which elements of so many bytes are reversed; it returns 0."""
+    first, end = map(_here, range(2))
+    load, store = MOVES[size]
+    machine, one = I64 if size == 8 else I32, constant(I32, size)
+    swapped = _put(2, first + bytes((load, 0, 0))) + _moved(size, first, end)
+    swapped += end + _here(2) + bytes((store, 0, 0))
+    turn = _put(1, end + one + _MINUS) + swapped + _put(0, first + one + _PLUS)
+    return _function([unsigned(1) + bytes((machine,))], turns(first + end + b"\x4f", turn), constant(I32, 0))
+
+
+def alike(element: Type) -> bytes:
+    """A function of where elements begin and end, and where as many others begin: whether they are the same (0, 1), or
+    2 where that is first asked of two NaN.
+    """
+    machine, size = machine_type(element), constant(I32, struct_size(struct_code(element) or ""))
+    at, end, to = map(_here, range(3))
+    differs = _here(3) + _here(4) + bytes((COMPARE[machine]["!="],))
+    number = (
+        _here(3)
+        + _here(3)
+        + bytes((COMPARE[machine]["=="],))
+        + IF
+        + NOTHING
+        + constant(I32, 0)
+        + RETURN
+        + END
+    )
+    both = _unlike_itself(_here(4), machine, 2) + constant(I32, 0) + RETURN
+    return _function(
+        [unsigned(2) + bytes((machine,))],
+        turns(
+            at + end + _SAME,
+            _put(3, loaded(at, 0, element)) + _put(4, loaded(to, 0, element)),
+            differs + IF + NOTHING + number + both + END,
+            _put(0, at + size + _PLUS) + _put(2, to + size + _PLUS),
+        ),
+        constant(I32, 1),
+    )
 
 
 def _stores(machine: int, size: int) -> int:

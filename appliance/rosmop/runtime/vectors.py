@@ -10,7 +10,7 @@ from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, Context, Fau
 
 Values = list[Any]
 
-_LARGE = 1024  # bytes; what holds less is not charged when it is looked at
+LARGE = 1024  # bytes; what holds less is not charged when it is looked at
 
 
 def element(values: Values, index: int, site: int) -> Any:
@@ -49,7 +49,7 @@ def append_text(context: Context, values: Values, value: bytes, width: int, site
 def weighed(context: Context, values: Values, measure: Callable[[Values], int], site: int) -> Values:
     """The vector or message, all of which is about to be looked at; `measure` says how many bytes it holds."""
     size = measure(values)
-    if size > _LARGE:
+    if size > LARGE:
         context.spend(size // BYTES_PER_INSTRUCTION, site)
     return values
 

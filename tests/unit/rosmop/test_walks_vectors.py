@@ -13,7 +13,6 @@ from appliance.rosmop.ir import layout
 from appliance.rosmop.ir.feed import module_of
 from appliance.rosmop.ir.layout import ROOM
 from appliance.rosmop.ir.values import Values
-from appliance.rosmop.ir.vectors import MOST_SORTED
 from appliance.rosmop.syntax.errors import SpecificationError
 from tests.support.examples import examples
 from tests.unit.rosmop.test_walks import Fed, plain
@@ -122,6 +121,7 @@ TAKEN = (
     "double g[3] = {x}; n += g[0] + g[2]; g[1] = n; a = g;",
     "b.push_back(-x); std::sort(b.begin(), b.end()); n = b[1]; std::sort(b.begin() + 1, b.end() - 1);",
     "auto t = b; auto u = t; t.push_back(x); n = u.size(); b = u;",
+    "std::reverse(b.begin(), b.end()); if (a == b || b != a) { n++; }",
     "keep(values); n += least(a); again();", "a = b = values; n = a.at(0);",
 )  # fmt: skip
 
@@ -136,7 +136,7 @@ def test_nothing_of_that_is_for_the_engine(body: str) -> None:
 
 
 BEYOND = (
-    "std::reverse(b.begin(), b.end());", "if (a == b) { n++; }", "values[0] = x;", "a = made();", "grow(a);",
+    "values[0] = x;", "a = made();", "grow(a);",
     "for (auto one : b) { b.push_back(one); if (n++ > 5) { break; } }", "w[0].push_back(x);",
     "n = b[(b = a)[0]];", "a = x ? b : d;", "t.push_back(when);",
 )  # fmt: skip
@@ -172,21 +172,54 @@ def test_every_kind_of_number(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_few_are_sorted_in_the_module(kind: str) -> None:
-    """Those that are equal stay in their order; where one is no number, or there are more, it is for the engine."""
+def test_they_are_sorted_and_put_the_other_way_round(kind: str) -> None:
+    """Those that are equal stay in their order; where one is no number, it is for the engine."""
     text = kept(
-        "a.clear(); for (auto one : values) { a.push_back(one); } std::sort(a.begin(), a.end()); n = a[0] * 3;",
+        "a.clear(); for (auto one : values) { a.push_back(one); } b = a; std::sort(a.begin(), a.end());"
+        " if (x > 0) { std::sort(b.begin() + x, b.end() - 1); std::reverse(b.begin(), b.end() - x); }"
+        " std::reverse(a.begin(), a.end()); n = a[0] * 3;",
         kind=kind,
     )
     random = Random(kind)  # noqa: S311  draws examples, not keys
     some = (0.0, -0.0, 1.5, -7.25, 300.0, -1e300, 1e300, float("inf"), float("-inf"), 2.0**63, -1.0, 255.0)
     fed = Fed(text)
-    for size in (1, 2, 3, 5, 17, MOST_SORTED):
-        fed.check([stamped(tuple(random.choices(some, k=size))) for _ in range(5)], "/stamped")
-    assert fed.came == {"together": 6, "passed": 30}
-    fed.check([stamped((1.0, 0.0) * MOST_SORTED)], "/stamped")
+    sizes = (1, 2, 3, 5, 17, 64, 65, 100, 255, 256, 257, 1000)
+    for size in sizes:
+        few, many = (tuple(random.choices(some, k=size)) for _ in range(2))
+        more = tuple(random.uniform(-1000, 1000) for _ in range(size))
+        fed.check(
+            [stamped(few), stamped(many, min(size - 1, 3)), stamped(more, min(size - 1, 2))], "/stamped"
+        )
+    assert fed.came == {"together": len(sizes), "passed": 3 * len(sizes)}
     fed.check([stamped((1.0, float("nan"), 0.5, -3.0, 2.0))], "/stamped")
-    assert fed.came["together"] == (6 if kind in ("double", "float") else 7)
+    assert fed.came["together"] == len(sizes) + (kind not in ("double", "float"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_are_compared(kind: str) -> None:
+    """By what they hold, whatever it is that holds them; two NaN at one place are for the engine."""
+    text = kept(
+        "a.clear(); for (auto one : values) { a.push_back(one); } if (a == b) { n++; } if (a != b) { n += 2; }"
+        f" d = values; if (x == 1) {{ b = a; }} if (values == d) {{ n += 4; }} std::vector<{kind}> t = a;"
+        " if (t != a) { n += 8; } t.push_back(3); if (a == t) { n += 16; }",
+        kind=kind,
+    )
+    fed = Fed(text)
+    draws: list[tuple[float, ...]] = [
+        (),
+        (1.0,),
+        (1.0, 2.0),
+        (1.0, 2.5),
+        (0.0, -0.0),
+        (-0.0, 0.0),
+        (1.0, 2.0),
+    ]
+    draws += [(7.0,) * 300, (7.0,) * 299 + (8.0,), (0.0, 2.0**40)]
+    fed.check([stamped(one, count) for one in draws for count in (0, 1)], "/stamped")
+    fed.check([stamped(one) for one in draws], "/stamped")
+    assert fed.came == {"together": 2, "passed": 3 * len(draws)}
+    none = float("nan")
+    fed.check([stamped((0.0, none)), stamped((none, 1.0))], "/stamped")
 
 
 @pytest.mark.parametrize("body", ["d.push_back(x);", "d.insert(d.begin(), x);", "d.resize(d.size() + 1);"])
@@ -265,7 +298,8 @@ def test_vectors_survive_wherever_the_module_is_stopped(monkeypatch: pytest.Monk
         "b = a;", "a.insert(a.begin() + 5, 1); a.pop_back();", "a.erase(a.begin() + 7); a.push_back(1);",
         "a.resize(0); a.resize(700);", "std::vector<double> t(601); n += t[0];", "auto t = a; t[0] = 1;",
         "std::vector<double> t(601, 1.0); n += t[0];", "n += a.size(); b = {1, 2}; b.clear();",
-        "std::sort(a.begin(), a.begin() + 63);", "std::sort(a.end() - 64, a.end()); std::sort(a.end(), a.end());",
+        "std::sort(a.begin(), a.begin() + 63);", "std::reverse(a.begin() + 1, a.end());", "if (a == b) { n++; }",
+        "b = a; if (a != b) { n++; }", "std::sort(a.end() - 64, a.end()); std::sort(a.end(), a.end());",
         "a.erase(a.begin(), a.begin() + 13);",
         "a.erase(a.begin(), a.begin() + 70); a.resize(601);", "keep(a); n += least(a);",
     ],

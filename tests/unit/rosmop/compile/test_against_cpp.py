@@ -91,6 +91,11 @@ def vector_program(random: Random) -> str:
                     f"{a}.erase({a}.begin() + {a}.size() / 2, {a}.end());",
                     f"{a}.resize({k});",
                     f"std::sort({a}.begin(), {a}.end());",
+                    f"std::reverse({a}.begin(), {a}.end());",
+                    f"if ({a} == {b}) {{ total += 1; }} else {{ {a} = {b}; {b}.resize({k}); }}",
+                    f"{a} = {b}; if ({a} != {b}) {{ total += 7; }}",
+                    f"{a}.resize(90); for (auto& one : {a}) {{ total = total * 5 + 3; one = total % 64; }}"
+                    f" std::sort({a}.begin() + {k}, {a}.end());",
                     f"{a} = {b};",
                     f"{a} = {{{x}, total, {k}}};",
                     f"{a}.clear();",
