@@ -1,0 +1,27 @@
+"""No text that comes from outside is ever made into code of Python."""
+
+import ast
+from pathlib import Path
+
+APPLIANCE = Path(__file__).parents[2] / "appliance"
+MAKE_CODE = {"eval", "exec", "compile", "__import__"}
+
+
+def made_of_text(source: str) -> list[int]:
+    """The lines at which a source makes code of a text."""
+    return [
+        node.lineno
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in MAKE_CODE
+    ]
+
+
+def test_nothing_makes_code_of_text() -> None:
+    """Specifications are interpreted, or become WebAssembly; policies and formulas are data."""
+    found = [
+        f"{path.relative_to(APPLIANCE)}:{line}"
+        for path in sorted(APPLIANCE.rglob("*.py"))
+        for line in made_of_text(path.read_text(encoding="utf-8"))
+    ]
+    assert found == []
+    assert made_of_text("x = 1\nexec(compile('y = 2', '', 'exec'))") == [2, 2]
