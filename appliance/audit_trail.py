@@ -76,9 +76,10 @@ class AuditTrail:
         reads: bool = False,
         **asked_of: str,
     ) -> str:
-        """Record a decision; the id by which it is found. `asked_of` is what a command is about: a parameter, a node.
+        """Record a decision; the id by which it is found, if it is more than counted.
 
-        `reads`: the call changes nothing, so that its repetitions are counted when it is allowed.
+        `asked_of` is what a command is about: a parameter, a node. `reads`: the call changes nothing, so that its
+        repetitions are counted when it is allowed.
         """
         record = self._of_decision(
             asker, method, category, resource, decision, reads=reads, asked_of=asked_of
@@ -153,7 +154,7 @@ class AuditTrail:
         reads: bool = False,
         **detail: Any,
     ) -> str:
-        """Record an event that is no decision; the id by which it is found. `more` is detail whose names others choose.
+        """Record an event that is no decision; the id, as of `decided`. `more` is detail whose names others choose.
 
         `severity` is for an event that has not always the same (`audit/events.py`).
         `reads`: it changed nothing, so that its repetitions are counted.

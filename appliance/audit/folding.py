@@ -78,7 +78,8 @@ class Folder:
         self._clock = clock
         self._kinds: dict[Key, _Kind] = {}
         self._coming: dict[Key, Record] = {}
-        """Denials that the owner will offer, by the narrowest kind; of each the first, where it was not there yet."""
+        """Denials that the owner will offer, by their kind; of each the first, where it was not there yet."""
+        self._coming_as: dict[str, Key] = {}  # by their ids
         self._due: dict[Key, float] = {}
         self._by_subject: dict[Key, set[Key]] = {}
         self._denials: Pool[_Holder] = Pool("kinds of denials", settings.kinds, _standing)
@@ -94,21 +95,32 @@ class Folder:
         return kind.state if kind is not None and kind.state.count else None
 
     def in_full(self, record: Record) -> str:
-        """The id of the record in full that a denial repeats; else its own. By the owner, before it offers the record.
+        """The id of the record in full that a denial repeats; else its own, or none if it is counted among others.
 
-        What was not offered yet (the log gathers) is remembered, so that a repetition in the same moment finds it.
+        By the owner, before it offers the record. What was not offered yet (the log gathers) is remembered, so that a
+        repetition in the same moment finds it.
         """
         if record.decision != "deny" or not self._settings.seconds:
             return record.id
-        key = kind_of(keepable(record))
+        plain = keepable(record)
+        key = narrow = kind_of(plain)
+        if key not in self._coming:
+            key, _ = self._denial_key(plain, self._coming_beside(plain))
         kind = self._kinds.get(key)
-        if kind is None:
-            first = self._coming.setdefault(key, record)
-            known, about = first.id, (first.caller_id, first.resource)
-        else:
-            known, about = kind.state.recorded_id, (kind.state.caller_id, kind.state.resource)
-        same = about == (record.caller_id, record.resource)
-        return known if same else record.id  # a kind of a stranger is of many things
+        first: Record | FoldState = self._coming.setdefault(key, record) if kind is None else kind.state
+        if first is record:
+            self._coming_as[record.id] = key
+            return record.id
+        same = key == narrow and (first.caller_id, first.resource) == (record.caller_id, record.resource)
+        known = first.id if isinstance(first, Record) else first.recorded_id
+        return known if same else ""  # what is over, and a kind of a stranger, is of many things
+
+    def _coming_beside(self, record: Record) -> int:
+        """How many kinds will be of the share that a denial is charged to, and are not there yet."""
+        host, standing = _holder(record)
+        strangers = standing is Standing.STRANGER
+        waiting = list(self._coming.values())  # another thread takes from it
+        return sum(other.stranger if strangers else other.host == host for other in waiting)
 
     def offer(self, record: Record, now: float) -> Iterator[Record]:
         """The records to write for this one: itself, nothing (counted), or summaries and itself."""
@@ -124,8 +136,9 @@ class Folder:
             yield from self._end_contradicted(plain)
         if not (denial or record.folds) or not self._counted(plain, denial=denial, now=now):
             yield record
-        if denial and self._coming:
-            self._coming.pop(kind_of(plain), None)  # from now on its kind is there, or that of its host
+        key = self._coming_as.pop(record.id, None)
+        if key is not None:
+            del self._coming[key]  # from now on its kind is there, or that of its host
 
     def _counted(self, record: Record, *, denial: bool, now: float) -> bool:
         key, scope = self._denial_key(record) if denial else self._passing_key(record)
@@ -145,9 +158,10 @@ class Folder:
             self._by_subject.setdefault(about, set()).add(key)
         return False
 
-    def _denial_key(self, record: Record) -> tuple[Key, str]:
+    def _denial_key(self, record: Record, coming: int = 0) -> tuple[Key, str]:
+        """The kind that a denial is counted in, and its scope, when `coming` kinds more are of its share."""
         key = kind_of(record)
-        if key in self._kinds or not self._denials.refusal(_holder(record)):
+        if key in self._kinds or not self._denials.refusal(_holder(record), 1 + coming):
             return key, STRANGER if record.stranger else KIND
         if record.stranger:
             return (STRANGERS, record.event, record.decision), STRANGERS

@@ -139,7 +139,7 @@ class AuditLog:
     # --- for the owner, from any thread ---------------------------------------------------------------------
 
     def record(self, record: Record) -> str:
-        """Take a record into the log; the id by which it is found there: its own, or that of the one it repeats.
+        """Take a record into the log; the id by which it is found there: its own, that of the one it repeats, or none.
 
         Its `detail` must not be changed afterwards.
         """

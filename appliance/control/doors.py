@@ -12,6 +12,7 @@ from functools import partial
 from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.config import Settings
+from appliance.master.calls.call import with_record
 from appliance.master.calls.glimpse import asked_for
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
@@ -106,7 +107,7 @@ class Doors:
             resource=asked.resource,
             more=asked.about,
         )
-        return build_fault(1, f"{reason} [{record}]")
+        return build_fault(1, with_record(reason, record))
 
     def troubled(self, peer: Peer, reason: str) -> None:
         """A peer went over a limit."""

@@ -347,7 +347,12 @@ def served(calls: Iterable[Call[S]], part: S) -> dict[str, Served]:
 
 def denial_text(decision: Decision, record: str, tell: str) -> str:
     """What a denied caller is told: as much of the reason as the policy lets be told, and the record's id."""
-    return f"{told_of(decision, tell)} [{record}]"
+    return with_record(told_of(decision, tell), record)
+
+
+def with_record(text: str, record: str) -> str:
+    """What is told of a refusal that has this record; it has none when it is one of many that are counted."""
+    return f"{text} [{record}]" if record else text
 
 
 def claimed_name(params: Sequence[Value]) -> str:

@@ -22,7 +22,7 @@ import structlog
 from appliance.audit.record import Severity
 from appliance.audit_trail import NOT_RECORDED, AuditTrail
 from appliance.master.caller import Answer, Caller
-from appliance.master.calls.call import Attempt, Call, Table, Verb, claimed_name, denial_text
+from appliance.master.calls.call import Attempt, Call, Table, Verb, claimed_name, denial_text, with_record
 from appliance.master.calls.gate import Contest, Gate, contested
 from appliance.master.calls.parameters import ParameterCalls, Write
 from appliance.master.calls.registration import given_up
@@ -267,7 +267,7 @@ class Execution:
                     resource=call.name,
                     call=call.name,
                 )
-                return [0, f"{error} [{record}]", call.denial]
+                return [0, with_record(str(error), record), call.denial]
             case PeerError():
                 return self._malformed(call, caller, caller.caller_id, error)
             case EncodingError():

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from appliance.audit_trail import AuditTrail
-from appliance.master.calls.call import Attempt, Verb
+from appliance.master.calls.call import Attempt, Verb, with_record
 from appliance.master.calls.execution import Execution, Visit
 from appliance.master.calls.parameters import ParameterCalls
 from appliance.master.calls.turns import touch
@@ -144,7 +144,7 @@ class Multicall:
             category=Category.COMMAND.value,
             resource=MULTICALL,
         )
-        return {"faultCode": code, "faultString": f"{why} [{record}]"}
+        return {"faultCode": code, "faultString": with_record(why, record)}
 
 
 @dataclass(slots=True)

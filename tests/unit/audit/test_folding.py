@@ -340,3 +340,24 @@ def test_events_of_a_host_beyond_its_budget_are_counted() -> None:
     summaries = list(folder.finish())
     assert {one.event for one in summaries} == {"repetitions folded"}
     assert len(written) + sum(one.detail["count"] for one in summaries) == 800
+
+
+def test_who_is_denied_is_told_the_id_of_a_record_or_none() -> None:
+    """Whatever is over, or of a stranger, and whether it is offered one by one or many at once."""
+    for gathered in (1, 7, 400):
+        folder = make_folder(keys_per_host=4, strangers=3)
+        denials = [
+            denial(f"/{number % 6}", f"10.0.0.{host}", stranger=host > 2, caller_id=f"/n{number % 5}")
+            for number in range(100)
+            for host in (1, 2, 3, 4)
+        ]
+        told: list[tuple[Record, str]] = []
+        written: dict[str, Record] = {}
+        for begin in range(0, len(denials), gathered):
+            together = denials[begin : begin + gathered]
+            told += [(one, folder.in_full(one)) for one in together]
+            written |= {record.id: record for record in offer(folder, *together)}
+        assert {found for _, found in told} == {"", *written}, gathered
+        for one, found in told:
+            kept = written.get(found, one)
+            assert (kept.host, kept.resource, kept.caller_id) == (one.host, one.resource, one.caller_id)
