@@ -1,7 +1,8 @@
 """charon as a child: started, provisioned over vici, watched. Blocking calls: the caller makes one at a time.
 
 Provisioning is a difference: what is wanted and was not loaded is loaded, what is no longer wanted is unloaded and its
-tunnel closed. A host whose certificate was replaced has its tunnel closed too: it comes back with the new one.
+tunnel closed. A host whose certificate was replaced has its tunnel closed too: it comes back with the new one. An end
+that charon agrees to is not believed: what stands of a tunnel that was to end is closed again at each look.
 """
 
 import base64
@@ -37,6 +38,9 @@ class Vici:
         self._path = path
         self._session = self._connect()
         self._loaded: dict[str, TunnelHost] = {}
+        self._former: dict[
+            str, set[bytes]
+        ] = {}  # of each host, what made up its tunnel with a certificate before
         self._stated: TunnelsStated | None = None
         self.proposals = proposals_of(self._key_exchanges())
 
@@ -70,20 +74,33 @@ class Vici:
             if fresh or was != host:
                 self._load(host, stated)
             if was is not None and was.serial != host.serial:
+                mine = connection_name(host.name)
+                self._former[host.name] = {
+                    part for name, row in self._standing() if name == mine for part in _parts(row)
+                }
                 self._close(host.name)
         self._stated = stated
 
     def seen(self) -> list[TunnelSeen]:
         """The tunnels that stand now.
 
-        One of a host that is not wanted is closed again: keys that were just being made anew can outlive an end.
+        One of a host that is not wanted, or of a certificate that was replaced, is closed again: keys that were just
+        being made anew can outlive an end.
         """
-        with self._said("the list of tunnels"):
-            found = [(name, row) for reply in self._session.list_sas() for name, row in reply.items()]
+        found = self._standing()
         standing = {host for name, _ in found if (host := host_of(name)) is not None}
         for host in sorted(standing - self._loaded.keys()):
             self._close(host)
+        for name, row in found:
+            former, parts = self._former.get(host_of(name) or ""), _parts(row)
+            if former is not None and not former.isdisjoint(parts):
+                former |= parts  # new keys of what was to end
+                self._end(host_of(name), {"ike-id": _text(row, "uniqueid")})
         return [one for name, row in found if (one := _seen(name, row)) is not None]
+
+    def _standing(self) -> list[tuple[str, Any]]:
+        with self._said("the list of tunnels"):
+            return [(name, row) for reply in self._session.list_sas() for name, row in reply.items()]
 
     def version(self) -> str:
         """charon's version."""
@@ -124,11 +141,15 @@ class Vici:
             with contextlib.suppress(CommandException):  # its address is in use until the tunnel is gone
                 self._session.unload_pool({"name": connection_name(name)})
         del self._loaded[name]
+        self._former.pop(name, None)
 
     def _close(self, name: str) -> None:
+        self._end(name, {"ike": connection_name(name)})
+
+    def _end(self, name: str | None, tunnel: dict[str, str]) -> None:
         with self._said(f"the end of the tunnel of {name}"), contextlib.suppress(CommandException):
             # It says so when there is none to close.
-            list(self._session.terminate({"ike": connection_name(name), "timeout": "-1", "force": "yes"}))
+            list(self._session.terminate({**tunnel, "timeout": "-1", "force": "yes"}))
 
     def _connect(self, timeout: float | None = _SECONDS) -> Any:
         sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -167,6 +188,12 @@ def _seen(name: str, row: Any) -> TunnelSeen | None:
         sum(int(_text(child, "bytes-in") or 0) for child in children),
         sum(int(_text(child, "bytes-out") or 0) for child in children),
     )
+
+
+def _parts(row: Any) -> set[bytes]:
+    """The numbers of a tunnel and of what it carries, which charon gives once; new keys change one or the other."""
+    carried = row.get("child-sas", {}).values()
+    return {b"ike " + row["uniqueid"], *(b"child " + child["uniqueid"] for child in carried)}
 
 
 def _text(row: Any, key: str) -> str:

@@ -6,32 +6,41 @@ import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
+import msgspec
 import pytest
 from vici.protocol import FiniteStream, Message, Packet
 
-from appliance.channel.messages import TunnelsStated
+from appliance.channel.messages import TunnelHost, TunnelsStated
 from appliance.ipsec.charon import CharonError, Vici
 from appliance.ipsec.strongswan import connection_name
 
-_ESTABLISHED = {"state": "ESTABLISHED", "child-sas": {"ros-1": {"state": "INSTALLED"}}}
 
+class Standing(NamedTuple):
+    """A tunnel that stands: of which connection, the numbers of it and of what it carries."""
 
-def _listed(tunnel: str) -> bytes:
-    name = b"list-sa"
-    said: bytes = Message.serialize({tunnel: _ESTABLISHED})
-    return bytes([Packet.EVENT, len(name)]) + name + said
+    tunnel: str
+    ike: int
+    child: int
+
+    def listed(self) -> bytes:
+        """How charon says so."""
+        name, child = b"list-sa", {"state": "INSTALLED", "uniqueid": str(self.child)}
+        row = {"state": "ESTABLISHED", "uniqueid": str(self.ike), "child-sas": {f"ros-{self.child}": child}}
+        said: bytes = Message.serialize({self.tunnel: row})
+        return bytes([Packet.EVENT, len(name)]) + name + said
 
 
 class StandIn:
     """A charon that answers every command with success; `events` is what it says to who registers for events.
 
-    `standing` are the names of its tunnels, whatever it is asked to end, `asked` the commands it got.
+    `standing` are its tunnels, whatever it is asked to end, `asked` the commands it got.
     """
 
     def __init__(self, path: Path) -> None:
         self.events = bytes([Packet.EVENT_CONFIRM])
-        self.standing: list[str] = []
+        self.standing: list[Standing] = []
         self.asked: list[tuple[str, dict[str, bytes]]] = []
         self._listener = socket.socket(socket.AF_UNIX)
         self._listener.bind(str(path))
@@ -50,9 +59,14 @@ class StandIn:
                     name, body = packet[2 : 2 + packet[1]].decode(), packet[2 + packet[1] :]
                     self.asked.append((name, dict(Message.deserialize(FiniteStream(body)))))
                     if name == "list-sas":
-                        answers[:0] = map(_listed, self.standing)
+                        answers[:0] = map(Standing.listed, self.standing)
                 for answer in answers:
                     connection.sendall(struct.pack("!I", len(answer)) + answer)
+
+    def ended(self, by: str) -> list[str]:
+        """What it was asked to end since this was asked last: the `ike` (connection) or `ike-id` of each."""
+        asked, self.asked = self.asked, []
+        return [body[by].decode() for name, body in asked if name == "terminate" and by in body]
 
     def close(self) -> None:
         """End it, after whoever speaks to it."""
@@ -101,9 +115,29 @@ def test_what_stands_and_is_not_wanted_is_closed_at_each_look(charon: tuple[Stan
     """An end that charon agreed to is not believed: who is revoked while keys are made anew stays out."""
     stand_in, vici = charon
     vici.provision(stated(1))
-    stand_in.standing = [connection_name("gone"), "(unnamed)"]
+    stand_in.standing = [Standing(connection_name("gone"), 1, 1), Standing("(unnamed)", 2, 2)]
     for _ in range(2):
-        stand_in.asked.clear()
         assert [one.name for one in vici.seen()] == ["gone"]
-        ended = [body["ike"] for name, body in stand_in.asked if name == "terminate"]
-        assert ended == [connection_name("gone").encode()]
+        assert stand_in.ended("ike") == [connection_name("gone")]
+
+
+def test_what_stands_of_a_certificate_that_was_replaced_is_closed_at_each_look(
+    charon: tuple[StandIn, Vici],
+) -> None:
+    """By the numbers of what stood then, and of what new keys made of it; not the tunnel of the new certificate."""
+    stand_in, vici = charon
+    tunnel, certificates = connection_name("laptop"), ("1a", "1b")
+    before, other = Standing(tunnel, 3, 7), Standing(connection_name("other"), 4, 8)
+    for serial in certificates:
+        stand_in.standing = [before, other]
+        hosts = [TunnelHost("laptop", "10.113.11.2", serial), TunnelHost("other", "10.113.11.3", "2a")]
+        vici.provision(msgspec.structs.replace(stated(1), hosts=hosts))
+    assert stand_in.ended("ike") == [tunnel]
+    after = Standing(tunnel, 6, 10)
+    for anew in (before, before, Standing(tunnel, 5, 7), Standing(tunnel, 5, 9)):
+        stand_in.standing = [after, anew, other]
+        vici.seen()
+        assert stand_in.ended("ike-id") == [str(anew.ike)]
+    stand_in.standing = [after, other]
+    vici.seen()
+    assert stand_in.ended("ike-id") == []
