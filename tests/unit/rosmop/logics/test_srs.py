@@ -96,6 +96,23 @@ def test_what_has_no_end_is_a_fault_and_changes_nothing() -> None:
         assert run.step(1, 0) == ("fail",)
 
 
+def test_comparing_long_rules_is_work() -> None:
+    """A rule may be as long as the string; what would take seconds at each event is a fault, the rule alone is not."""
+    long, half = "a " * 20_000, "a " * 10_000
+    for formula, fault in (
+        (f"{long} b -> #fail .", False),
+        (f"{long} b -> #fail . {half} b -> #fail .", True),
+    ):
+        run = compiled("srs", formula).start(0)
+        assert isinstance(run, RewritingRun)
+        run.string = [0] * 50_000
+        if fault:
+            with pytest.raises(RunFaultError, match="more than 200000 steps"):
+                run.step(0, 0)
+        else:
+            assert run.step(0, 0) == ()
+
+
 def test_a_string_that_grows_for_ever_is_a_fault() -> None:
     """One symbol for each event, until there are too many."""
     run = compiled("srs", "a b -> #fail .").start(0)
