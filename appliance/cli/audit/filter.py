@@ -16,8 +16,11 @@ from appliance.audit.record import Severity
 from appliance.cli.audit.errors import Errors, tell
 from appliance.cli.spans import Since, Until
 from appliance.cli.target import Appliance
+from appliance.policy.model import Category
 from appliance.wrong_values import meant
 
+CATEGORIES = (*Category, "monitor", "parameter", "publication", "rest", "service", "subscription", "topic")
+"""What a record may be about: what the policy decides, and what else there is."""
 _P = ParamSpec("_P")
 
 
@@ -61,8 +64,9 @@ def _filter(
     end = None if until is None else parse_moment(until, now)
     if begin is not None and end is not None and begin > end:
         raise MomentError(f"--since {since} is later than --until {until}: nothing is between them")
-    if event is not None and not set(event) & set("*?[") and event not in EVENTS:
-        tell(printable(f"this version records no event {event!r}{meant(event, EVENTS)}"))
+    for what, name, known in (("event", event, EVENTS), ("category", category, CATEGORIES)):
+        if name is not None and not set(name) & set("*?[") and name not in known:
+            tell(printable(f"this version records no {what} {name!r}{meant(name, known)}"))
     return Filter(
         decision=tuple(name for name, asked in wanted.items() if asked),
         since=begin,

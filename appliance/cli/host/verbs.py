@@ -12,9 +12,10 @@ from appliance.channel.answers.hosts import Host, PortsSeen
 from appliance.cli import completion
 from appliance.cli.host.kit import KitWriter, placed, wishes_of, write_script
 from appliance.cli.host.output import new_output, usage_error
-from appliance.cli.output import moment, say, say_json
+from appliance.cli.output import moment, printable, say, say_json
 from appliance.cli.spans import span_given
 from appliance.cli.target import Appliance, speaks
+from appliance.wrong_values import meant
 
 _Name = Annotated[
     str,
@@ -121,6 +122,10 @@ def list_hosts(
     Example: rosrv host list
     """
     body = running.ask_or_exit(HostList())
+    groups = sorted({name for row in body.hosts for name in row.groups})
+    if group is not None and group not in groups:
+        known = meant(group, groups) or f": {', '.join(groups[:20]) or 'it has none'}"
+        typer.echo(printable(f"rosrv: hosts.yaml has no group {group!r}{known}"), err=True)
     for row in body.hosts:
         if group is not None and group not in row.groups:
             continue

@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import pty
+import re
 import signal
 import sqlite3
 import subprocess
@@ -14,7 +15,12 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+import appliance
 from appliance.audit.log import AuditLog
+from appliance.cli.audit.filter import CATEGORIES
+from appliance.master.graph.registry import Kind
+from appliance.policy.model import Category
+from appliance.specifications.allocation import SERVICE, TOPIC
 from tests.support.audit import decision, settle
 from tests.support.command import rosrv as run
 from tests.support.requirements import need_root
@@ -65,6 +71,16 @@ def test_an_event_that_this_version_does_not_record_is_told(state: Path) -> None
         assert done.stderr == "rosrv: this version records no event 'desicion'; did you mean decision?\n"
         for known in ("decision", "desi*"):
             assert "this version" not in run("audit", verb, "--event", known, "--state", str(state)).stderr
+
+
+def test_a_category_that_this_version_does_not_record_is_told(state: Path) -> None:
+    """As an event is; those that it records are known, wherever they are written."""
+    done = run("audit", "search", "--category", "publsh", "--state", str(state))
+    assert (done.returncode, done.stdout) == (0, "")
+    assert done.stderr == "rosrv: this version records no category 'publsh'; did you mean publish?\n"
+    sources = Path(appliance.__file__).parent.rglob("*.py")
+    written = {word for path in sources for word in re.findall(r'category="(\w+)"', path.read_text())}
+    assert written | {TOPIC, SERVICE, *Category, *Kind} == set(CATEGORIES)
 
 
 def test_search_json(state: Path) -> None:

@@ -116,6 +116,15 @@ def test_a_group_of_hosts(asked: list[AdminRequest[Any]]) -> None:
     assert asked
 
 
+@pytest.mark.parametrize(("group", "known"), [("ocus", "; did you mean ocu?"), ("arms", ": ocu")])
+def test_a_group_that_no_host_is_in_is_told(asked: list[AdminRequest[Any]], group: str, known: str) -> None:
+    """Beside the list, which is empty: a slip is not taken for a group without a host."""
+    done = run("list", "--group", group)
+    assert (done.exit_code, done.stdout) == (0, "")
+    assert done.stderr == f"rosrv: hosts.yaml has no group '{group}'{known}\n"
+    assert asked
+
+
 def test_a_token_and_its_script(asked: list[AdminRequest[Any]], tmp_path: Path) -> None:
     """The token alone is on standard output; the script is its owner's, has no token in it, and replaces nothing."""
     out = tmp_path / "join.sh"
