@@ -65,6 +65,7 @@ from appliance.rpc.bulk import LargeWrites, bulk_turns
 from appliance.shares.pool import Pool
 from appliance.shares.table import PARAMETER_BYTES
 from appliance.specifications.allocation import Allocation
+from appliance.specifications.compiler import SpecificationCompiler
 from appliance.specifications.monitors import ALLOCATION, Monitors
 from appliance.store.state import StateStore
 
@@ -80,6 +81,7 @@ class Foundation:
 
     settings: Settings
     lifeline: ControlLifeline
+    compiler: SpecificationCompiler
     store: StateStore
     trail: AuditTrail
     policies: Policies
@@ -274,6 +276,7 @@ class Parts:
             published=self.publisher.wake,
             told=[told.reported] if settings.monitors_on_rosout else [],
             site_keys=settings.site_keys,
+            check=base.compiler.check,
         )
 
     def _make_calls(self) -> None:

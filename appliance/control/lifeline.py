@@ -33,16 +33,22 @@ class Surroundings:
 
 
 class ControlLifeline:
-    """The lifeline. `stopping` is set at the end, `enclosed(answer)` hears whether tunnels are open.
+    """The lifeline. `stopping` is set at the end, `enclosed(answer)` hears whether tunnels are open. A start may wait
+    for the compiler: `compiler(channel)` is given each link to it at once.
 
     What else is for other parts of control is handed to them, in order, from `hear` on.
     """
 
     def __init__(
-        self, descriptor: int, stopping: asyncio.Event, enclosed: Callable[[messages.TunnelsEnclosed], None]
+        self,
+        descriptor: int,
+        stopping: asyncio.Event,
+        enclosed: Callable[[messages.TunnelsEnclosed], None],
+        compiler: Callable[[Channel], None],
     ) -> None:
         self._stopping = stopping
         self._enclosed = enclosed
+        self._compiler = compiler
         self.channel = Channel(socket.socket(fileno=descriptor), messages.Lifeline)
         self.surroundings = Surroundings()
         self.sockets: dict[str, socket.socket] = {}
@@ -121,6 +127,8 @@ class ControlLifeline:
             case messages.SocketsRestored(_count, announced):
                 self.announced = announced
                 self.restored.set()
+            case messages.LinkOpened(role="compiler"):
+                self._compiler(Channel(socket.socket(fileno=descriptors[0]), messages.CompilerLink))
             case messages.FirewallReported():
                 self.surroundings.firewall = message
             case messages.TunnelsEnclosed() | messages.EndpointFound() | messages.RouteFound():

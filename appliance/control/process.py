@@ -60,6 +60,7 @@ from appliance.rpc.server import listen
 from appliance.shares.pool import Standing
 from appliance.shares.table import AUDIT_RESERVE
 from appliance.specifications.allocation import TOPIC
+from appliance.specifications.compiler import SpecificationCompiler
 from appliance.specifications.files import SpecificationsRefusedError
 from appliance.store.database import StoreError
 from appliance.store.state import StateStore
@@ -93,7 +94,9 @@ class _Control:
             lifeline_fd,
             self._stopping,
             lambda answer: self._tunnels.answered(answer),  # noqa: PLW0108 - made later
+            lambda channel: self._compiler.attach(channel),  # noqa: PLW0108 - made below
         )
+        self._compiler = SpecificationCompiler(lambda: self._lifeline.say(messages.CompilerWanted()))
         self._tasks: list[asyncio.Task[None]] = []
         self._parameters_dirty = asyncio.Event()
         self._reloading: set[asyncio.Task[None]] = set()
@@ -115,10 +118,12 @@ class _Control:
 
     async def _start(self) -> None:
         await self._lifeline.restored.wait()
+        if self._settings.monitors is not None:
+            self._compiler.call()  # it starts while the policy is read
         restarted = RVMASTER in self._lifeline.sockets
         self._base = base = await self._lay_foundation(restarted)
         self._parts = Parts(base)
-        self._parts.monitors.start(restarted=restarted)
+        await self._parts.monitors.start(restarted=restarted)
         self._hosts = self._make_hosts()
         await _restore(base, self._parts)
         await self._serve()
@@ -165,6 +170,7 @@ class _Control:
         return Foundation(
             settings=self._settings,
             lifeline=self._lifeline,
+            compiler=self._compiler,
             store=store,
             trail=trail,
             policies=policies,

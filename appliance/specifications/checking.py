@@ -1,22 +1,23 @@
-"""Specifications compiled as a whole, for `files.check`."""
+"""Specifications compiled as a whole: in the process `compiler` for control, and where `files.check` is called."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import cache
 
+from appliance.channel.messages import Contents
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.certify.properties import certificates_of
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.syntax.errors import SpecificationError
-from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError
+from appliance.specifications.files import SpecificationsRefusedError
 
 
-def checked(sources: Sources, site_keys: Sequence[str]) -> Checked:
-    """What they are. Raises `SpecificationsRefusedError` with all that is wrong."""
+def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
+    """What is in these files, with these definitions. Raises `SpecificationsRefusedError` with all that is wrong."""
     try:
-        definitions = _standard().extended(Definitions.from_files(sources.definitions))
-        monitors = MonitorSet.load(sources.files, definitions)
+        definitions = _standard().extended(Definitions.from_files(texts))
+        monitors = MonitorSet.load(files, definitions)
     except SpecificationError as error:
         raise SpecificationsRefusedError([str(finding) for finding in error.findings]) from error
     except DefinitionError as error:
@@ -24,27 +25,28 @@ def checked(sources: Sources, site_keys: Sequence[str]) -> Checked:
     certificates, wrong = certificates_of(monitors.monitors)
     if wrong:
         raise SpecificationsRefusedError([str(finding) for finding in wrong])
-    return Checked(
+    topics, services = (
+        {
+            monitor.name: frozenset(
+                event.topic
+                for event in monitor.code.events
+                if event.topic is not None and (event.part is None) is messages
+            )
+            for monitor in monitors.monitors
+        }
+        for messages in (True, False)
+    )
+    types = dict(monitors.topics) | dict(monitors.publications)
+    return Contents(
         {monitor.name: monitor.code.file for monitor in monitors.monitors},
-        {
-            monitor.name: frozenset(
-                e.topic for e in monitor.code.events if e.topic is not None and e.part is None
-            )
-            for monitor in monitors.monitors
-        },
-        {
-            monitor.name: frozenset(
-                e.topic for e in monitor.code.events if e.topic is not None and e.part is not None
-            )
-            for monitor in monitors.monitors
-        },
+        topics,
+        services,
         dict(monitors.publications),
         tuple(str(warning) for warning in monitors.warnings),
-        dict(monitors.topics) | dict(monitors.publications),
-        definitions,
+        types,
+        {name: definitions.full_text(name) for name in types.values()},
         {monitor.name: monitor.code.uses for monitor in monitors.monitors},
-        {name: monitors.published_by(name) for name in sources.files},
-        sources.signers(site_keys),
+        {name: monitors.published_by(name) for name in files},
         certificates,
     )
 

@@ -4,14 +4,16 @@ What is checked here is compiled again in the relay; nothing comes into force th
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from appliance import late
+from appliance.channel import messages
 from appliance.ros.definitions import Definitions
+from appliance.ros.errors import DefinitionError
 from appliance.ros.message_view import read_fields
 from appliance.site_keys import UnsignedError, read_signature, signer
 
@@ -88,31 +90,16 @@ class Sources(msgspec.Struct, frozen=True):
         return self.files | {f"msg/{name}": text for name, text in self.definitions.items()}
 
 
-@dataclass(frozen=True, slots=True)
-class Checked:
-    """Specifications without errors: their monitors (name to file), what they listen to and publish.
+class Checked(messages.Contents, frozen=True):
+    """Specifications that may come into force; `signed_by` are the keys of the site that signed them."""
 
-    `uses` are the other monitors whose variables a monitor uses, `published_by` the topics each file publishes;
-    `signed_by` are the keys of the site that signed them, `certificates` says of each property of a monitor whether its
-    automaton was proved to be what is written.
-    """
-
-    monitors: dict[str, str] = field(default_factory=dict)
-    topics: dict[str, frozenset[str]] = field(default_factory=dict)
-    services: dict[str, frozenset[str]] = field(default_factory=dict)
-    publications: dict[str, str] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-    types: dict[str, str] = field(default_factory=dict)
-    definitions: Definitions = field(default_factory=lambda: Definitions({}))
-    uses: dict[str, frozenset[str]] = field(default_factory=dict)
-    published_by: dict[str, frozenset[str]] = field(default_factory=dict)
-    signed_by: list[str] = field(default_factory=list)
-    certificates: dict[str, list[str]] = field(default_factory=dict)
+    signed_by: list[str] = []  # noqa: RUF012  each struct gets one of its own
 
     def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
         """A message of a topic (its first bytes) as fields and values; None if its type is not known."""
         name = self.types.get(topic)
-        return read_fields(self.definitions, name, data) if name is not None else None
+        definitions = _definitions(name, self.texts.get(name, "")) if name is not None else None
+        return read_fields(definitions, name, data) if name is not None and definitions is not None else None
 
     def of_topic(self, topic: str) -> bool:
         """Whether a monitor has an event on a topic."""
@@ -123,13 +110,34 @@ class Checked:
         return any(service in services for services in self.services.values())
 
 
+@lru_cache(maxsize=1000)
+def _definitions(name: str, text: str) -> Definitions | None:
+    try:
+        return Definitions.from_full_text(name, text)
+    except DefinitionError:
+        return None
+
+
 def check(sources: Sources, site_keys: Sequence[str]) -> Checked:
-    """Compile everything. Raises `SpecificationsRefusedError` with all that is wrong; takes a moment.
+    """Compile everything here. Raises `SpecificationsRefusedError` with all that is wrong; takes a moment.
 
     Where there are `site_keys`, each text must be signed with one of them.
     """
     if not sources.files:
         return Checked()
+    require_bounded(sources)
+    # The compiler, half a second of a small machine: not where there is nothing to compile.
+    checking = late.load("appliance.specifications.checking")
+    return checked(checking.contents(sources.files, sources.definitions), sources, site_keys)
+
+
+def checked(contents: messages.Contents, sources: Sources, site_keys: Sequence[str]) -> Checked:
+    """What the compiler found in these, once they are signed. Raises `SpecificationsRefusedError`."""
+    return Checked(**msgspec.structs.asdict(contents), signed_by=sources.signers(site_keys))
+
+
+def require_bounded(sources: Sources) -> None:
+    """Raises `SpecificationsRefusedError` where they are too many, or too long."""
     if len(sources.files) > _MOST_FILES:
         raise SpecificationsRefusedError(
             [f"{len(sources.files)} files of specifications; {_MOST_FILES} at most"]
@@ -141,9 +149,6 @@ def check(sources: Sources, site_keys: Sequence[str]) -> Checked:
     for name, text in sources.files.items():
         if len(text) > _LONGEST_FILE:
             raise SpecificationsRefusedError([f"{name}: longer than {_LONGEST_FILE} characters"])
-    # The compiler, half a second of a small machine: not where there is nothing to compile.
-    checked: Checked = late.load("appliance.specifications.checking").checked(sources, site_keys)
-    return checked
 
 
 def read_folder(folder: Path) -> Sources:

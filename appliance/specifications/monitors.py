@@ -6,8 +6,8 @@ Invariants:
 
 1. The folder is the baseline and only read; what is loaded, replaced or removed while the robot runs is a revision in
    the store (`revisions.py`) and survives a restart, as the switches (`switches.py`) do.
-2. New specifications are compiled before anything changes; bad ones change nothing and say everything that is wrong
-   with them. The relay compiles them again and has the last word.
+2. New specifications are compiled before anything changes, by the process that `check` asks; bad ones change nothing
+   and say everything that is wrong with them. The relay compiles them again and has the last word.
 3. What is loaded joins monitors on trial that it shares variables with; no load and no switch takes one that is in
    force along.
 4. A reload takes what the folder has, and leaves what the folder does not have in force unless it is told to remove
@@ -36,13 +36,14 @@ from appliance.channel.answers import monitors as answers
 from appliance.channel.answers.monitors import Replaced, Switched
 from appliance.fingerprints import fingerprint_of_all
 from appliance.specifications.allocation import Allocation
-from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError, check
+from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError
 from appliance.specifications.folder import SpecificationFolder
 from appliance.specifications.records import MonitorRecords
 from appliance.specifications.relays import Relays
 from appliance.specifications.revisions import (
     DISK,
     NOTHING,
+    Check,
     Kept,
     check_kept,
     described,
@@ -102,10 +103,12 @@ class Monitors:
         published: Callable[[], None],
         told: Collection[Callable[[messages.MonitorEvent], None]],
         site_keys: Sequence[str],
+        check: Check,
     ) -> None:
         self.folder = folder
         self._folder = SpecificationFolder(folder)
         self.site_keys = site_keys
+        self._check = check
         self._store = store
         self._trail = trail
         self.switches = Switches(enable)
@@ -121,7 +124,7 @@ class Monitors:
 
     # --- start ---
 
-    def start(self, *, restarted: bool) -> None:
+    async def start(self, *, restarted: bool) -> None:
         """Bring specifications into force at start. Raises `SpecificationsRefusedError`.
 
         As with the policy: after a crash of control those that were in force; at the appliance's start the folder's,
@@ -134,11 +137,11 @@ class Monitors:
         if last is not None:
             self.in_force = last
         if last is not None and (restarted or last.who != DISK):
-            self._enforce(sources_of(last), check_kept(last, self.site_keys), last)
+            self._enforce(sources_of(last), await check_kept(self._check, last, self.site_keys), last)
             self._trial.resume()
         else:
             sources = self._folder.read()
-            checked = check(sources, self.site_keys)
+            checked = await self._check(sources, self.site_keys)
             if last is not None and sources_of(last) == sources:
                 self._enforce(sources, checked, last)
                 self._trial.resume()
@@ -464,7 +467,7 @@ class Monitors:
             **switched,
         }
         try:
-            checked = await asyncio.to_thread(check, sources, self.site_keys)
+            checked = await self._check(sources, self.site_keys)
             in_force = {name: True for name in checked.monitors if self.switches.enabled(name)}
             require_whole(self.switches.states_of(checked) | in_force, checked)
             moved = await self.rollout.take(Revision(before + 1, sources, checked))

@@ -1,13 +1,16 @@
 """Revisions of the specifications as the store keeps them; each with the switches that its monitors had last."""
 
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 import msgspec
 
-from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError, check
+from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError
 from appliance.specifications.rollout import Switch
 from appliance.store.state import MonitorRevisionRow, StateStore
+
+Check = Callable[[Sources, Sequence[str]], Awaitable[Checked]]
+"""What these are, with the keys of the site. Raises `SpecificationsRefusedError`."""
 
 DISK = "disk"
 """Who brought a revision into force that is the folder's."""
@@ -43,10 +46,10 @@ def described(row: MonitorRevisionRow, present: int) -> dict[str, Any]:
     return known | {"in_force": row.revision == present, "names": list(sources_of(row).files)}
 
 
-def check_kept(row: MonitorRevisionRow, site_keys: Sequence[str]) -> Checked:
+async def check_kept(check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]) -> Checked:
     """Compile what was in force. A newer version of the appliance may refuse it; then there is a way back."""
     try:
-        return check(sources_of(row), site_keys)
+        return await check(sources_of(row), site_keys)
     except SpecificationsRefusedError as error:
         way = (
             f"this is revision {row.revision}, which {row.who} brought into force while the appliance ran."

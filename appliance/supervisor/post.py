@@ -28,6 +28,7 @@ class Post:
     lives: int = 0
     short_lives: int = 0  # in a row
     due: asyncio.TimerHandle | None = None
+    wanted: bool = False  # of a role on demand: asked for since this life began
 
     @property
     def is_vacant(self) -> bool:

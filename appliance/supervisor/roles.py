@@ -60,7 +60,8 @@ class Role:
     is the role that must be ready first. `outlives_control` roles are stopped last. `files` is the
     limit on open files. `readable_by` is the user whose group may pass through `part` and read what there is
     readable for it. `listens`: each of its lives is given the listening socket that the supervisor holds for it.
-    `dispensable`: when it cannot serve, the others go on without it. `on_demand`: started when control asks for it.
+    `dispensable`: when it cannot serve, the others go on without it. `on_demand`: started when control asks for it,
+    and not again after it has ended by itself with status 0.
     `group` is the user whose group it is in instead of one of its own, to read what is `readable_by` that.
     `capabilities` are those of `privileges.SUPERVISORS` that it keeps. `secret` is a file that its user may not read:
     it is opened before the privileges are given up, and `entry` gets the descriptor (or None) as its last argument.
@@ -140,12 +141,18 @@ ROLES = (
     ),
     _ours(
         "control", "rosrv", "control", "appliance.control.process:main",
-        ended_early=100, files=65_536, links=("relay", "signer", "api", "charon", "syslog", "recorder"),
+        ended_early=100, files=65_536,
+        links=("relay", "signer", "compiler", "api", "charon", "syslog", "recorder"),
         readable_by="rosrv-api",
         walls=lambda facts: Walls(
             listed=True, families=ROUTES, reads=(*around(*facts.control_reads), str(DPKG)), binds=None,
             reaches=None,
         ),
+    ),
+    Role(
+        "compiler", "rosrv-compiler", "compiler", "appliance.compiler.process:main",
+        ended_early=700, links=("control",), network=False, dispensable=True, on_demand=True,
+        walls=lambda _facts: Walls(listed=True),
     ),
     Role(
         "rosout", "rosrv-rosout", "rosout",

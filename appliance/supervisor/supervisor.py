@@ -68,6 +68,7 @@ _FROM_CONTROL: tuple[type[messages.Message], ...] = (
     messages.ApplianceStopRequested,
     messages.LogHeld,
     messages.TunnelsWanted,
+    messages.CompilerWanted,
 )
 
 log = structlog.get_logger()
@@ -114,7 +115,7 @@ class Supervisor:
         self._ready = ready
         self.is_ready = False
         self._guard = Guard(enclosure or Enclosure(), self._tell_control)
-        self._reports = Reports(self._received, self._violated, self._died)
+        self._reports = Reports(self._received, self._violated, self.died)
         self.stopping = asyncio.Event()
         self._someone_died = asyncio.Event()
         self.failure: str | None = None
@@ -213,6 +214,7 @@ class Supervisor:
     def fill(self, post: Post) -> None:
         """Start a process at this post; one that cannot be made is tried again, ever later."""
         post.due = None
+        post.wanted = False
         if self.stopping.is_set():
             return
         here, there = socket.socketpair()
@@ -311,6 +313,8 @@ class Supervisor:
                 self._answer(life, self._open_tunnels(life, pool, address))
             case messages.LogHeld(processes):
                 self._free_log(processes)
+            case messages.CompilerWanted():
+                self._demand("compiler")
             case messages.ApplianceStopRequested(reason):
                 log.warning("control asks to end the appliance", reason=reason)
                 self.stop()
@@ -399,10 +403,16 @@ class Supervisor:
             return
         answer = await self._guard.open_tunnels(pool, address)
         if answer.esp is not None:
-            for post in self.posts:
-                if post.role.on_demand and post.is_vacant:
-                    self.fill(post)
+            self._demand("charon")
         life.send(answer)
+
+    def _demand(self, role: str) -> None:
+        """Have a process that is there on demand; one that is just ending is followed by another."""
+        for post in self.posts:
+            if post.role.name == role:
+                post.wanted = post.life is not None
+                if post.is_vacant:
+                    self.fill(post)
 
     def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)
@@ -461,11 +471,15 @@ class Supervisor:
         inside = self._guard.enclosure.inside()
         return await health.answers(self._facts.rosmaster_port, account_of("rosrv"), inside, seconds)
 
-    def _died(self, life: Life, code: int) -> None:
+    def died(self, life: Life, code: int) -> None:
+        """A process has ended: see who follows."""
         post = next(post for post in self.posts if post.life is life)
         lived = post.bury(life)
         self._someone_died.set()
         if self.stopping.is_set():
+            return
+        if post.role.on_demand and code == 0:
+            self._ended(post)
             return
         log.error("process died", role=life.role, pid=life.pid, end=_end_of(code), lived=round(lived, 3))
         self._tell_processes()
@@ -475,6 +489,15 @@ class Supervisor:
                 return
             log.critical("process keeps dying", role=life.role, times=post.short_lives)
         self._fill_later(post)
+
+    def _ended(self, post: Post) -> None:
+        """A process that was there on demand has ended by itself, as nobody needed it: that is no restart."""
+        log.info("process ended", role=post.role.name)
+        post.lives -= 1
+        post.short_lives = 0
+        self._tell_processes()
+        if post.wanted:
+            self.fill(post)
 
     def _fill_later(self, post: Post) -> None:
         post.due = asyncio.get_running_loop().call_later(post.delay(), self.fill, post)

@@ -20,6 +20,7 @@ NUMERIC_IDS = {
     "rosrv-syslog": 61017,
     "rosrv-rosout": 61018,
     "rosrv-recorder": 61019,
+    "rosrv-compiler": 61020,
 }
 
 

@@ -12,6 +12,7 @@ the link to the api, which bring every request of operators: only its two ends i
 
 # ruff: noqa: F403  a new message is listed by being written
 from appliance.channel.answers.status import ProcessInfo as ProcessInfo
+from appliance.channel.messages.compiler import *
 from appliance.channel.messages.forwarding import *
 from appliance.channel.messages.lifeline import *
 from appliance.channel.messages.message import *

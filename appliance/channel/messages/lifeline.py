@@ -162,6 +162,10 @@ class LogHeld(Message):
     processes: list[int]
 
 
+class CompilerWanted(Message):
+    """Control has specifications to be read: the compiler is started if it is not there; it ends by itself."""
+
+
 class ApplianceStopRequested(Message):
     """Control asks the supervisor to end the appliance (the `shutdown` call of the Master API, granted)."""
 
@@ -173,5 +177,5 @@ Lifeline = (
     | SocketsRestored | Announced | ProcessesChanged | ClockRead | FirewallReported | ProbeFailed | ProbePassed
     | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
     | TunnelsWanted | TunnelsEnclosed
-    | RingGiven | RouteFound | LogHeld | ApplianceStopRequested | SignatureWanted | SignatureMade
+    | RingGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested | SignatureWanted | SignatureMade
 )  # fmt: skip

@@ -248,7 +248,7 @@ def test_a_clean_end_leaves_nothing(start: Any, state: Path) -> None:
     assert time.monotonic() - began < allowed(5)
     assert running.children() == []
     left = sorted(path.name for path in state.iterdir())
-    assert left == ["control", "ipsec", "lock", "relay", "rosmaster", "rosout", "run", "signer"]
+    assert left == ["compiler", "control", "ipsec", "lock", "relay", "rosmaster", "rosout", "run", "signer"]
     assert running.process.seen(event="process did not end") == []
 
 

@@ -65,7 +65,7 @@ def run(
     async def inside() -> None:
         ours, theirs = socket.socketpair()
         stopping = asyncio.Event()
-        lifeline, supervisor = ControlLifeline(theirs.detach(), stopping, enclosed), Supervisor(ours)
+        lifeline, supervisor = ControlLifeline(theirs.detach(), stopping, enclosed, print), Supervisor(ours)
         lifeline.attach()
         try:
             await work(lifeline, supervisor)

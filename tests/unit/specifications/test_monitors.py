@@ -13,7 +13,7 @@ from msgspec.structs import asdict
 from appliance.audit.log import AuditLog
 from appliance.channel import admin, messages
 from appliance.specifications.allocation import Allocation, Move, Resource
-from appliance.specifications.files import Sources, SpecificationsRefusedError
+from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError, check
 from appliance.specifications.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
 from appliance.store.state import StateStore
 from tests.support.audit import HeardTrail
@@ -23,6 +23,11 @@ A = "a() { int shared; event said() /chatter std_msgs/String '{}' { } }"
 B = "hold b() { event said() /other std_msgs/String '{}' { } }"
 
 C = "c() { event said() /third std_msgs/String '{}' { } }"
+
+
+async def here(sources: Sources, site_keys: Sequence[str]) -> Checked:
+    """The compiler, in this process."""
+    return await asyncio.to_thread(check, sources, site_keys)
 
 
 class Desk:
@@ -42,7 +47,7 @@ class Desk:
         self.carried_out = asyncio.Event()
         self.carried_out.set()
 
-    def monitors(
+    async def monitors(
         self,
         enable: str = "all",
         *,
@@ -64,8 +69,9 @@ class Desk:
             published=lambda: None,
             told=[],
             site_keys=site_keys,
+            check=here,
         )
-        relay.monitors.start(restarted=restarted)
+        await relay.monitors.start(restarted=restarted)
         return relay.monitors
 
 
@@ -122,10 +128,10 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
 
 async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: Desk) -> None:
     """The same folder again is no new revision; an operator's revision stays until `reload`."""
-    first = desk.monitors()
+    first = await desk.monitors()
     assert (first.revision, first.names(), first.differs_from_folder) == (1, ["a"], False)
     await desk.store.settled()
-    again = desk.monitors()
+    again = await desk.monitors()
     assert again.revision == 1
     desk.began = ["b"]
     replaced = await again.load(admin.MonitorLoad({"b.rv": B}), "eve")
@@ -133,7 +139,7 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
     assert replaced.began == ["b"]
     repeated = await again.load(admin.MonitorLoad({"b.rv": B}), "adam")
     assert (repeated.revision, repeated.replaced, repeated.changed, again.in_force.who) == (2, 2, [], "eve")
-    restarted = desk.monitors()
+    restarted = await desk.monitors()
     assert (restarted.names(), restarted.in_force.who, restarted.differs_from_folder) == (
         ["a", "b"],
         "eve",
@@ -155,14 +161,14 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
 
 async def test_a_reload_takes_nothing_away_that_the_folder_did_not_bring(desk: Desk) -> None:
     """What the folder does not have stays in force, over restarts, too, until somebody says that it is to go."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
     (desk.folder / "c.rv").write_text(C)
     kept = await monitors.reload(admin.MonitorReload(), "operator")
     assert (kept.added, kept.removed, kept.kept) == (["c.rv"], [], ["b.rv"])
     assert monitors.names() == ["a", "b", "c"]
     await desk.store.settled()
-    restarted = desk.monitors()
+    restarted = await desk.monitors()
     assert restarted.names() == ["a", "b", "c"]
     (desk.folder / "c.rv").unlink()
     again = await restarted.reload(admin.MonitorReload(), "operator")
@@ -173,7 +179,7 @@ async def test_a_reload_takes_nothing_away_that_the_folder_did_not_bring(desk: D
 
 async def test_a_file_with_another_name_is_not_taken_beside_the_old_one(desk: Desk) -> None:
     """Its monitor is in force already: nothing changes, and the words say which file has to go, and how."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     (desk.folder / "a.rv").rename(desk.folder / "new.rv")
     with pytest.raises(
         SpecificationsRefusedError, match=r"not of the folder, and kept: a\.rv \(prune removes"
@@ -187,11 +193,11 @@ async def test_a_file_with_another_name_is_not_taken_beside_the_old_one(desk: De
 async def test_a_revision_comes_back_with_its_switches(desk: Desk) -> None:
     """Specifications and switches are as they were, over restarts; what was in force all the time keeps its switch."""
     (desk.folder / "b.rv").write_text(B)
-    monitors = desk.monitors(enable="none")
+    monitors = await desk.monitors(enable="none")
     await monitors.switch(admin.MonitorSwitch(["a", "b"], True), "eve")
     await monitors.remove(admin.MonitorRemove(["b"]), "eve")
     await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")
-    restarted = desk.monitors(enable="none", restarted=True)
+    restarted = await desk.monitors(enable="none", restarted=True)
     back = await restarted.roll_back(admin.MonitorRollback(None), "adam")
     assert (back.added, back.removed, back.revision) == (["b.rv"], [], 3)
     assert {name: restarted.switches.enabled(name) for name in restarted.names()} == {"a": False, "b": True}
@@ -208,7 +214,7 @@ async def test_a_revision_comes_back_with_its_switches(desk: Desk) -> None:
 async def test_a_refused_rollback_leaves_no_switch_behind(desk: Desk) -> None:
     """A monitor of that name that is loaded later is as if nobody had switched it."""
     (desk.folder / "b.rv").write_text(B)
-    monitors = desk.monitors(enable="none")
+    monitors = await desk.monitors(enable="none")
     await monitors.switch(admin.MonitorSwitch(["b"], True), "eve")
     await monitors.remove(admin.MonitorRemove(["b"]), "eve")
     desk.findings = ["the relay says no"]
@@ -229,7 +235,7 @@ async def gone_back(monitors: Monitors, revision: int) -> None:
 async def test_what_is_not_confirmed_goes_back(desk: Desk) -> None:
     """The monitor that was removed on trial stands guard again, enabled as it was, also after a restart."""
     (desk.folder / "b.rv").write_text(B)
-    monitors = desk.monitors(enable="none")
+    monitors = await desk.monitors(enable="none")
     await monitors.switch(admin.MonitorSwitch(["b"], True), "eve")
     gone = await monitors.remove(admin.MonitorRemove(["b"], confirm_within=0.0), "eve")
     assert gone.confirm_by is not None
@@ -241,12 +247,12 @@ async def test_what_is_not_confirmed_goes_back(desk: Desk) -> None:
     )
     await monitors.remove(admin.MonitorRemove(["b"], confirm_within=300.0), "eve")
     await monitors.remove(admin.MonitorRemove(["a"], confirm_within=300.0), "eve")
-    restarted = desk.monitors(enable="none", restarted=True)
+    restarted = await desk.monitors(enable="none", restarted=True)
     assert restarted.names() == []
     assert restarted.confirm_by is not None
     assert (await restarted.confirm(admin.MonitorConfirm(), "eve")).confirmed
     assert not (await restarted.confirm(admin.MonitorConfirm(), "eve")).confirmed
-    again = desk.monitors(enable="none", restarted=True)
+    again = await desk.monitors(enable="none", restarted=True)
     assert (again.names(), again.confirm_by) == ([], None)
     assert [fields["who"] for event, fields in desk.trail.heard if event == "specifications confirmed"] == [
         "eve"
@@ -256,7 +262,7 @@ async def test_what_is_not_confirmed_goes_back(desk: Desk) -> None:
 async def test_the_first_load_goes_back_to_nothing(tmp_path: Path) -> None:
     """Where there was no revision before."""
     desk = Desk(tmp_path)
-    monitors = desk.monitors(folder=False)
+    monitors = await desk.monitors(folder=False)
     await monitors.load(admin.MonitorLoad({"b.rv": B}, confirm_within=0.0), "eve")
     await gone_back(monitors, 2)
     assert monitors.names() == []
@@ -267,7 +273,7 @@ async def test_the_first_load_goes_back_to_nothing(tmp_path: Path) -> None:
 async def test_without_a_folder_a_reload_is_an_error(tmp_path: Path) -> None:
     """Nothing is removed, the words say what to do, and nothing is said to differ from a folder that is not there."""
     desk = Desk(tmp_path)
-    monitors = desk.monitors(folder=False)
+    monitors = await desk.monitors(folder=False)
     await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
     assert not monitors.differs_from_folder
     for prune in (False, True):
@@ -280,7 +286,7 @@ async def test_without_a_folder_a_reload_is_an_error(tmp_path: Path) -> None:
 
 async def test_a_bad_specification_changes_nothing(desk: Desk) -> None:
     """Whether control or the relay finds the fault; it is a record."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     with pytest.raises(SpecificationsRefusedError):
         await monitors.load(admin.MonitorLoad({"b.rv": "nonsense"}), "eve")
     assert not desk.sent
@@ -295,12 +301,12 @@ async def test_a_bad_specification_changes_nothing(desk: Desk) -> None:
         await monitors.reload(admin.MonitorReload(), "eve")
     await desk.store.settled()
     with pytest.raises(SpecificationsRefusedError):
-        desk.monitors()
+        await desk.monitors()
 
 
 async def test_a_switch_is_answered_when_the_relay_has_carried_it_out(desk: Desk) -> None:
     """What is sent after the answer is judged by it: told is not done, nor when monitors are resumed."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     monitors.received(messages.SpecificationsTaken(1, [], ["a"], monitors.statement(0).statement))
     for order in (
         monitors.switch(admin.MonitorSwitch(["a"], False), "eve"),
@@ -321,17 +327,17 @@ async def test_a_switch_is_answered_when_the_relay_has_carried_it_out(desk: Desk
 
 async def test_switches_are_kept_and_recorded(desk: Desk) -> None:
     """Only what changes is told and recorded; `--enable` is for those that nobody has switched."""
-    monitors = desk.monitors("none")
+    monitors = await desk.monitors("none")
     assert monitors.switches.enabled("a") is False
     assert (await monitors.switch(admin.MonitorSwitch(["a", "a"], True), "eve")).names == ["a"]
     assert (await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")).names == []
     assert desk.sent == [messages.MonitorSwitched("a", True)]
-    assert desk.monitors("none").switches.enabled("a") is True
+    assert (await desk.monitors("none")).switches.enabled("a") is True
     assert monitors.statement(0).enabled == {"a": True}
     with pytest.raises(UnknownMonitorError, match="there are: a"):
         await monitors.switch(admin.MonitorSwitch(["nobody"], True), "eve")
     with pytest.raises(SpecificationsRefusedError, match="--enable"):
-        desk.monitors("a,nobody")
+        await desk.monitors("a,nobody")
     assert [fields["who"] for event, fields in desk.trail.heard if event == "monitor enabled"] == ["eve"]
 
 
@@ -339,16 +345,16 @@ async def test_a_monitor_that_was_removed_while_the_robot_ran_does_not_keep_it_f
     desk: Desk,
 ) -> None:
     """Though `--enable` still names it; nor does a crash of control."""
-    monitors = desk.monitors("a")
+    monitors = await desk.monitors("a")
     await monitors.remove(admin.MonitorRemove(["a"]), "eve")
-    assert desk.monitors("a").names() == []
-    assert desk.monitors("a", restarted=True).names() == []
+    assert (await desk.monitors("a")).names() == []
+    assert (await desk.monitors("a", restarted=True)).names() == []
 
 
 async def test_a_relay_that_follows_another_is_an_alarm_and_holds(desk: Desk) -> None:
     """The first relay of an appliance is not; nor is a control that finds its relay as it was."""
     (desk.folder / "b.rv").write_text(B)
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     assert monitors.statement(0).restarted is False
     monitors.received(messages.SpecificationsTaken(1, ["a", "b"], []))
     assert "monitors restarted" not in [event for event, _ in desk.trail.heard]
@@ -359,7 +365,7 @@ async def test_a_relay_that_follows_another_is_an_alarm_and_holds(desk: Desk) ->
     assert (await monitors.resume(admin.MonitorResume(["a", "b"]), "eve")).names == ["b"]
     assert desk.sent[-1] == messages.MonitorResumed("b")
     await desk.store.settled()
-    control = desk.monitors(restarted=True)
+    control = await desk.monitors(restarted=True)
     assert control.statement(0).restarted is True
     control.received(messages.SpecificationsTaken(1, [], []))
     assert [event for event, _ in desk.trail.heard].count("monitors restarted") == 1
@@ -367,7 +373,7 @@ async def test_a_relay_that_follows_another_is_an_alarm_and_holds(desk: Desk) ->
 
 async def test_what_others_use_is_not_removed_alone(desk: Desk) -> None:
     """And a file goes whole or not at all."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     user = "c() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
     await monitors.load(
         admin.MonitorLoad({"c.rv": user + "\nd() { event said() /x std_msgs/String '{}' { } }"}), "eve"
@@ -383,7 +389,7 @@ async def test_what_others_use_is_not_removed_alone(desk: Desk) -> None:
 
 async def test_a_change_that_is_meant_for_other_monitors_is_refused(desk: Desk) -> None:
     """Two engineers cannot overwrite each other: not after a load, a switch, or a resumption."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     seen = [monitors.tag]
     await monitors.load(admin.MonitorLoad({"b.rv": B}, expected=monitors.tag), "adam")
     seen.append(monitors.tag)
@@ -409,20 +415,20 @@ async def test_a_change_that_is_meant_for_other_monitors_is_refused(desk: Desk) 
 
 async def test_a_switch_goes_with_its_monitor(desk: Desk) -> None:
     """One that is loaded later under its name is as `--enable` says; so it is in the next life of control."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")
     await monitors.load(admin.MonitorLoad({"a.rv": A.replace("{", "{ int n;", 1)}), "eve")
     assert not monitors.switches.enabled("a")
     await monitors.remove(admin.MonitorRemove(["a"]), "eve")
     await monitors.load(admin.MonitorLoad({"a.rv": A}), "eve")
     assert monitors.switches.enabled("a")
-    assert desk.monitors(restarted=True).switches.enabled("a")
+    assert (await desk.monitors(restarted=True)).switches.enabled("a")
 
 
 async def test_a_monitor_is_not_resumed_while_its_relay_is_away(desk: Desk) -> None:
     """The relay that comes will hold its topics: nobody is told that they go on."""
     (desk.folder / "b.rv").write_text(B)
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
     desk.away = True
     with pytest.raises(SpecificationsRefusedError, match="b not resumed: the relay process is away"):
@@ -434,7 +440,7 @@ async def test_a_monitor_is_not_resumed_while_its_relay_is_away(desk: Desk) -> N
 async def test_of_two_changes_for_the_same_monitors_one_is_made(desk: Desk) -> None:
     """Though they come at once, and the first takes its time."""
     (desk.folder / "b.rv").write_text(B)
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     monitors.received(messages.SpecificationsTaken(1, [], ["b"]))
     tag = monitors.tag
     done = await asyncio.gather(
@@ -450,7 +456,7 @@ async def test_of_two_changes_for_the_same_monitors_one_is_made(desk: Desk) -> N
 
 async def test_the_tag_is_that_of_what_changed_something(desk: Desk) -> None:
     """A switch that was so already, an unknown name and a bad specification leave it; no start brings one back."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     first = monitors.tag
     assert (await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")).names == []
     assert (await monitors.resume(admin.MonitorResume(["a"]), "eve")).names == []
@@ -462,12 +468,12 @@ async def test_the_tag_is_that_of_what_changed_something(desk: Desk) -> None:
     await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")
     await monitors.switch(admin.MonitorSwitch(["a"], True), "eve")
     assert monitors.tag != first
-    assert desk.monitors().tag == desk.monitors(restarted=True).tag == monitors.tag
+    assert (await desk.monitors()).tag == (await desk.monitors(restarted=True)).tag == monitors.tag
 
 
 async def test_what_monitors_did_is_recorded_with_its_count(desk: Desk) -> None:
     """The bytes before and after as hexadecimal digits; what could not be told, too."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     told = [
         messages.MonitorEvent("change", "a", "k", "/chatter", 1, "a changed", {}, b"\x01", b"\x02", 1),
         messages.MonitorEvent("change", "a", "k", "/chatter", 2, "", {}, count=41),
@@ -499,12 +505,12 @@ async def test_where_the_site_signs_nothing_else_comes_into_force(desk: Desk) ->
     """Start, load, reload, removal, rollback, and the start after a crash: each asks for the site's signatures."""
     unsigned = "a.rv:1:1: error: it has no signature of the site"
     with pytest.raises(SpecificationsRefusedError, match=unsigned):
-        desk.monitors(site_keys=[LINE])
-    desk.monitors()  # revision 1 is unsigned
+        await desk.monitors(site_keys=[LINE])
+    await desk.monitors()  # revision 1 is unsigned
     await desk.store.settled()
     beside = desk.folder / "a.rv.sig"
     beside.write_text(signed(A))
-    monitors = desk.monitors(site_keys=[LINE])
+    monitors = await desk.monitors(site_keys=[LINE])
     assert (monitors.revision, monitors.differs_from_folder) == (2, False)
     for new in (
         Sources({"b.rv": B}),
@@ -530,9 +536,9 @@ async def test_where_the_site_signs_nothing_else_comes_into_force(desk: Desk) ->
         await monitors.reload(admin.MonitorReload(), "adam")
     beside.write_text(signed(A + " "))
     assert (await monitors.reload(admin.MonitorReload(), "adam")).changed == ["a.rv"]
-    assert desk.monitors(restarted=True, site_keys=[LINE]).sources == sources(a=A + " ", b=B)
+    assert (await desk.monitors(restarted=True, site_keys=[LINE])).sources == sources(a=A + " ", b=B)
     with pytest.raises(SpecificationsRefusedError, match="rosrv monitor reset"):
-        desk.monitors(restarted=True, site_keys=[OTHER_LINE])
+        await desk.monitors(restarted=True, site_keys=[OTHER_LINE])
     loaded = [fields["signed_by"] for event, fields in desk.trail.heard if event == "specifications loaded"]
     assert loaded == [[], *([[NAME]] * 5)]
 
@@ -544,19 +550,19 @@ async def test_a_signature_that_changes_is_a_change(desk: Desk) -> None:
     for path, text in texts.items():
         path.write_text(text)
         Path(f"{path}.sig").write_text(signed(text))
-    monitors = desk.monitors(site_keys=[LINE, OTHER_LINE])
+    monitors = await desk.monitors(site_keys=[LINE, OTHER_LINE])
     differs = [monitors.differs_from_folder]
     for path, text in texts.items():
         Path(f"{path}.sig").write_text(signed(text, OTHER_KEY))
     differs.append(monitors.differs_from_folder)
     await monitors.reload(admin.MonitorReload(), "adam")
     assert [*differs, monitors.differs_from_folder] == [False, True, False]
-    assert desk.monitors(restarted=True, site_keys=[OTHER_LINE]).names() == ["a"]
+    assert (await desk.monitors(restarted=True, site_keys=[OTHER_LINE])).names() == ["a"]
 
 
 async def test_a_trial_is_told_kept_and_promoted(desk: Desk) -> None:
     """It is not enabled; it survives a restart; the relays compile anew when it begins and when it ends."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     assert (await monitors.trial(admin.MonitorTrial(["a"], True), "eve")).names == ["a"]
     assert (await monitors.trial(admin.MonitorTrial(["a"], True), "eve")).names == []
     assert (monitors.switches.enabled("a"), monitors.switches.on_trial("a")) == (False, True)
@@ -564,7 +570,7 @@ async def test_a_trial_is_told_kept_and_promoted(desk: Desk) -> None:
     assert isinstance(stated, messages.SpecificationsStated)
     assert (stated.enabled, stated.trials, stated.revision) == ({"a": True}, ("a",), 1)
     for restarted in (False, True):
-        again = desk.monitors(restarted=restarted)
+        again = await desk.monitors(restarted=restarted)
         assert again.switches.on_trial("a")
         assert again.statement(0).trials == ("a",)
     with pytest.raises(SpecificationsRefusedError, match="rosrv monitor promote"):
@@ -582,7 +588,7 @@ async def test_a_trial_is_told_kept_and_promoted(desk: Desk) -> None:
 
 async def test_a_trial_that_is_disabled_is_over(desk: Desk) -> None:
     """It is as any disabled monitor; and a switch goes with its monitor."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     await monitors.trial(admin.MonitorTrial(["a"], True), "eve")
     assert (await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")).names == ["a"]
     assert (monitors.switches.enabled("a"), monitors.switches.on_trial("a")) == (False, False)
@@ -598,14 +604,14 @@ async def test_a_trial_that_is_disabled_is_over(desk: Desk) -> None:
 
 async def test_a_relay_that_does_not_take_a_trial_leaves_everything(desk: Desk) -> None:
     """What is in force stays in force, and no switch is kept."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     desk.findings = ["no"]
     with pytest.raises(SpecificationsRefusedError, match="no"):
         await monitors.trial(admin.MonitorTrial(["a"], True), "eve")
     desk.findings = []
     assert monitors.switches.enabled("a")
     assert monitors.statement(0).trials == ()
-    assert desk.monitors(restarted=True).switches.enabled("a")
+    assert (await desk.monitors(restarted=True)).switches.enabled("a")
 
 
 USER = "u() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
@@ -614,7 +620,7 @@ USER = "u() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
 async def test_what_shares_variables_is_on_trial_together(desk: Desk) -> None:
     """All are named, by who puts them there and by who promotes them; what is loaded joins, what is in force never."""
     (desk.folder / "u.rv").write_text(USER)
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     with pytest.raises(SpecificationsRefusedError, match="u on trial and a in force do not go together"):
         await monitors.trial(admin.MonitorTrial(["u"], True), "eve")
     assert (await monitors.trial(admin.MonitorTrial(["u", "a"], True), "eve")).names == ["u", "a"]
@@ -622,7 +628,7 @@ async def test_what_shares_variables_is_on_trial_together(desk: Desk) -> None:
         await monitors.trial(admin.MonitorTrial(["a"], False), "eve")
     await monitors.load(admin.MonitorLoad({"v.rv": USER.replace("u()", "v()")}), "eve")
     assert monitors.statement(0).trials == ("a", "u", "v")
-    assert desk.monitors(restarted=True).switches.on_trial("v")
+    assert (await desk.monitors(restarted=True)).switches.on_trial("v")
     await monitors.load(admin.MonitorLoad({"c.rv": C}), "eve")
     uses_both = C.replace("{ }", "{ shared = 2; }")
     with pytest.raises(SpecificationsRefusedError, match="a, u, v on trial and c in force"):
@@ -635,7 +641,7 @@ async def test_what_shares_variables_is_on_trial_together(desk: Desk) -> None:
 
 async def test_a_rollback_brings_a_trial_back(desk: Desk) -> None:
     """A monitor that comes back is on trial as it was when it went."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     await monitors.load(admin.MonitorLoad({"c.rv": C}), "eve")
     await monitors.trial(admin.MonitorTrial(["c"], True), "eve")
     await monitors.remove(admin.MonitorRemove(["c"]), "eve")
@@ -646,7 +652,7 @@ async def test_a_rollback_brings_a_trial_back(desk: Desk) -> None:
 
 async def test_what_a_trial_would_have_done_is_no_drop(desk: Desk) -> None:
     """Neither in the events nor in the counts of drops; `detail` says what it would have been."""
-    monitors = desk.monitors()
+    monitors = await desk.monitors()
     told = [
         messages.MonitorEvent(
             "trial drop", "a", "k", "/chatter", 1, "a.said dropped it", {}, b"\x01", size=1

@@ -20,7 +20,7 @@ ALSO: Final = {
         "cryptography", "appliance.config", "appliance.ros.definitions", "appliance.rosmop.logics.formula",
         "appliance.rosmop.why",
     },
-    "charon": _LINKED, "syslog": _LINKED, "recorder": {"pydantic", "appliance.channel.admin"},
+    "charon": _LINKED, "compiler": _LINKED, "syslog": _LINKED, "recorder": {"pydantic", "appliance.channel.admin"},
     "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette", "yaml", "appliance.policy.policy"},
 }  # fmt: skip
 

@@ -92,6 +92,16 @@ def test_the_recorder_is_there_when_it_is_wanted() -> None:
     assert (recorder.dispensable, recorder.network, recorder.capabilities) == (True, False, ())
 
 
+def test_the_compiler_has_nothing_but_its_link() -> None:
+    """What reads specifications has a user of its own, no network, no file and no right, and is there on demand."""
+    compiler = BY_NAME["compiler"]
+    assert compiler in roles_of()
+    assert compiler.user not in {role.user for role in ROLES if role is not compiler}
+    assert (compiler.path, compiler.network, compiler.capabilities) == (None, False, ())
+    assert (compiler.dispensable, compiler.on_demand, compiler.links) == (True, True, ("control",))
+    assert compiler.walls(FACTS).reads == compiler.walls(FACTS).writes == ()
+
+
 def test_rows_are_consistent() -> None:
     """Each role has a user of the design and is either ours or a program; no two of ours share a part."""
     assert all(role.user in NUMERIC_IDS for role in ROLES)

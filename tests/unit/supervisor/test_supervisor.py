@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 from structlog.testing import capture_logs
 
-from appliance.channel.messages import RouteWanted
+from appliance.channel.messages import CompilerWanted, RouteWanted
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.life import Life
@@ -172,3 +172,35 @@ def test_a_slow_start_is_waited_for_with_words(tmp_path: Path, monkeypatch: pyte
     }  # fmt: skip
     (reason,) = reasons
     assert "it waited for control" in reason
+
+
+@pytest.mark.parametrize("wanted", [False, True])
+def test_who_is_there_on_demand_ends_by_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wanted: bool
+) -> None:
+    """Its end is no death: nobody follows but where one was asked for meanwhile, and it is counted as no restart."""
+    role = Role(name="compiler", user="rosrv-compiler", part="compiler", entry="m:f", on_demand=True)
+    asyncio.run(_end_by_themselves(made(tmp_path, role), monkeypatch, wanted))
+
+
+async def _end_by_themselves(supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch, wanted: bool) -> None:
+    [post] = supervisor.posts
+    filled: list[int] = []
+    monkeypatch.setattr(supervisor, "fill", lambda post: filled.append(post.lives))
+    control = cast(Life, StandIn())
+    supervisor.control_said(control, CompilerWanted(), ())
+    assert filled == [0]
+    post.life, post.lives = cast(Life, StandIn()), 1
+    cast(Any, post.life).started = 0.0
+    if wanted:
+        supervisor.control_said(control, CompilerWanted(), ())
+    supervisor.died(post.life, 0)
+    assert filled == [0] + [0] * wanted
+    assert post.is_vacant
+    assert post.lives == 0
+    post.life, post.lives = cast(Life, StandIn()), 1
+    cast(Any, post.life).started = 0.0
+    supervisor.died(post.life, -9)
+    assert post.due is not None  # a death is followed by a life
+    post.due.cancel()
+    supervisor.kept.close()

@@ -91,7 +91,7 @@ def test_every_process_of_ours_is_listed_but_that_which_starts_charon() -> None:
         walls = role.walls(FACTS)
         assert walls.listed is (role.name not in {"rosmaster", "rosout", "charon"}), role.name
         assert bool(walls.programs) is not walls.listed
-        assert (walls.families == UNIX) is (role.name in {"signer", "api", "recorder"})
+        assert (walls.families == UNIX) is (role.name in {"signer", "compiler", "api", "recorder"})
         assert role.network or (walls.families, walls.binds, walls.reaches) == (UNIX, (), ())
 
 

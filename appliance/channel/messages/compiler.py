@@ -1,0 +1,50 @@
+"""The link control <-> compiler: texts of specifications, and what is in them."""
+
+import msgspec
+
+from appliance.channel.messages.message import Message
+
+
+class Contents(msgspec.Struct, frozen=True):
+    """What specifications without errors are: their monitors (name to file), what they listen to and publish.
+
+    `uses` are the other monitors whose variables a monitor uses, `published_by` the topics each file publishes.
+    `types` has the message type of each topic, `texts` the full text of each such type. `certificates` says of each
+    property of a monitor whether its automaton was proved to be what is written.
+    """
+
+    monitors: dict[str, str] = {}
+    topics: dict[str, frozenset[str]] = {}
+    services: dict[str, frozenset[str]] = {}
+    publications: dict[str, str] = {}
+    warnings: tuple[str, ...] = ()
+    types: dict[str, str] = {}
+    texts: dict[str, str] = {}
+    uses: dict[str, frozenset[str]] = {}
+    published_by: dict[str, frozenset[str]] = {}
+    certificates: dict[str, list[str]] = {}
+
+
+class ContentsWanted(Message):
+    """Control asks what is in these files of specifications (name to text), with these definitions of messages."""
+
+    number: int
+    files: dict[str, str]
+    definitions: dict[str, str]
+
+
+class ContentsFound(Message):
+    """They are in order: what is in them."""
+
+    number: int
+    contents: Contents
+
+
+class ContentsRefused(Message):
+    """They are not, and all that is wrong with them, as `file:line:column: error: text`."""
+
+    number: int
+    findings: list[str]
+
+
+CompilerLink = ContentsWanted | ContentsFound | ContentsRefused

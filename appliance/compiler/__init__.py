@@ -1,0 +1,1 @@
+"""The compiler: reads specifications for control, in a process that has nothing else."""

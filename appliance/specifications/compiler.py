@@ -1,0 +1,82 @@
+"""Control's end of the link to the compiler: the process that reads specifications, which control does not.
+
+It is asked for when there is something to be read, and ends by itself when there is no more. What is too much for it
+ends it, and is refused: the specifications in force stay.
+"""
+
+import asyncio
+from collections.abc import Callable, Sequence
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel, ChannelClosedError
+from appliance.channel.link import Link
+from appliance.specifications.files import (
+    Checked,
+    Sources,
+    SpecificationsRefusedError,
+    checked,
+    require_bounded,
+)
+
+_START_SECONDS = 60.0  # of a machine that has much else to start
+_WORK_SECONDS = 180.0  # of a machine that does much else; the compiler bounds its processor time
+_ENDED = (
+    "the compiler ended while it read them, maybe of the memory or time that they take; the log says more"
+)
+_TRIES = 2  # one that is asked may just have ended because nobody had asked it
+
+
+class SpecificationCompiler:
+    """`wanted()` has the process started."""
+
+    def __init__(self, wanted: Callable[[], None]) -> None:
+        self._wanted = wanted
+        self._link = Link(self._heard)
+        self._there = asyncio.Event()
+        self._called = False
+
+    def call(self) -> None:
+        """Have it come, for there is going to be something to read."""
+        if self._link.channel is None and not self._called:
+            self._there.clear()
+            self._called = True
+            self._wanted()
+
+    def attach(self, channel: Channel) -> None:
+        """It is there."""
+        self._link.attach(channel)
+        self._called = False
+        self._there.set()
+
+    async def check(self, sources: Sources, site_keys: Sequence[str]) -> Checked:
+        """As `files.check`. Raises `SpecificationsRefusedError`, also when the compiler does not answer."""
+        if not sources.files:
+            return Checked()
+        require_bounded(sources)
+        for _ in range(_TRIES):
+            try:
+                return checked(await self._contents(sources), sources, site_keys)
+            except ChannelClosedError:
+                continue
+        raise SpecificationsRefusedError([_ENDED])
+
+    async def _contents(self, sources: Sources) -> messages.Contents:
+        try:
+            self.call()
+            async with asyncio.timeout(_START_SECONDS):
+                await self._there.wait()
+            answer: messages.ContentsFound | messages.ContentsRefused = await self._link.ask(
+                lambda number: messages.ContentsWanted(number, sources.files, sources.definitions),
+                _WORK_SECONDS,
+            )
+        except TimeoutError:
+            self._called = False
+            raise SpecificationsRefusedError(
+                ["the compiler does not answer; try again, the log may say why"]
+            ) from None
+        if isinstance(answer, messages.ContentsRefused):
+            raise SpecificationsRefusedError(answer.findings)
+        return answer.contents
+
+    def _heard(self, message: messages.ContentsFound | messages.ContentsRefused) -> None:
+        self._link.answered(message.number, message)

@@ -1,0 +1,105 @@
+"""The compiler's process: what it answers, when it ends, and what it may take."""
+
+import asyncio
+import resource
+import socket
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.compiler import process
+from appliance.specifications.files import Sources, SpecificationsRefusedError, check, checked
+
+GOOD = """a() {
+    int shared;
+    event said(string data) /chatter std_msgs/String '{data:data}' { shared = shared + 1; }
+    event seen() /seen own_msgs/Seen '{}' { }
+    fsm : idle [ said -> idle ]
+    @idle { }
+}
+b() { event said() /chatter std_msgs/String '{}' { if (shared > 3) { } } }
+"""
+DEFINITIONS = {"own_msgs/Seen.msg": "std_msgs/Header header\ngeometry_msgs/Point[] at\n"}
+HUNGRY = "s() { event e() /a std_msgs/Bool '{}' { " + "int x; x = 1 + 2 * 3; " * 2000 + " } }"
+
+pytestmark = pytest.mark.anyio
+
+
+async def conversation(*wanted: messages.ContentsWanted) -> list[Any]:
+    """What a compiler answers that is asked this; it has ended by itself when this returns."""
+    lifeline, its_lifeline = socket.socketpair()
+    ours, theirs = socket.socketpair()
+    supervisor, control = Channel(lifeline, messages.Lifeline), Channel(ours, messages.CompilerLink)
+    answers: list[Any] = []
+    loop = asyncio.get_running_loop()
+    supervisor.attach(loop, lambda _message, _descriptors: None, lambda: None)
+    control.attach(loop, lambda message, _descriptors: answers.append(message), lambda: None)
+    supervisor.send(messages.LinkOpened("control", 0), (theirs.fileno(),))
+    theirs.close()
+    for one in wanted:
+        control.send(one)
+    try:
+        await process.Process(Channel(its_lifeline, messages.Lifeline)).run()
+        await asyncio.sleep(0)  # what it said last is read in this turn
+        return answers
+    finally:
+        supervisor.close()
+        control.close()
+        its_lifeline.close()
+
+
+async def test_it_answers_each_question_and_ends_when_nobody_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it finds is what `check` does here; what is wrong with texts is said as `check` says it."""
+    monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
+    monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)  # this process goes on
+    bad = GOOD.replace("shared + 1", "shred + 1")
+    found, refused = await conversation(
+        messages.ContentsWanted(7, {"a.rv": GOOD}, DEFINITIONS), messages.ContentsWanted(8, {"a.rv": bad}, {})
+    )
+    sources = Sources({"a.rv": GOOD}, DEFINITIONS)
+    assert (found.number, checked(found.contents, sources, ())) == (7, check(sources, ()))
+    with pytest.raises(SpecificationsRefusedError) as error:
+        check(Sources({"a.rv": bad}), ())
+    assert (refused.number, refused.findings) == (8, error.value.findings)
+
+
+async def test_a_defect_of_the_compiler_is_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever asked is told; what else is asked is answered."""
+    monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
+    monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
+    monkeypatch.setattr("appliance.specifications.checking._standard", lambda: 1 // 0)
+    wanted = messages.ContentsWanted(1, {"a.rv": GOOD}, {})
+    assert [answer.findings for answer in await conversation(wanted, wanted)] == [
+        ["a defect of rosrv, please report it: ZeroDivisionError: integer division or modulo by zero"]
+    ] * 2
+
+
+@pytest.mark.parametrize(("memory", "seconds"), [(8 << 20, 4), (1 << 30, 1)], ids=["memory", "time"])
+def test_texts_that_take_too_much_are_no_burden(memory: int, seconds: int) -> None:
+    """They are refused, or end the process by the kernel's hand: within the bounds in either case."""
+    program = f"""
+import resource, sys
+from pathlib import Path
+from appliance import late
+from appliance.channel import messages
+from appliance.compiler import process
+late.load("appliance.specifications.checking")
+size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (size + {memory}, size + {memory}))
+resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+process._WORK_SECONDS = {seconds}
+print(process.answer(messages.ContentsWanted(1, {{"a.rv": sys.stdin.read()}}, {{}})))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        check=False,
+        input=HUNGRY,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode != 0 or "more than the 1024 MiB of memory" in done.stdout

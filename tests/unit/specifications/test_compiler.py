@@ -1,0 +1,114 @@
+"""Control's end of the link to the compiler, with a compiler that a test plays."""
+
+import asyncio
+import socket
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from appliance.channel import messages
+from appliance.channel.channel import Channel
+from appliance.specifications import compiler as module
+from appliance.specifications.compiler import SpecificationCompiler
+from appliance.specifications.files import Sources, SpecificationsRefusedError
+
+SOURCES = Sources({"a.rv": "text"})
+FOUND = messages.Contents({"a": "a.rv"})
+
+pytestmark = pytest.mark.anyio
+
+
+class Scene:
+    """Control's end; a compiler comes when it is called, and does with a question what the next of `acts` does."""
+
+    def __init__(self, *acts: Callable[[Channel, Any], None]) -> None:
+        self.calls = 0
+        self._acts = list(acts)
+        self._channels: list[Channel] = []
+        self.compiler = SpecificationCompiler(self.called)
+
+    def called(self) -> None:
+        """Another one comes, in the next turn of the loop."""
+        self.calls += 1
+        asyncio.get_running_loop().call_soon(self.come)
+
+    def come(self) -> None:
+        """It is linked."""
+        ours, theirs = socket.socketpair()
+        channel = Channel(theirs, messages.CompilerLink)
+        self._channels.append(channel)
+        channel.attach(
+            asyncio.get_running_loop(),
+            lambda message, _descriptors: self._acts.pop(0)(channel, message),
+            channel.close,
+        )
+        self.compiler.attach(Channel(ours, messages.CompilerLink))
+
+    def close(self) -> None:
+        """All of them end."""
+        for channel in self._channels:
+            channel.close()
+
+
+def finds(channel: Channel, wanted: messages.ContentsWanted) -> None:
+    """It is in order."""
+    channel.send(messages.ContentsFound(wanted.number, FOUND))
+
+
+def refuses(channel: Channel, wanted: messages.ContentsWanted) -> None:
+    """It is wrong."""
+    channel.send(messages.ContentsRefused(wanted.number, ["a.rv:1:1: error: no"]))
+
+
+def dies(channel: Channel, _wanted: messages.ContentsWanted) -> None:
+    """It is killed while it works."""
+    channel.close()
+
+
+async def test_it_is_called_when_there_is_something_to_read() -> None:
+    """Once for all questions, and not for no files."""
+    scene = Scene(finds, refuses, finds)
+    assert (await scene.compiler.check(Sources(), ())).monitors == {}
+    assert scene.calls == 0
+    assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
+    with pytest.raises(SpecificationsRefusedError, match=r"a\.rv:1:1: error: no"):
+        await scene.compiler.check(SOURCES, ())
+    assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
+    assert scene.calls == 1
+    scene.close()
+
+
+async def test_one_that_has_just_ended_is_followed_by_another() -> None:
+    """The next is asked the same."""
+    scene = Scene(dies, finds)
+    assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
+    assert scene.calls == 2
+    scene.close()
+
+
+async def test_texts_that_end_it_are_refused_and_no_others() -> None:
+    """Nothing is in force that could not be read."""
+    scene = Scene(dies, dies, finds)
+    with pytest.raises(SpecificationsRefusedError, match="the compiler ended while it read them"):
+        await scene.compiler.check(SOURCES, ())
+    assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
+    scene.close()
+
+
+async def test_one_that_says_nothing_or_does_not_come_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """That is an answer, too; the next time it is called again."""
+    monkeypatch.setattr(module, "_WORK_SECONDS", 0.05)
+    monkeypatch.setattr(module, "_START_SECONDS", 0.05)
+    scene = Scene(lambda _channel, _wanted: None)
+    with pytest.raises(SpecificationsRefusedError, match="the compiler does not answer"):
+        await scene.compiler.check(SOURCES, ())
+    scene.close()
+    nobody: list[None] = []
+    alone = SpecificationCompiler(lambda: nobody.append(None))
+    for _ in range(2):
+        with pytest.raises(SpecificationsRefusedError, match="the compiler does not answer"):
+            await alone.check(SOURCES, ())
+    assert len(nobody) == 2
