@@ -215,7 +215,14 @@ class _Maker:
                     return end
             return None
 
-        return run
+        def run_one(v: Variables) -> str | None:
+            interpreter._site = only[0]
+            return only[1](v)
+
+        if len(runs) != 1:
+            return run
+        only = runs[0]
+        return run_one
 
     def _statement(self, node: form.Statement) -> _Run:
         self._at = node.site
@@ -223,9 +230,21 @@ class _Maker:
         return made
 
     def _evaluate(self, node: form.Evaluate) -> _Run:
-        if isinstance(node.value, form.Assign):
-            return self._store(node.value)
-        value = self.value(node.value)
+        return self._effect(node.value)
+
+    def _effect(self, node: form.Expression) -> _Run:
+        """An expression whose value nobody wants."""
+        if isinstance(node, form.Assign):
+            return self._store(node)
+        if isinstance(node, form.Sequence):
+            effects = [self._effect(item) for item in node.items]
+
+            def run_all(v: Variables) -> None:
+                for effect in effects:
+                    effect(v)
+
+            return run_all
+        value = self.value(node)
 
         def run(v: Variables) -> None:
             value(v)
@@ -250,7 +269,10 @@ class _Maker:
         def run(v: Variables) -> str | None:
             return yes(v) if test(v) else no(v)
 
-        return run
+        def run_yes(v: Variables) -> str | None:
+            return yes(v) if test(v) else None
+
+        return run if node.no else run_yes
 
     def _branch(self, site: int, statements: Sequence[form.Statement]) -> _Run:
         """What drops or changes the message, or publishes one, can say which conditions led there."""
@@ -659,8 +681,7 @@ class _Maker:
         return (lambda v: left(v) or right(v)) if node.operator == "or" else lambda v: left(v) and right(v)
 
     def _not(self, node: form.Not) -> _Value:
-        value = self.value(node.value)
-        return lambda v: not value(v)
+        return self._then(self.value(node.value), operator.not_)
 
     def _conditional(self, node: form.Conditional) -> _Value:
         test, yes, no = self.value(node.test), self.value(node.yes), self.value(node.no)

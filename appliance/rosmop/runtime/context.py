@@ -16,7 +16,9 @@ BUDGET = 1_000_000
 """Instructions that a specification may spend on one message."""
 
 TRIAL_BUDGET = 100_000
-"""Instructions that a specification on trial may spend on one message: what waits meanwhile waits some milliseconds."""
+"""Instructions that a specification on trial may spend on one message: what waits meanwhile waits some tens of
+milliseconds.
+"""
 
 MAX_BYTES = 16 << 20
 """Bytes that the values of a specification may hold together."""
