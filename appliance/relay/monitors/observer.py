@@ -17,7 +17,7 @@ from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.places import NOWHERE, Place, Senders, Sighting
 from appliance.rosmop.explanations import of_change, of_drop, of_fault, of_published, of_verdict
-from appliance.rosmop.outcomes import Outcome, Verdict, bound, named
+from appliance.rosmop.outcomes import Outcome, Verdict, named
 from appliance.rosmop.runtime.context import LogLine, Published
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class Observer:
 
     def hides_verdict(self, verdict: Verdict, place: Place) -> bool:
         """Whether the next such verdict at a place is only counted."""
-        return self._observations.told("verdict", verdict.monitor, place, _which(verdict))
+        return self._observations.told("verdict", verdict.monitor, place, named(verdict))
 
     def hides_publication(self, monitor: str, topic: str, place: Place) -> bool:
         """Whether the next message that a monitor publishes on a topic, because of one at a place, is only counted."""
@@ -89,7 +89,7 @@ class Observer:
         place = self.senders.place(source) or NOWHERE
         kind = f"{self._prefix}verdict"
         if (
-            self._observations.told(kind, verdict.monitor, place, _which(verdict))
+            self._observations.told(kind, verdict.monitor, place, named(verdict))
             or self._explained >= _EXPLAINED
         ):
             return False
@@ -270,7 +270,8 @@ class Observer:
                         place,
                         last,
                         times,
-                        distinction=_which(verdict),
+                        distinction=named(verdict),
+                        shared={"category": verdict.category},
                     )
             for writers, messages in changed.items():
                 self._again[writers, place] = self._again.get((writers, place), 0) + messages
@@ -310,7 +311,8 @@ class Observer:
                 place,
                 outcome.time,
                 named(verdict),
-                distinction=_which(verdict),
+                distinction=named(verdict),
+                shared={"category": verdict.category},
                 detail=of_verdict(outcome, verdict, self._who),
                 after=bytes(outcome.buffer[:SHOWN]),
                 size=len(outcome.buffer),
@@ -374,8 +376,3 @@ def _together(events: Sequence[str]) -> list[str]:
 def _of_publication(place: Place, topic: str) -> Place:
     """Where a publication is told that comes of a message at a place."""
     return place._replace(key="", resource=topic)
-
-
-def _which(verdict: Verdict) -> str:
-    """What distinguishes a verdict from the others of its monitor."""
-    return f"{verdict.property} {verdict.category}{bound(verdict)}"

@@ -89,7 +89,10 @@ def test_who_may_not_read_messages_gets_a_monitors_record_without_them() -> None
     texts = {
         "property 1 of goals (fsm) with id = a: secret, n = 7: twice": "property 1 of goals (fsm): twice",
         "on trial: property 2 of goals (ere) with id = \n: fail": "on trial: property 2 of goals (ere): twice",
-        "3 more in the same second: 0 twice with id = a: secret": "3 more in the same second: 0 twice",
+        "3 more in the same second: 0 twice with id = a: secret": "3 more in the same second: 0 twice",  # up to 0.1.0
+        "3 more in the same second: property 1 of goals (fsm) with id = a: twice": (
+            "3 more in the same second: property 1 of goals (fsm): twice"
+        ),
         "property 1 of gun (fsm): unsafe": "property 1 of gun (fsm): unsafe",
     }
     for reason, plain in texts.items():

@@ -548,7 +548,8 @@ def test_a_verdict_is_told_with_its_property_logic_and_category(world: Monitored
     verdict = world.event("verdict", monitor="latch", count=0)
     assert verdict.detail["logic"] == "fsm"
     assert verdict.detail["category"] == "pressed"
-    assert world.event("verdict", count=2).monitor == "latch"
+    again = world.event("verdict", count=2)
+    assert (again.monitor, again.text, again.detail) == ("latch", verdict.text, {"category": "pressed"})
 
     def counted() -> Any:
         rows = [row for one in world.told if isinstance(one, MonitorsCounted) for row in one.rows]
