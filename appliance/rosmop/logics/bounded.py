@@ -5,7 +5,7 @@ bound passes. What is certain is found part by part: `x or y` is once one of the
 come in time and `x` held until then, or `x` has failed, or the time is over.
 
 Theory of operation. A `Program` (`past.py`) has the distinct parts of the formula. Those that look back only are
-computed at their event (`Steps`). Of the others a *cell* stands for the value of one part at one event
+computed at their event (`Folded`). Of the others a *cell* stands for the value of one part at one event
 while that is open; a cell tells its *users* when it is decided. Cells are made for what is asked for only: of
 `fire => eventually[0,1s] safe` nothing is kept but the events `fire` that wait.
 
@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 from appliance.rosmop.logics.formula import Formula
 from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
-from appliance.rosmop.logics.past import FOREVER, VERDICTS, Instruction, Program, Window, steps_of
+from appliance.rosmop.logics.past import FOREVER, VERDICTS, Instruction, Program, Window, fold
 
 MOST_OPEN = 10_000
 
@@ -400,9 +400,9 @@ class BoundedProperty(CompiledProperty):
                 self.later.add(number)
         asked = {operand for number in self.later for operand in program.instructions[number].operands}
         at_once = sorted(asked - self.later)
-        self.steps = steps_of(program, at_once)
+        self.folded = fold(program, at_once)
         self.at_once = {number: index for index, number in enumerate(at_once)}
-        """Those that these need to know at their event, as `steps` has them."""
+        """Those that these need to know at their event, as `folded` has them."""
         self.order = {
             number: sorted(program.instructions[number].operands, key=self.later.__contains__)
             for number in self.later
@@ -471,7 +471,7 @@ class BoundedRun:
 
     def __init__(self, compiled: BoundedProperty, time_ns: int) -> None:
         self._compiled = compiled
-        self._at_once = compiled.steps.start()
+        self._at_once = compiled.folded.start()
         self.later = compiled.later
         self.place = 0
         self._operators = compiled.operators(self)
@@ -499,7 +499,7 @@ class BoundedRun:
         if sum(len(operator.rows) for operator in self._operators.values()) >= MOST_OPEN:
             raise RunFaultError(f"more than {MOST_OPEN} events wait for what follows them")
         self.place += 1
-        self._places = self._compiled.steps.take(self._at_once, event, self._now)
+        self._places = self._compiled.folded.take(self._at_once, event, self._now)
         self._values = {}
         whole = self.value(self._compiled.program.result)
         if isinstance(whole, Cell):

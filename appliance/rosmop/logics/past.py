@@ -9,9 +9,9 @@ follows its operands, with only ``previously`` and ``since`` left of the tempora
 - ``since``: its own last value;
 - either with bounds: the intervals of time in which it will hold if the left operand goes on to hold (`Window`).
 
-Which atoms hold is known of each event, so what is left of the program at it is worked out beforehand, as data
-(`Steps`). Without time bounds the values are bits and the program a finite automaton, which is built if it is small
-enough.
+Which atoms hold is known of each event, so the program is folded beforehand into what is left of it at each of them,
+which is data (`Folded`). Without time bounds the values are bits and the program a finite automaton, which is built if
+it is small enough.
 """
 
 import copy
@@ -32,6 +32,7 @@ from appliance.rosmop.logics.automaton import (
 from appliance.rosmop.logics.formula import Bounds, Formula, event_names
 from appliance.rosmop.logics.interface import (
     Categories,
+    ClockedProperty,
     CompiledProperty,
     FiniteProperty,
     Run,
@@ -41,6 +42,7 @@ from appliance.rosmop.logics.interface import (
 )
 
 VERDICTS = ("violation", "validation")
+ANEW = "anew"
 TOLD: tuple[Categories, Categories] = VERDICTS[:1], VERDICTS[1:]
 MAX_TABLE_WORK = 2_000_000
 """How many values may be computed to build a table."""
@@ -80,11 +82,6 @@ class Program:
         self._numbers: dict[Instruction, int] = {}
         self.instructions: list[Instruction] = []
         self.result = self._add(formula)
-
-    @property
-    def bounded(self) -> bool:
-        """Whether any operator has a time bound."""
-        return any(instruction.bounded for instruction in self.instructions)
 
     def _emit(
         self, operator: str, *operands: int, low: int = 0, high: int | None = None, event: int = -1
@@ -141,12 +138,12 @@ Residue = tuple[tuple[Operation, ...], tuple[int, ...]]
 
 
 @dataclass(frozen=True)
-class Steps:
-    """How a program is stepped over a list of *values*: `False`, `True` (so a place below 2 says what is in it), what
-    one step leaves to the next, and what is of use within one.
+class Folded:
+    """A program as its runs have it. They keep a list of *values*: `False`, `True` (so a place below 2 says what is in
+    it), what one step leaves to the next, and what is of use within one.
 
     ``bounds`` are those of the windows among what is left to the next step, ``abstract`` the places in it that abstract
-    operators have. ``residues`` has one residue for each event, and behind them that of an event that is not named.
+    operators have. ``residues`` has one for each event, and behind them that of an event that is not named.
     """
 
     bounds: tuple[Bounds | None, ...]
@@ -188,8 +185,8 @@ def compute(operations: Sequence[Operation], values: list[Any], event: int, now:
             values[place] = left == event
 
 
-def steps_of(program: Program, wanted: Sequence[int]) -> Steps:
-    """How to compute these instructions."""
+def fold(program: Program, wanted: Sequence[int]) -> Folded:
+    """The program, to compute these instructions."""
     needed = {*wanted}
     for number in range(max(wanted), -1, -1):
         if number in needed:
@@ -198,14 +195,14 @@ def steps_of(program: Program, wanted: Sequence[int]) -> Steps:
     looking = {number: one for number, one in chosen.items() if one.plain in ("since", "previously")}
     kept = {number: place for place, number in enumerate(looking, 2)}
     events = {one.event for one in chosen.values()} | {-1}
-    folded = sum(1 + len(one.operands) for one in chosen.values()) * len(events) <= MAX_FOLDED
-    folds = {event: _Fold(chosen, kept, event if folded else None) for event in (events if folded else {-1})}
-    residues = {event: fold.residue(wanted) for event, fold in folds.items()}
-    return Steps(
+    known = sum(1 + len(one.operands) for one in chosen.values()) * len(events) <= MAX_FOLDED
+    folds = {event: _Fold(chosen, kept, event if known else None) for event in (events if known else {-1})}
+    residues = {event: made.residue(wanted) for event, made in folds.items()}
+    return Folded(
         tuple((one.low, one.high) if one.bounded else None for one in looking.values()),
         tuple(kept[number] for number, one in looking.items() if one.plain != one.operator),
         tuple(residues.get(event, residues[-1]) for event in (*program.events.values(), -1)),
-        max(fold.size for fold in folds.values()),
+        max(made.size for made in folds.values()),
     )
 
 
@@ -284,39 +281,85 @@ class _Fold:
 
 
 def compile_past(source: Source, formula: Formula) -> CompiledProperty:
-    """The monitor of a past formula: a table where it is finite and small, else its steps."""
-    program = Program(formula, source.events)
-    steps = steps_of(program, [program.result])
-    if not program.bounded:
-        named = event_names(formula)
-        of_event, classes = letter_classes(source.events, named)
-        letters = [source.events.index(named[index]) if index >= 0 else -1 for index in classes]
-        try:
-            automaton = _table(steps, letters)
-        except TooManyStatesError:
-            pass
-        else:
-            return FiniteProperty(source, VERDICTS, spread(automaton, of_event))
-    return PastProperty(source, steps)
+    """The monitor of a past formula: tables where they are finite and small, else the program, folded."""
+    folded = fold(program := Program(formula, source.events), [program.result])
+    bounds = [found for found in folded.bounds if found is not None]
+    named = event_names(formula)
+    of_event, classes = letter_classes(source.events, named)
+    letters = [source.events.index(named[index]) if index >= 0 else -1 for index in classes]
+    try:
+        if not bounds:
+            return FiniteProperty(source, VERDICTS, spread(_table(folded, letters), of_event))
+        if len(bounds) == 1 and (bounds[0][0] == 0 or bounds[0][1] is None):
+            late = [len(classes) + letter for letter in of_event]
+            automaton = spread(_table(folded, letters, clocked=True), [*of_event, *late])
+            low, high = bounds[0]
+            return ClockedPast(source, automaton, low - 1 if high is None else high)
+    except TooManyStatesError:
+        pass
+    return PastProperty(source, folded)
 
 
-def _table(steps: Steps, letters: Sequence[int]) -> Automaton:
-    """The automaton over letters, of which the formula names ``letters[i]`` (-1: none of its events)."""
-    values, kept = steps.start(), steps.kept
+def _table(folded: Folded, letters: Sequence[int], *, clocked: bool = False) -> Automaton:
+    """The automaton over letters, of which the formula names ``letters[i]`` (-1: none of its events).
 
-    def step(state: tuple[tuple[bool, ...], bool], letter: int) -> tuple[tuple[bool, ...], bool]:
-        values[kept] = state[0]
-        (result,) = steps.take(values, letters[letter], 0)
-        return tuple(values[kept]), values[result]
+    With a clock all letters are there a second time, as they are where it is late; a state that is entered as the clock
+    begins anew has `ANEW` behind its verdict.
+    """
+    values, kept, many = folded.start(), folded.kept, len(letters)
 
-    work = sum(1 + len(steps.residues[letter][0]) for letter in letters)
+    def step(state: tuple[tuple[bool, ...], bool, bool], letter: int) -> tuple[tuple[bool, ...], bool, bool]:
+        windows = [
+            value if bounds is None else _Clock(value, first=bounds[1] is None)
+            for bounds, value in zip(folded.bounds, state[0], strict=True)
+        ]
+        values[kept] = windows
+        (result,) = folded.take(values, letters[letter % many], letter >= many)
+        anew = any(isinstance(window, _Clock) and window.anew for window in windows)
+        return tuple(map(bool, values[kept])), values[result], anew
+
+    work = sum(1 + len(folded.residues[letter][0]) for letter in letters) << clocked
     return explore(
-        (tuple(values[kept]), False),
-        len(letters),
+        ((False,) * len(folded.bounds), False, False),
+        many << clocked,
         step,
-        lambda state: TOLD[state[1]],
+        lambda state: (*TOLD[state[1]], ANEW) if state[2] else TOLD[state[1]],
         min(MAX_STATES, 1 + MAX_TABLE_WORK // work),
     )
+
+
+class _Clock:
+    """A window that begins at once, or never ends (``first``), in a table: whether it is there, for times that are
+    whether more than its bound has passed since it began, at its `first` or its last anchor.
+    """
+
+    def __init__(self, there: bool, *, first: bool) -> None:
+        self._there = there
+        self._first = first
+        self.anew = False
+
+    def __bool__(self) -> bool:
+        return self._there
+
+    def step(self, unbroken: bool, anchor: bool, late: bool) -> bool:
+        """The value, as `Window.step` gives it."""
+        self._there = self._there and unbroken and (self._first or not late)
+        if anchor and not (self._first and self._there):
+            self._there = self.anew = True
+        return self._there and (not self._first or (late and not self.anew))
+
+
+class ClockedPast(ClockedProperty):
+    """A past formula with one time bound, that one window of `_Clock` has."""
+
+    def __init__(self, source: Source, automaton: Automaton, within: int) -> None:
+        super().__init__(source, VERDICTS)
+        self.initial, self.within = automaton.initial, within
+        self.verdicts = tuple(told[:1] for told in automaton.verdicts)
+        self.waits = (None,) * len(automaton)
+        rows = [[(target, ANEW in automaton.verdicts[target]) for target in row] for row in automaton.table]
+        self.moves = tuple(tuple(row[: len(self.events)]) for row in rows)
+        self.late = tuple(tuple(row[len(self.events) :]) for row in rows)
 
 
 class Window:
@@ -365,9 +408,9 @@ class PastRun(UntimedRun):
 
     __slots__ = ("_residues", "now", "values")
 
-    def __init__(self, steps: Steps, time_ns: int) -> None:
-        self._residues = steps.residues
-        self.values = steps.start()
+    def __init__(self, folded: Folded, time_ns: int) -> None:
+        self._residues = folded.residues
+        self.values = folded.start()
         self.now = time_ns
 
     def __copy__(self) -> "PastRun":
@@ -386,17 +429,17 @@ class PastRun(UntimedRun):
 
 
 class PastProperty(CompiledProperty):
-    """A past formula without a table."""
+    """A past formula without tables."""
 
-    def __init__(self, source: Source, steps: Steps) -> None:
+    def __init__(self, source: Source, folded: Folded) -> None:
         super().__init__(source, VERDICTS)
-        self._steps = steps
+        self._folded = folded
 
     @property
     def timed(self) -> bool:
         """Whether the formula has time bounds."""
-        return any(self._steps.bounds)
+        return any(self._folded.bounds)
 
     def start(self, time_ns: int) -> Run:
         """A fresh run."""
-        return PastRun(self._steps, time_ns)
+        return PastRun(self._folded, time_ns)

@@ -24,7 +24,7 @@ from appliance.rosmop.logics.interface import (
     UntimedRun,
     twin,
 )
-from appliance.rosmop.logics.past import TOLD, VERDICTS, Program, Steps, steps_of
+from appliance.rosmop.logics.past import TOLD, VERDICTS, Folded, Program, fold
 from appliance.rosmop.logics.ptltl import SYNTAX as PTLTL
 
 MAX_DEPTH = 10_000
@@ -64,15 +64,15 @@ def compile_ptcaret(source: Source) -> CompiledProperty:
     if CALL not in source.events and any(node.name == CALL for node in nodes(formula)):
         raise source.error(0, "`@bc` needs the event `call` of the specification")
     program = Program(formula, source.events)
-    return CaretProperty(source, steps_of(program, [program.result]))
+    return CaretProperty(source, fold(program, [program.result]))
 
 
 class CaretProperty(CompiledProperty):
     """A formula with a stack: what the abstract operators remember, for each call that is open."""
 
-    def __init__(self, source: Source, steps: Steps) -> None:
+    def __init__(self, source: Source, folded: Folded) -> None:
         super().__init__(source, VERDICTS)
-        self.steps = steps
+        self.folded = folded
         places = [source.events.index(name) if name in source.events else -1 for name in (BEGIN, END)]
         self.begin, self.end = places
 
@@ -88,7 +88,7 @@ class CaretRun(UntimedRun):
 
     def __init__(self, compiled: CaretProperty) -> None:
         self._compiled = compiled
-        self._values = compiled.steps.start()
+        self._values = compiled.folded.start()
         self._stack: list[tuple[bool, ...]] = []
 
     def __copy__(self) -> "CaretRun":
@@ -99,12 +99,12 @@ class CaretRun(UntimedRun):
     def step(self, event: int, _time_ns: int) -> Categories:
         """Take the event; the time plays no part. Raises RunFaultError, and is unchanged then."""
         compiled, values, stack = self._compiled, self._values, self._stack
-        abstract = compiled.steps.abstract
+        abstract = compiled.folded.abstract
         if event == compiled.begin:
             if len(stack) >= MAX_DEPTH:
                 raise RunFaultError(f"more than {MAX_DEPTH} calls are open: an `end` is missing")
             stack.append(tuple(values[place] for place in abstract))
-        (result,) = compiled.steps.take(values, event, 0)
+        (result,) = compiled.folded.take(values, event, 0)
         holds = values[result]
         if event == compiled.end:
             for place, before in zip_longest(abstract, stack.pop() if stack else (), fillvalue=False):

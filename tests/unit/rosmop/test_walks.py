@@ -664,6 +664,10 @@ CLOCKED = (
     "pattern: globally: e requires o within 2ms @violation { n++; __RESET; }",
     "pattern: globally: o forbids e within 2ms @violation { n++; __RESET; }",
     "pattern: until o: no e within 2ms @violation { n++; __RESET; } @validation { m++; }",
+    "mtl: e => once[0,2ms] o @violation { n++; __RESET; }",
+    "mtl: e => !o since[1ms,inf] e @violation { n++; }",
+    "mtl: e => previously[1ms,inf] o @violation { m++; }",
+    "mtl: historically[0,3ms] (e => previously o) @violation { n++; } @validation { m++; }",
 )
 
 

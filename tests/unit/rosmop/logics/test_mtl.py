@@ -8,8 +8,8 @@ import pytest
 import reelay
 
 from appliance.rosmop.logics import past
-from appliance.rosmop.logics.interface import FiniteProperty, Run
-from appliance.rosmop.logics.past import PastRun, Window
+from appliance.rosmop.logics.interface import ClockedProperty, FiniteProperty, Run
+from appliance.rosmop.logics.past import PastProperty, PastRun, Window
 from tests.unit.rosmop.logics.driving import ABC, compiled, refusal, seeded
 from tests.unit.rosmop.logics.temporal import Printer, Tree, draw
 
@@ -197,6 +197,26 @@ def test_durations() -> None:
 def test_without_bounds_it_is_a_table() -> None:
     """A formula without time bounds is compiled to a finite automaton."""
     assert isinstance(compiled("mtl", "a since !b"), FiniteProperty)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a => once[0,3ns] b",
+        "!c since[2ns,inf] a",
+        "previously[0,2ns] (a or previously b)",
+        "historically[0,0] (a => once b)",
+    ],
+)
+def test_with_one_bound_it_has_tables_and_a_clock(text: str) -> None:
+    """One that begins at once, or has no end: a module can step it; and it tells what the windows tell."""
+    one, other = compiled("mtl", text), compiled("mtl", f"({text}) or once[1ns,1ns] false")
+    assert isinstance(one, ClockedProperty)
+    assert isinstance(other, PastProperty)
+    random = seeded(14)
+    for _ in range(200):
+        trace = timed_trace(random, 12, 4)
+        assert verdicts(one.start(0), trace) == verdicts(other.start(0), trace), trace
 
 
 def test_time_does_not_run_backwards() -> None:

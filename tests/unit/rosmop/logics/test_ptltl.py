@@ -81,7 +81,7 @@ def test_random_formulas_on_all_short_traces() -> None:
 
 
 @pytest.mark.parametrize("folded", [past.MAX_FOLDED, 0])
-def test_table_and_steps_agree(folded: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_table_and_folded_program_agree(folded: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A formula too large for a table is computed, with the same verdicts."""
     monkeypatch.setattr(past, "MAX_FOLDED", folded)
     random = seeded(8)
