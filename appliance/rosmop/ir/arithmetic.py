@@ -9,7 +9,6 @@ from appliance.rosmop.ir.wasm import (
     ABS,
     CALCULATE,
     COMPARE,
-    DROP,
     ELSE,
     END,
     F32,
@@ -138,13 +137,6 @@ class Arithmetic(Parts):
         kind = bytes((machine_type(node.type),))
         yes, no = self._nested(node.yes), self._nested(node.no)
         return self._value(node.test) + IF + kind + yes + ELSE + no + END
-
-    def _sequence(self, node: form.Sequence) -> bytes:
-        chosen = node.chosen % len(node.items)
-        values = [
-            self._value(item) + (b"" if index == chosen else DROP) for index, item in enumerate(node.items)
-        ]
-        return b"".join(values)
 
     def _question(self, argument: form.Expression, operator: str) -> bytes:
         """Compare the size of a number with infinity."""

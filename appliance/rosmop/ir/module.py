@@ -11,7 +11,7 @@ arrays (`records.py`).
   bits (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`, `RESET`.
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
   it is taken back. Within what it calls it is a trap. Beyond are strings that are made or changed, vectors of anything
-  but numbers, of more than `ROOM` bytes, of the message that are changed, handed back or by reference,
+  but numbers, of more than `ROOM` bytes, arrays of the message that become longer or shorter, messages by reference,
   messages (and `MESSAGE`) of more than `MOST_MADE` bytes or with what is beyond, what is published with a string of
   more than `MOST_KEPT`, or first of its kind of a second, recursion, `sin` and its like. An event of which no message
   can come past such a place has no module: `NotScalarError` names what is beyond.
@@ -32,6 +32,7 @@ from appliance.rosmop.ir import form
 from appliance.rosmop.ir.arithmetic import to_floating
 from appliance.rosmop.ir.layout import (
     NOW,
+    ROOM,
     UNDO,
     Cells,
     Layout,
@@ -53,8 +54,8 @@ from appliance.rosmop.ir.wasm import (
     F64,
     I32,
     I64,
+    MOVES,
     RETURN,
-    STORE,
     UNREACHABLE,
     constant,
     row,
@@ -62,7 +63,10 @@ from appliance.rosmop.ir.wasm import (
 )
 from appliance.rosmop.runtime.wire import FEW
 from appliance.rosmop.types import kinds
+from appliance.rosmop.types.kinds import Type
 
+_LOADS = {I32: 0x28, I64: 0x29, F32: 0x2A, F64: 0x2B}
+_STORES = {I32: 0x36, I64: 0x37, F32: 0x38, F64: 0x39}
 HAPPENED, DROPPED, CHANGED, RESET = 1, 2, 4, 16
 
 EARLY = 16
@@ -75,6 +79,7 @@ class Written:
 
     `brief`: without loops. `passes`: some message comes to its end. `says`: it may put out lines. `early`: it may write
     into the first bytes of the message, where a header is. `publishes`: contexts, and topics on which they may publish.
+    `references`: where the values of its references stand when it has returned.
     """
 
     number: int
@@ -89,6 +94,7 @@ class Written:
     says: bool
     early: bool
     publishes: frozenset[tuple[str, str]] = frozenset()
+    references: tuple[tuple[str, int], ...] = ()
 
 
 class Writer(Layout):
@@ -158,7 +164,9 @@ class _Body(Records):
         self._own_places(function)
         self._writer = writer
         self._function = function
-        self._made = made_in(function.body, writer.shared)
+        self._made, self._begun = made_in(function, writer.shared)
+        self._references: dict[str, int] = {}
+        """Where the values of references stand when it has returned."""
         self._result = result
         self._is_handler = answers and function.happens is None  # type: ignore[union-attr]  # has looked
         self._types = tuple(parameters.values())
@@ -196,6 +204,7 @@ class _Body(Records):
             self._says,
             self._early,
             frozenset(self._publishes),
+            tuple(self._references.items()),
         )
 
     def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
@@ -229,6 +238,8 @@ class _Body(Records):
             return self._change(value)
         if isinstance(value, form.Literal) and value.value is None:
             return b""
+        if isinstance(value, form.Sequence):
+            return b"".join(self._evaluate(form.Evaluate(node.site, item)) for item in value.items)
         if isinstance(value, form.Conditional) and value.type == kinds.VOID:
             yes, no = ((form.Evaluate(node.site, branch),) for branch in (value.yes, value.no))
             return self._if(form.If(node.site, value.test, yes, no))
@@ -278,13 +289,6 @@ class _Body(Records):
             chosen = constant(I32, index) + self._set(node.name)
             code += self._when(test, lambda chosen=chosen: chosen)  # type: ignore[misc]  # the row of this turn
         return code
-
-    def _return(self, node: form.Return) -> bytes:
-        if node.references:
-            raise NotScalarError("references")
-        if node.value.type == kinds.VOID:
-            return constant(I32, 0) + RETURN
-        return self._value(node.value) + RETURN
 
     def _leave(self, node: form.Leave) -> bytes:
         code = constant(I32, bool(node.happened))
@@ -345,21 +349,63 @@ class _Body(Records):
 
     def _write_back(self, node: form.WriteBack) -> bytes:
         code = self._when(self._get("dropped"), lambda: self._leave(form.Leave(node.site, True)))
-        for write in node.writes:
-            if write.end is not None:
-                code += self._when(self._get(write.flag), self._elsewhere)
-                continue
-            self._writes += 1
+        for write in sorted(node.writes, key=lambda write: write.end is not None):
             self._early = self._early or (write.at.base is None and write.at.offset < EARLY)
-            code += self._when(self._get(write.flag), partial(self._put_field, write))
+            put = partial(self._put_field if write.end is None else self._put_array, write)
+            code += self._when(self._get(write.flag), partial(self._or_elsewhere, put))
         return code
+
+    def _or_elsewhere(self, put: Callable[[], bytes]) -> bytes:
+        try:
+            return put()
+        except NotScalarError:
+            return self._elsewhere()
+
+    def _put_array(self, write: form.Write) -> bytes:
+        """Put the elements of an array there that is as long. A NaN that is put there, or that Python would change, is
+        left.
+        """
+        value, end = write.value, write.end
+        if not isinstance(value, form.Copy) or not isinstance(value.value, form.Read) or end is None:
+            raise NotScalarError(str(value.type))
+        room, at = self._room(value.value), write.at
+        code, place, count = self._noted(b"".join(self._elements(value)))
+        if isinstance(value.type, kinds.Vector) and value.type.length is None:
+            at = at.plus(4)
+        behind = self._position(at) + count + constant(I64, room.size) + b"\x7e\x7c"
+        other = behind + self._get(end, I64) + b"\x52" + self._is_elsewhere(room) + b"\x72"
+        code += self._when(other, self._elsewhere)
+        element, to = (f"{what} {len(self._locals)}" for what in ("element", "target"))
+        code += (
+            place + self._set(element) + self._get("at") + self._position(at) + b"\xa7\x6a" + self._set(to)
+        )
+        left = f"left {len(self._locals)}"
+        each = self._put_element(room.element, self._get(element), self._get(to))
+        for name in (element, to):
+            each += self._get(name) + constant(I32, room.size) + b"\x6a" + self._set(name)
+        self._brief = False
+        self._writes += ROOM // room.size
+        return code + count + self._set(left, I64) + self._times(left, each)
+
+    def _put_element(self, kind: Type, element: bytes, to: bytes) -> bytes:
+        size, machine = self._writer.size(kind), machine_type(kind)
+        if isinstance(kind, kinds.Bool):
+            return self._put_bits(to, 0, size, loaded(element, 0, kind))
+        bits = element + bytes((MOVES[size][0], 0, 0))
+        if machine not in (F32, F64):
+            return self._put_bits(to, 0, size, bits)
+        value = loaded(element, 0, kind)
+        other = bits + to + bytes((MOVES[size][0], 0, 0)) + bytes((COMPARE[I64 if size == 8 else I32]["!="],))
+        if machine == F32:  # a signalling one comes from Python as a quiet one
+            other += bits + constant(I32, 1 << 22) + b"\x71\x45\x72"
+        none = value + value + bytes((COMPARE[machine]["!="],)) + other + b"\x71"
+        return self._when(none, self._elsewhere) + self._put_bits(to, 0, size, bits)
 
     def _put_field(self, write: form.Write) -> bytes:
         """Put a number where it differs, bit by bit; Python decides which bits a NaN has."""
         codes = struct_code(write.value.type) or ""
         machine, size = machine_type(write.value.type), struct_size(codes)
-        whole = I64 if size == 8 else I32
-        new, value = f"new {whole}", self._value(write.value)
+        value = self._value(write.value)
         code = b""
         if machine in (F32, F64):
             kept = f"kept {machine}"
@@ -368,25 +414,29 @@ class _Body(Records):
             value = self._get(kept, machine) + (b"\xbc" if machine == F32 else b"\xbd")
         elif len(codes) == 2:
             code, value = self._parts_of(write.value.type, value)
-        code += value + self._set(new, whole)
-        load = {1: 0x2D, 2: 0x2F, 4: 0x28, 8: 0x29}[size]
-        mask = constant(I32, (1 << 8 * size) - 1) + b"\x71" if size < 4 else b""
-        old = b"".join(self._at(write.at, load))
+        self._writes += 1
+        base = b"" if write.at.base is None else self._get(write.at.base, I64) + b"\xa7\x6a"
+        return code + self._put_bits(self._get("at") + base, write.at.offset, size, value)
+
+    def _put_bits(self, place: bytes, offset: int, size: int, bits: bytes) -> bytes:
+        """Put so many bytes there if others stand there, which are noted."""
+        whole = I64 if size == 8 else I32
+        load, store = (bytes((code, 0)) + unsigned(offset) for code in MOVES[size])
+        new, mask = f"new {whole}", constant(I32, (1 << 8 * size) - 1) + b"\x71" if size < 4 else b""
+        old = place + load
         differs = old + self._get(new, whole) + mask + bytes((COMPARE[whole]["!="],))
 
         def put() -> bytes:
             entry, end = self._get("entry"), self._cell(0x28, UNDO) + self._set("entry")
-            base = b"" if write.at.base is None else self._get(write.at.base, I64) + b"\xa7\x6a"
-            address = self._get("at") + base + constant(I32, write.at.offset) + b"\x6a"
-            note = entry + address + b"\x36\x00\x00" + entry + constant(I32, size) + b"\x36\x00\x04"
+            note = entry + place + constant(I32, offset) + b"\x6a\x36\x00\x00"
+            note += entry + constant(I32, size) + b"\x36\x00\x04"
             note += entry + old + (b"" if whole == I64 else b"\xad") + b"\x37\x00\x08"
             note += self._cell(0x36, UNDO, entry + constant(I32, 16) + b"\x6a")
-            place, store = self._at(write.at, STORE[size])
             return (
                 end + note + place + self._get(new, whole) + store + constant(I32, 1) + self._set("changed")
             )
 
-        return code + self._when(differs, put)
+        return bits + self._set(new, whole) + self._when(differs, put)
 
     # Expressions
 
@@ -401,8 +451,7 @@ class _Body(Records):
         cells = self._writer.shared.get(node.name)
         if cells is None:
             return self._get(node.name, machine)
-        load = {I32: 0x28, I64: 0x29, F32: 0x2A, F64: 0x2B}[machine]
-        return self._cell(load, cells.address(node.name, node.type))
+        return self._cell(_LOADS[machine], cells.address(node.name, node.type))
 
     def _assigned_to(self, node: form.Assign) -> bytes:
         if isinstance(node.type, kinds.String):
@@ -411,13 +460,14 @@ class _Body(Records):
             return self._assigned_vector(node)
         if isinstance(node.type, kinds.Record):
             return self._assigned_record(node)
+        if node.type == kinds.VOID:
+            return self._handed(node.name, node.value)
         machine, value = machine_type(node.type), self._value(node.value)
         cells = self._writer.shared.get(node.name)
         if cells is None:
             return value + self._set(node.name, machine)
         self._assigned.add(node.name)
-        store = {I32: 0x36, I64: 0x37, F32: 0x38, F64: 0x39}[machine]
-        return self._cell(store, cells.address(node.name, node.type), value)
+        return self._cell(_STORES[machine], cells.address(node.name, node.type), value)
 
     def _assign(self, node: form.Assign) -> bytes:
         return self._assigned_to(node) + self._read(form.Read(node.type, node.name))
@@ -514,16 +564,39 @@ class _Body(Records):
         code = self._value(argument) + _OF_MOMENTS[node.function](self)
         return code + b"\xa7" if machine_type(node.type) == I32 else code
 
+    def _sequence(self, node: form.Sequence) -> bytes:
+        chosen = node.chosen % len(node.items)
+        return b"".join(
+            self._value(item) if index == chosen else self._evaluate(form.Evaluate(-1, item))
+            for index, item in enumerate(node.items)
+        )
+
+    def _after(self, node: form.Sequence) -> tuple[bytes, bytes, bytes]:
+        *before, last = node.items
+        if node.chosen not in (-1, len(before)):
+            raise NotScalarError(str(node.type))
+        code = b"".join(self._evaluate(form.Evaluate(-1, item)) for item in before)
+        first, place, count = self._elements(last)
+        return code + first, place, count
+
+    # What functions are given, and hand back
+
     def _invoke(self, node: form.Invoke) -> bytes:
+        return self._called(node)[0]
+
+    def _called(self, node: form.Invoke) -> tuple[bytes, tuple[tuple[str, int], ...]]:
+        """A call, and where the values of its references stand behind it. A string or vector that it returns is where
+        it is (32 bits) and how long.
+        """
         if node.depth is not None:
             raise NotScalarError("recursion")
-        result = I32 if node.type == kinds.VOID else machine_type(node.type)
+        result = I32 if node.type == kinds.VOID else I64 if _has_place(node.type) else machine_type(node.type)
         function = self._writer.functions[node.function]
         parameters: dict[str, int] = {}
         code = b""
         with self._apart(*node.arguments):
             for name, argument in zip(function.parameters, node.arguments, strict=True):
-                if isinstance(argument.type, kinds.String | kinds.Vector):
+                if _has_place(argument.type):
                     parameters |= {f"place of {name}": I32, f"count of {name}": I64}
                     code += b"".join(self._elements(argument))
                 elif isinstance(argument.type, kinds.Record):
@@ -537,7 +610,88 @@ class _Body(Records):
         self._brief = self._brief and called.brief
         self._says = self._says or called.says
         self._publishes |= called.publishes
-        return code + b"\x10" + unsigned(called.number)
+        return code + b"\x10" + unsigned(called.number), called.references
+
+    def _return(self, node: form.Return) -> bytes:
+        kind, code, answer = node.value.type, b"", constant(I32, 0)
+        if _has_place(kind):
+            code, place, count = self._noted(b"".join(self._elements(node.value)))
+            answer = place + b"\xad" + count + constant(I64, 32) + b"\x86\x84"
+        elif kind != kinds.VOID:
+            name = f"answer {machine_type(kind)}"
+            code, answer = (
+                self._value(node.value) + self._set(name, machine_type(kind)),
+                self._get(name, machine_type(kind)),
+            )
+        for name in node.references:
+            at = self._references.setdefault(name, self._writer.room(8))
+            if f"count of {name}" in self._locals:
+                code += self._cell(0x36, at, self._get(f"place of {name}"))
+                code += self._cell(0x36, at + 4, self._get(f"count of {name}", I64) + b"\xa7")
+            elif name in self._locals:
+                machine = self._locals[name][1]
+                code += self._cell(_STORES[machine], at, self._get(name, machine))
+            else:
+                raise NotScalarError("a message by reference")
+        return code + answer + RETURN
+
+    def _handed(self, name: str, node: form.Expression) -> bytes:
+        """Call a function with references; what it hands back is in local variables that are numbered, from its value
+        on.
+        """
+        if not isinstance(node, form.Invoke):
+            raise NotScalarError(str(node.type))
+        code, references = self._called(node)
+        if _has_place(node.type):
+            code += self._put_span(f"{name} 0")
+        else:
+            code += DROP if node.type == kinds.VOID else self._set(f"{name} 0", machine_type(node.type))
+        kinds_of = dict(zip(self._writer.functions[node.function].parameters, node.arguments, strict=True))
+        for number, (reference, at) in enumerate(references, 1):
+            kind = kinds_of[reference].type
+            if _has_place(kind):
+                code += self._cell(0x29, at) + self._put_span(f"{name} {number}")
+            else:
+                machine = machine_type(kind)
+                code += self._cell(_LOADS[machine], at) + self._set(f"{name} {number}", machine)
+        return code
+
+    def _put_span(self, name: str) -> bytes:
+        """An address and length (32 bits each, from the stack) in local variables."""
+        code = self._set("span", I64) + self._get("span", I64) + b"\xa7" + self._set(f"place of {name}")
+        return (
+            code + self._get("span", I64) + constant(I64, 32) + b"\x88" + self._set(f"count of {name}", I64)
+        )
+
+    def _handed_back(self, node: form.Invoke) -> tuple[bytes, bytes, bytes]:
+        name = f"handed back {len(self._locals)}"
+        code = self._invoke(node) + self._put_span(name)
+        return code, self._get(f"place of {name}"), self._get(f"count of {name}", I64)
+
+    def _elements(self, node: form.Expression) -> tuple[bytes, bytes, bytes]:
+        if isinstance(node, form.Item) and node.base.type == kinds.VOID:
+            return super()._elements(_part_of(node))
+        if isinstance(node.type, kinds.String) and isinstance(node, form.Invoke):
+            return self._handed_back(node)
+        if isinstance(node.type, kinds.String) and isinstance(node, form.Sequence):
+            return self._after(node)
+        return super()._elements(node)
+
+    def _item(self, node: form.Item) -> bytes:
+        if node.base.type != kinds.VOID:
+            return super()._item(node)
+        return constant(I32, 0) if node.type == kinds.VOID else self._value(_part_of(node))
+
+
+def _has_place(kind: Type) -> bool:
+    """Whether a value is where it is and how long it is."""
+    return isinstance(kind, kinds.String | kinds.Vector)
+
+
+def _part_of(node: form.Item) -> form.Read:
+    """The local variable that has a part of what a function has handed back."""
+    assert isinstance(node.base, form.Read)  # noqa: S101  as the form has it
+    return form.Read(node.type, f"{node.base.name} {node.number}")
 
 
 _EXACT = {"fabs": 0x99, "ceil": 0x9B, "floor": 0x9C, "trunc": 0x9D, "rint": 0x9E, "nearbyint": 0x9E, "sqrt": 0x9F,

@@ -216,4 +216,4 @@ def root(node: form.Expression) -> form.Read | form.Assign | None:
             node = node.arguments[0]
         else:
             return None
-    return node
+    return node if node.type != kinds.VOID else None  # that holds what a function has handed back

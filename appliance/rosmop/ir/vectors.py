@@ -9,6 +9,7 @@ A local variable that is changed, or holds what may change meanwhile, has a plac
 copied from: in the message.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -70,12 +71,21 @@ class Vectors(Texts):
 
     _made: frozenset[str] = frozenset()
     """The local variables that have a place of their own."""
+    _begun: frozenset[str] = frozenset()
+    """Those of them that are elsewhere until they change: in the message, or with who calls the function."""
+
+    @abstractmethod
+    def _handed_back(self, node: form.Invoke) -> tuple[bytes, bytes, bytes]:
+        """A string or vector that a function returns, as `_elements`; the next call may change what is there."""
+
+    @abstractmethod
+    def _after(self, node: form.Sequence) -> tuple[bytes, bytes, bytes]:
+        """The same of one behind what is evaluated before."""
 
     def _room(self, node: form.Read | form.Assign) -> _Room:
         kind, cells = node.type, self._layout.shared.get(node.name)
-        if not isinstance(kind, kinds.Vector) or not kinds.is_number(kind.element):
-            raise NotScalarError(str(kind))
-        size = struct_size(struct_code(kind.element) or "")
+        size = self._size_of(kind)
+        assert isinstance(kind, kinds.Vector)  # noqa: S101  it has a size
         if cells is not None:
             if node.name not in cells.vectors:
                 cells.vectors[node.name] = self._layout.room(2 * ROOM + 8)
@@ -86,6 +96,12 @@ class Vectors(Texts):
         if node.name not in self._rooms:
             self._rooms[node.name] = self._layout.room(ROOM)
         return _Room(node.name, kind.element, size, self._rooms[node.name], None)
+
+    def _size_of(self, kind: Type) -> int:
+        """The bytes of an element of a vector that is kept or made. Raises `NotScalarError` of another."""
+        if not isinstance(kind, kinds.Vector) or not kinds.is_number(kind.element):
+            raise NotScalarError(str(kind))
+        return struct_size(struct_code(kind.element) or "")
 
     def _place_in(self, room: _Room) -> bytes:
         return self._get(f"place of {room.name}") if room.cell is None else self._cell(0x28, room.cell)
@@ -112,7 +128,8 @@ class Vectors(Texts):
         """What it was before this message is kept; `copied` brings the elements to where it is from now on."""
         self._assigned.add(room.name)
         if room.cell is None:
-            return constant(I32, room.begin) + self._set(f"place of {room.name}")
+            own = constant(I32, 1) + self._set(f"own {room.name}") if room.name in self._begun else b""
+            return own + constant(I32, room.begin) + self._set(f"place of {room.name}")
         current, begin = self._cell(0x28, room.cell), constant(I32, room.begin)
         is_old = current + self._cell(0x28, room.begin + 2 * ROOM) + _SAME
         other = constant(I32, room.begin + ROOM) + begin + current + begin + _SAME + SELECT
@@ -122,7 +139,15 @@ class Vectors(Texts):
     def _changing(self, room: _Room) -> bytes:
         """The elements may be written."""
         size = self._bytes(room, self._count_in(room))
-        return self._fresh(room, self._get("fresh") + self._place_in(room) + size + _COPY)
+        if room.name not in self._begun:
+            return self._fresh(room, self._get("fresh") + self._place_in(room) + size + _COPY)
+        code = self._when(self._count_in(room) + room.most + _OVER, self._elsewhere)
+        code += constant(I32, room.begin) + self._place_in(room) + size + _COPY + self._fresh(room)
+        return self._when(self._is_elsewhere(room), lambda: code)
+
+    def _is_elsewhere(self, room: _Room) -> bytes:
+        """Whether a local vector has not come to its place yet."""
+        return self._get(f"own {room.name}") + b"\x45"
 
     def _bytes(self, room: _Room, count: bytes) -> bytes:
         return count + _WRAP + constant(I32, room.size) + b"\x6c"
@@ -149,6 +174,10 @@ class Vectors(Texts):
             code = self._assigned_vector(node)
             first, place, count = self._elements(form.Read(node.type, node.name))
             return code + first, place, count
+        if isinstance(node, form.Zero | form.Vector | form.Invoke | form.Conditional):
+            name = f"made {len(self._locals)}"
+            room = _Room(name, node.type.element, self._size_of(node.type), self._layout.room(ROOM), None)
+            return self._copied(room, node), self._place_in(room), self._count_in(room)
         if not isinstance(node, form.Read) or not (
             node.name in self._layout.shared or node.name in self._made
         ):
@@ -180,7 +209,8 @@ class Vectors(Texts):
 
     def _assigned_vector(self, node: form.Assign) -> bytes:
         shared = self._layout.shared
-        if node.name in shared or node.name in self._made:
+        begins = node.name in self._begun and isinstance(node.value, form.Read)
+        if (node.name in shared or node.name in self._made) and not begins:
             return self._copied(self._room(node), node.value)
         root = root_of(node.value)
         if not root or root in shared or root in self._made:
@@ -196,10 +226,18 @@ class Vectors(Texts):
             return self._listed(room, value)
         if isinstance(value, form.Call) and value.function in ("l_filled", "e_fill"):
             return self._filled(room, value)
-        if not isinstance(value, form.Copy):
+        if isinstance(value, form.Invoke):
+            first, place, count = self._handed_back(value)
+        elif isinstance(value, form.Sequence):
+            first, place, count = self._after(value)
+        elif isinstance(value, form.Conditional):
+            first, place, count = self._chosen(value)
+        elif isinstance(value, form.Copy | form.Item):
+            first, place, count = self._elements(value)
+        else:
             raise NotScalarError(str(value.type))
-        first, place, count = self._elements(value)
-        code = first + self._when(count + room.most + _OVER, self._elsewhere) + self._fresh(room)
+        code, place, count = self._noted(first + place + count)
+        code += self._when(count + room.most + _OVER, self._elsewhere) + self._fresh(room)
         code += self._place_in(room) + place + self._bytes(room, count) + _COPY
         return code + self._counted(room, count)
 
@@ -475,23 +513,32 @@ def _stores(machine: int, size: int) -> int:
     return {F32: 0x38, F64: 0x39}.get(machine, STORE[size])
 
 
-def made_in(body: Sequence[form.Statement], shared: Mapping[str, object]) -> frozenset[str]:
-    """The local variables of a function that are given vectors which need a place of their own."""
+def made_in(
+    function: form.Function | form.Skipper, shared: Mapping[str, object]
+) -> tuple[frozenset[str], frozenset[str]]:
+    """The local variables of a function that are given vectors which need a place of their own, and of them those that
+    begin elsewhere: what the function is given, and arrays of the message (one that changes has no other name).
+    """
     sources: dict[str, list[form.Expression]] = {}
-    changed = set()
-    for node in form.nodes(body):
+    changed, fields = set(), set()
+    for node in form.nodes(function.body):
         if isinstance(node, form.Assign) and isinstance(node.type, kinds.Vector):
             sources.setdefault(node.name, []).append(node.value)
         elif isinstance(node, form.Call) and node.function in OF_VECTORS:
             changed.add(root_of(node.arguments[0]))
-    own = {
-        name: {root_of(value) for value in values}
-        for name, values in sources.items()
-        if name not in shared and not any(isinstance(value, form.Read) for value in values)
-    }
+        elif isinstance(node, form.ReadValue):
+            fields.add(node.name)
+    given = frozenset(function.parameters if isinstance(function, form.Function) else ())
+    own = {name: {""} for name in changed & given}
+    begun = set(given)
+    for name, values in sources.items():
+        named = [value.name for value in values if isinstance(value, form.Read)]
+        if name not in shared and fields.issuperset(named):
+            own[name] = {"" if name in given else root_of(value) for value in values} - fields
+            begun |= {name} if named else set()
     made = {
         name for name, roots in own.items() if name in changed or "" in roots or not roots.isdisjoint(shared)
     }
     while more := {name for name, roots in own.items() if not roots.isdisjoint(made)} - made:
         made |= more
-    return frozenset(made)
+    return frozenset(made), frozenset(made & begun)

@@ -28,7 +28,14 @@ FUNCTIONS = """
 int ii(double d) { return d > 2e9 ? 5 : d < -2e9 ? -5 : d != d ? 0 : (int) d; }
 unsigned int uu(double d) { return d > 4e9 || !(d > 0) ? 9u : (unsigned int) d; }
 """
-VECTORS = "std::vector<long> v = {1, 2, 3}; std::vector<long> w; long f[4] = {5, 6}; long total = 0;\n"
+VECTORS = """std::vector<long> v = {1, 2, 3}; std::vector<long> w; long f[4] = {5, 6}; long total = 0;
+std::vector<long> turned(std::vector<long> given, long k) {
+    std::reverse(given.begin(), given.end()); given.resize(k); return given; }
+std::vector<long> longer(const std::vector<long>& one, const std::vector<long>& other) {
+    if (one.size() < other.size()) { return other; } return one; }
+long exchange(std::vector<long>& one, std::vector<long>& other, long& count) {
+    std::vector<long> t = one; one = other; other = t; one.push_back(count); count += 3; return t.size(); }
+"""
 HEADERS = (
     "#include <algorithm>\n#include <cmath>\n#include <cstdint>\n#include <cstdio>\n#include <vector>\n"
     "using std::printf;\n"
@@ -93,6 +100,11 @@ def vector_program(random: Random) -> str:
                     f"std::sort({a}.begin(), {a}.end());",
                     f"std::reverse({a}.begin(), {a}.end());",
                     f"if ({a} == {b}) {{ total += 1; }} else {{ {a} = {b}; {b}.resize({k}); }}",
+                    f"{a} = turned({a}, {k});",
+                    f"{{ long k = {k}; total += exchange({a}, {b}, k) + k; total += exchange({b}, {a}, k) * k; }}",
+                    f"{a} = longer(turned({b}, {k}), {a});",
+                    f"for (auto one : turned(longer({a}, {b}), 5)) {{ total = total * 3 + one; }}",
+                    f"total += longer({a}, {b}).size() + turned({a}, 4)[3];",
                     f"{a} = {b}; if ({a} != {b}) {{ total += 7; }}",
                     f"{a}.resize(90); for (auto& one : {a}) {{ total = total * 5 + 3; one = total % 64; }}"
                     f" std::sort({a}.begin() + {k}, {a}.end());",

@@ -110,6 +110,9 @@ UNPROVED = {
     "not loop-free": event("for (int i = 0; i < x; i++) { x += i; }", "int x", "count:x"),
     "uses seconds": event("d = t.toSec();", "ros::Time t", "when:t", "double d = 0;"),
     "uses the instruction f64.copysign": event("y = copysign(y, 1.0);", "double y", "x:y"),
+    "uses the instruction memory.copy": event(
+        "v[1] = count;", "std::vector<long> v, int count", "three:v, count:count"
+    ),
     "uses a constant string, or a string or vector that is kept or made": event(
         'if (x) { last = "x"; }', "int x", "count:x", "std::string last;"
     ),
