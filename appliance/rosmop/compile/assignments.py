@@ -103,7 +103,7 @@ def _store_part(scope: Scope, place: Place, value: form.Expression) -> form.Expr
     assert isinstance(place, CharacterPlace | PartPlace)  # the last kinds of places
     inner, base = require_place(place.base, "an assignment"), place.base.form
     if isinstance(place, PartPlace):
-        part = form.Literal(kinds.VOID, place.part)
+        part = form.Literal(kinds.VOID, place.part.encode())
         return _store(scope, inner, form.Call(base.type, "a_part", (base, part, value), place.site))
     changed = form.Call(base.type, "a_character", (base, place.index, value), place.site)
     return _store(scope, inner, changed)

@@ -4,7 +4,6 @@ A cursor is an index into a vector that is known when the code is compiled; it i
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from appliance.rosmop.compile.assignments import mark, marked, require_place
 from appliance.rosmop.compile.conversion import convert, number
@@ -19,33 +18,23 @@ ALGORITHMS = frozenset({"sort", "reverse", "accumulate"})
 """Functions of `<algorithm>` and `<numeric>` that take a vector from `begin` to `end`."""
 
 
-@dataclass(frozen=True)
-class Cursor(kinds.Index):
-    """A place in `vector`: before an element, or behind the last."""
-
-    vector: Value
-
-    def __str__(self) -> str:
-        return "an iterator"
-
-
 def moved(operator: str, left: Value, right: Value, position: Position) -> Value | None:
     """`begin + n`, `end - n`, `end - begin`; None if this is none of them."""
-    if not isinstance(left.type, Cursor) or operator not in ("+", "-"):
+    if left.vector is None or operator not in ("+", "-"):
         return None
     if kinds.is_number(right.type):
         function, distance = "k_after" if operator == "+" else "k_before", number(right.form, kinds.LONG)
-        return Value(form.Call(left.type, function, (left.form, distance)), position)
-    if isinstance(right.type, Cursor) and operator == "-":
+        return Value(form.Call(kinds.INDEX, function, (left.form, distance)), position, vector=left.vector)
+    if right.vector is not None and operator == "-":
         return Value(form.Call(kinds.LONG, "k_before", (left.form, right.form)), position)
     return None
 
 
 def begin_or_end(base: Value, name: str, position: Position) -> Value:
     """`v.begin()` or `v.end()`."""
-    kind = Cursor(base)
-    place = form.Literal(kind, 0) if name == "begin" else form.Call(kind, "l_len", (base.form,))
-    return Value(place, position)
+    begin = form.Literal(kinds.INDEX, 0)
+    place = begin if name == "begin" else form.Call(kinds.INDEX, "l_len", (base.form,))
+    return Value(place, position, vector=base)
 
 
 def erase(scope: Scope, base: Value, cursors: Sequence[Value], at: tuple[Position, int]) -> Value:
@@ -67,9 +56,9 @@ def insert(scope: Scope, base: Value, arguments: Sequence[Value], at: tuple[Posi
 def algorithm(scope: Scope, name: str, values: Sequence[Value], at: tuple[Position, int]) -> Value:
     """`std::sort(first, last)` and its like."""
     position, site = at
-    if len(values) < 2 or not isinstance(values[0].type, Cursor):
+    if len(values) < 2 or values[0].vector is None:
         raise SpecificationError.at(position, f"`{name}` goes from `v.begin()` to `v.end()`")
-    base = values[0].type.vector
+    base = values[0].vector
     kind = _vector(base, position)
     span = (base.form, values[0].form, _index(base, values[1]))
     if name == "accumulate":
@@ -91,8 +80,8 @@ def _sum(
             at[0], "`accumulate` goes from `v.begin()` to `v.end()`, with a number to start from"
         )
     kind = values[2].type
-    assert isinstance(values[0].type, Cursor)  # the caller has looked
-    element = _vector(values[0].type.vector, at[0]).element
+    assert values[0].vector is not None  # the caller has looked
+    element = _vector(values[0].vector, at[0]).element
     if not kinds.is_number(element):
         raise SpecificationError.at(at[0], f"{element} has no sum")
     wide = kinds.common(kind, element)
@@ -106,7 +95,7 @@ def _vector(base: Value, position: Position) -> kinds.Vector:
 
 
 def _index(base: Value, cursor: Value) -> form.Expression:
-    if not isinstance(cursor.type, Cursor) or cursor.type.vector.form != base.form:
+    if cursor.vector is None or cursor.vector.form != base.form:
         raise SpecificationError.at(cursor.position, "write `v.begin() + n` of the same vector")
     return cursor.form
 

@@ -7,6 +7,8 @@ its end says nothing), what `when` looks at, first values and `init`.
 
 from dataclasses import replace
 
+import msgspec
+
 from appliance.rosmop.compile.conversion import number
 from appliance.rosmop.compile.places import Value
 from appliance.rosmop.compile.scope import Comparison, Scope
@@ -49,7 +51,7 @@ def noted(scope: Scope, node: tree.Binary, left: Value, right: Value, value: Val
     now = [number(side, kinds.DOUBLE) for side in sides]
     answer = form.Conditional(
         kinds.BOOL,
-        replace(compare, left=sides[0], right=sides[1]),
+        msgspec.structs.replace(compare, left=sides[0], right=sides[1]),
         form.Sequence(kinds.BOOL, (_note(now, comparison.when_true), _TRUE), -1),
         form.Sequence(kinds.BOOL, (_note(now, comparison.when_false), _FALSE), -1),
     )

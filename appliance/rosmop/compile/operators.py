@@ -57,7 +57,7 @@ def binary(operator: str, operands: Operands) -> Value:
     cursor = cursors.moved(operator, operands.left, operands.right, operands.position)
     if cursor is not None:
         return cursor
-    if operator in ("==", "!=") and left == right and not isinstance(left, kinds.Void | cursors.Cursor):
+    if operator in ("==", "!=") and left == right and not isinstance(left, kinds.Void | kinds.Index):
         first, (one, other) = order.arguments(operands.scope, (operands.left, operands.right))
         return order.after(first, operands.value(form.Compare(operator, one.form, other.form, operands.site)))
     raise operands.refused(operator, _hint(left, right))

@@ -39,6 +39,7 @@ class Value:
 
     `place` is where the value lives if it can be assigned. `owned` means that nothing else refers to it, so it
     needs no copy. `constant` is known without running. `first` is what the form begins with, before its place is known.
+    Of an iterator, `vector` is what it is a place in.
     """
 
     form: Expression
@@ -47,6 +48,7 @@ class Value:
     owned: bool = True
     constant: bool | int | float | bytes | None = None
     first: tuple[Expression, ...] = ()
+    vector: "Value | None" = None
 
     @property
     def pure(self) -> bool:

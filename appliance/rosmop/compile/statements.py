@@ -11,7 +11,6 @@ from appliance.ros import names
 from appliance.rosmop.compile import calls, loops
 from appliance.rosmop.compile.assignments import write_store
 from appliance.rosmop.compile.conversion import condition, convert
-from appliance.rosmop.compile.cursors import Cursor
 from appliance.rosmop.compile.expressions import assignment, converted, elements, value_of
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.ir import form
@@ -118,7 +117,7 @@ def _deduced(scope: Scope, declarator: tree.Declarator) -> tuple[kinds.Type, for
     if declarator.value is None or isinstance(declarator.value, tree.Elements) or declarator.is_array:
         raise SpecificationError.at(declarator.position, "`auto` needs a value: `auto x = …;`")
     value = value_of(scope, declarator.value)
-    if isinstance(value.type, kinds.Void | Cursor):
+    if isinstance(value.type, kinds.Void | kinds.Index):
         raise SpecificationError.at(
             declarator.position, f"a variable cannot hold {value.type}; use the expression itself"
         )

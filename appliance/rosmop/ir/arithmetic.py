@@ -206,7 +206,7 @@ class Arithmetic(Parts):
         if machine_type(new.type) == I32:
             value += b"\xac" if is_signed(new.type) else b"\xad"
         old = self._value(moment)
-        if part.value == "sec":
+        if part.value == b"sec":
             return self._limited(node.type, self._of_parts(value, old + self._nanoseconds()))
         return self._limited(node.type, self._of_parts(old + self._seconds(), value))
 

@@ -19,9 +19,10 @@ something long; what exceeds them is a fault.
 
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass
 from types import UnionType
 from typing import Any, get_args
+
+import msgspec
 
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
@@ -32,27 +33,29 @@ CHARGED = 1024
 SHORT = 64
 """To compare with a string of so many bytes takes no longer than any other instruction."""
 
+
+class Node(msgspec.Struct, frozen=True, tag=True, tag_field="node", array_like=True):
+    """A part of the form, which can be sent as it is."""
+
+
 # Expressions
 
 
-@dataclass(frozen=True, slots=True)
-class Literal:
+class Literal(Node, frozen=True):
     """A constant. What is no value of the language (None, and names of parts of a time) has the type void."""
 
     type: Type
-    value: bool | int | float | bytes | str | None
+    value: bool | int | float | bytes | None
 
 
-@dataclass(frozen=True, slots=True)
-class Read:
+class Read(Node, frozen=True):
     """The value of a variable."""
 
     type: Type
     name: str
 
 
-@dataclass(frozen=True, slots=True)
-class Assign:
+class Assign(Node, frozen=True):
     """Give a variable a value; the value."""
 
     type: Type
@@ -60,8 +63,7 @@ class Assign:
     value: "Expression"
 
 
-@dataclass(frozen=True, slots=True)
-class Convert:
+class Convert(Node, frozen=True):
     """A number as one of another type: integers wrap, floating-point numbers are truncated toward zero within the
     limits (NaN is 0) or rounded, and what is not zero is true.
     """
@@ -70,8 +72,7 @@ class Convert:
     value: "Expression"
 
 
-@dataclass(frozen=True, slots=True)
-class Arithmetic:
+class Arithmetic(Node, frozen=True):
     """`+ - * / % & | ^ << >>` of numbers of this type; of a shift the right operand may have another.
 
     Integers wrap, shifts count modulo the width, integer division truncates and is a fault by zero.
@@ -84,8 +85,7 @@ class Arithmetic:
     site: int
 
 
-@dataclass(frozen=True, slots=True)
-class Unary:
+class Unary(Node, frozen=True):
     """`-`, `~` or `abs` of a number; integers wrap."""
 
     type: Type
@@ -93,8 +93,7 @@ class Unary:
     value: "Expression"
 
 
-@dataclass(frozen=True, slots=True)
-class Moment:
+class Moment(Node, frozen=True):
     """A sum or difference of times and durations, exact; a fault beyond what this type holds."""
 
     type: Type
@@ -104,8 +103,7 @@ class Moment:
     site: int
 
 
-@dataclass(frozen=True, slots=True)
-class MomentOf:
+class MomentOf(Node, frozen=True):
     """A time or duration of seconds and nanoseconds (`long`), exact; a fault beyond what this type holds."""
 
     type: Type
@@ -114,8 +112,7 @@ class MomentOf:
     site: int
 
 
-@dataclass(frozen=True, slots=True)
-class Compare:
+class Compare(Node, frozen=True):
     """`== != < > <= >=` of two values of the same type; vectors and messages are charged by what they hold."""
 
     operator: str
@@ -125,8 +122,7 @@ class Compare:
     type: Type = kinds.BOOL
 
 
-@dataclass(frozen=True, slots=True)
-class CompareTexts:
+class CompareTexts(Node, frozen=True):
     """The same of strings. The left one is charged by its length, unless one of them is known to be `short`, or the
     right one is a variable that holds few bytes.
     """
@@ -139,8 +135,7 @@ class CompareTexts:
     type: Type = kinds.BOOL
 
 
-@dataclass(frozen=True, slots=True)
-class Logical:
+class Logical(Node, frozen=True):
     """`and`, `or`: the right operand is looked at only if the left one does not decide."""
 
     operator: str
@@ -149,16 +144,14 @@ class Logical:
     type: Type = kinds.BOOL
 
 
-@dataclass(frozen=True, slots=True)
-class Not:
+class Not(Node, frozen=True):
     """The opposite."""
 
     value: "Expression"
     type: Type = kinds.BOOL
 
 
-@dataclass(frozen=True, slots=True)
-class Conditional:
+class Conditional(Node, frozen=True):
     """`test ? yes : no`."""
 
     type: Type
@@ -167,8 +160,7 @@ class Conditional:
     no: "Expression"
 
 
-@dataclass(frozen=True, slots=True)
-class Sequence:
+class Sequence(Node, frozen=True):
     """All items in order; the value is that of the chosen one."""
 
     type: Type
@@ -176,16 +168,14 @@ class Sequence:
     chosen: int
 
 
-@dataclass(frozen=True, slots=True)
-class Discard:
+class Discard(Node, frozen=True):
     """An expression for its effect alone."""
 
     value: "Expression"
     type: Type = kinds.VOID
 
 
-@dataclass(frozen=True, slots=True)
-class Item:
+class Item(Node, frozen=True):
     """A field of a message, or a part of what a function hands back, by its number."""
 
     type: Type
@@ -193,8 +183,7 @@ class Item:
     number: int
 
 
-@dataclass(frozen=True, slots=True)
-class Vector:
+class Vector(Node, frozen=True):
     """A vector of these elements, and so many zeros behind them."""
 
     type: kinds.Vector
@@ -202,15 +191,13 @@ class Vector:
     zeros: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Zero:
+class Zero(Node, frozen=True):
     """A zero value, newly made."""
 
     type: Type
 
 
-@dataclass(frozen=True, slots=True)
-class Copy:
+class Copy(Node, frozen=True):
     """A copy of a vector or message with all that is in it."""
 
     type: Type
@@ -218,8 +205,7 @@ class Copy:
     site: int
 
 
-@dataclass(frozen=True, slots=True)
-class Recast:
+class Recast(Node, frozen=True):
     """A vector of bytes (or of vectors of them) as one of bytes of another kind."""
 
     type: kinds.Vector
@@ -227,8 +213,7 @@ class Recast:
     site: int
 
 
-@dataclass(frozen=True, slots=True)
-class OfType:
+class OfType(Node, frozen=True):
     """What a function is handed to deal with values of a type: how to make a `zero`,
     `copy` one, `measure` its bytes.
     """
@@ -239,8 +224,7 @@ class OfType:
     type: Type = kinds.VOID
 
 
-@dataclass(frozen=True, slots=True)
-class Call:
+class Call(Node, frozen=True):
     """A call of a function of `functions.py`."""
 
     type: Type
@@ -249,8 +233,7 @@ class Call:
     site: int = -1
 
 
-@dataclass(frozen=True, slots=True)
-class Accumulate:
+class Accumulate(Node, frozen=True):
     """The sum of a vector's elements from `first` to before `last`, and of `start`: calculated in `wide`, each step
     converted to the type.
     """
@@ -264,8 +247,7 @@ class Accumulate:
     site: int
 
 
-@dataclass(frozen=True, slots=True)
-class Invoke:
+class Invoke(Node, frozen=True):
     """A call of a helper function; with references what comes back is the value and the references' new values.
 
     `depth`: of a recursive one, whether it is called from a recursive one (a level deeper) or begins.
@@ -277,8 +259,7 @@ class Invoke:
     depth: bool | None
 
 
-@dataclass(frozen=True, slots=True)
-class Format:
+class Format(Node, frozen=True):
     """Text by a template with conversions, as Python's `%` of bytes has them. `size` is how long it can be without its
     strings if that is to be charged, else None.
     """
@@ -290,8 +271,7 @@ class Format:
     type: Type = kinds.STRING
 
 
-@dataclass(frozen=True, slots=True)
-class Join:
+class Join(Node, frozen=True):
     """Strings one after the other."""
 
     pieces: "tuple[Expression, ...]"
@@ -299,8 +279,7 @@ class Join:
     type: Type = kinds.STRING
 
 
-@dataclass(frozen=True, slots=True)
-class Log:
+class Log(Node, frozen=True):
     """A line of output."""
 
     level: str
@@ -309,8 +288,7 @@ class Log:
     type: Type = kinds.VOID
 
 
-@dataclass(frozen=True, slots=True)
-class Throttle:
+class Throttle(Node, frozen=True):
     """Whether output at this site is due: the last was at least so many seconds ago."""
 
     seconds: "Expression"
@@ -318,15 +296,13 @@ class Throttle:
     type: Type = kinds.BOOL
 
 
-@dataclass(frozen=True, slots=True)
-class Now:
+class Now(Node, frozen=True):
     """The time at which the message was received."""
 
     type: Type = kinds.TIME
 
 
-@dataclass(frozen=True, slots=True)
-class Whole:
+class Whole(Node, frozen=True):
     """`MESSAGE`: all of it, with the fields that this action has assigned so far, which `Pending` has named."""
 
     type: kinds.Record
@@ -344,16 +320,14 @@ Expression = (
 # Statements
 
 
-@dataclass(frozen=True, slots=True)
-class Evaluate:
+class Evaluate(Node, frozen=True):
     """An expression for its effect."""
 
     site: int
     value: Expression
 
 
-@dataclass(frozen=True, slots=True)
-class If:
+class If(Node, frozen=True):
     """`if (test) yes else no`."""
 
     site: int
@@ -362,16 +336,14 @@ class If:
     no: "tuple[Statement, ...]"
 
 
-@dataclass(frozen=True, slots=True)
-class Loop:
+class Loop(Node, frozen=True):
     """A loop that only `Break` ends."""
 
     site: int
     body: "tuple[Statement, ...]"
 
 
-@dataclass(frozen=True, slots=True)
-class ForEach:
+class ForEach(Node, frozen=True):
     """Once for each element of a vector (also one that the body appends) or character of a string (as a byte)."""
 
     site: int
@@ -380,22 +352,19 @@ class ForEach:
     body: "tuple[Statement, ...]"
 
 
-@dataclass(frozen=True, slots=True)
-class Break:
+class Break(Node, frozen=True):
     """Leave the innermost loop."""
 
     site: int
 
 
-@dataclass(frozen=True, slots=True)
-class Continue:
+class Continue(Node, frozen=True):
     """The innermost loop's next turn."""
 
     site: int
 
 
-@dataclass(frozen=True, slots=True)
-class Select:
+class Select(Node, frozen=True):
     """Give a variable the number that the table has for a value, or the default."""
 
     site: int
@@ -405,8 +374,7 @@ class Select:
     default: int
 
 
-@dataclass(frozen=True, slots=True)
-class Return:
+class Return(Node, frozen=True):
     """The end of a helper function, with its value and those of its references."""
 
     site: int
@@ -414,55 +382,48 @@ class Return:
     references: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Leave:
+class Leave(Node, frozen=True):
     """The end of anything else. Of an event: whether it happened."""
 
     site: int
     happened: bool | None
 
 
-@dataclass(frozen=True, slots=True)
-class Charge:
+class Charge(Node, frozen=True):
     """Take so many instructions from the budget."""
 
     site: int
     instructions: int
 
 
-@dataclass(frozen=True, slots=True)
-class Allocate:
+class Allocate(Node, frozen=True):
     """Charge for so many bytes that will be made; None: as many as the message has, if they are many."""
 
     site: int
     size: int | None
 
 
-@dataclass(frozen=True, slots=True)
-class LimitDepth:
+class LimitDepth(Node, frozen=True):
     """A fault if this recursive function has been called too often within itself."""
 
     site: int
     name: str
 
 
-@dataclass(frozen=True, slots=True)
-class Drop:
+class Drop(Node, frozen=True):
     """The message is not relayed. `anyway`: there is one; else only if there is (a deadline brings none)."""
 
     site: int
     anyway: bool
 
 
-@dataclass(frozen=True, slots=True)
-class Reset:
+class Reset(Node, frozen=True):
     """The property begins anew when its handlers have run."""
 
     site: int
 
 
-@dataclass(frozen=True, slots=True)
-class Publish:
+class Publish(Node, frozen=True):
     """Publish a message; `name` is a variable for its bytes."""
 
     site: int
@@ -475,8 +436,7 @@ class Publish:
 # Fields of the message
 
 
-@dataclass(frozen=True, slots=True)
-class Spot:
+class Spot(Node, frozen=True):
     """A position: so many bytes behind a named one, or behind the start."""
 
     base: str | None
@@ -487,8 +447,7 @@ class Spot:
         return Spot(self.base, self.offset + more)
 
 
-@dataclass(frozen=True, slots=True)
-class AfterText:
+class AfterText(Node, frozen=True):
     """Name the position behind the string at `at`."""
 
     site: int
@@ -496,8 +455,7 @@ class AfterText:
     at: Spot
 
 
-@dataclass(frozen=True, slots=True)
-class Count:
+class Count(Node, frozen=True):
     """Name the number of elements of the array at `at`; a fault if so many, of `least` bytes each, are not there."""
 
     site: int
@@ -506,8 +464,7 @@ class Count:
     least: int
 
 
-@dataclass(frozen=True, slots=True)
-class AfterElements:
+class AfterElements(Node, frozen=True):
     """Name the position behind so many elements (a number, or a named one) of `size` bytes each."""
 
     site: int
@@ -517,8 +474,7 @@ class AfterElements:
     size: int
 
 
-@dataclass(frozen=True, slots=True)
-class Skip:
+class Skip(Node, frozen=True):
     """Name the position behind so many elements of variable size, each of which `skipper` measures (None: strings).
 
     They are charged; `inner` (within an element that is skipped) even if they are few.
@@ -532,8 +488,7 @@ class Skip:
     inner: bool
 
 
-@dataclass(frozen=True, slots=True)
-class NotPast:
+class NotPast(Node, frozen=True):
     """The event does not happen, and that is told, unless there are more elements than `index`."""
 
     site: int
@@ -541,8 +496,7 @@ class NotPast:
     index: int
 
 
-@dataclass(frozen=True, slots=True)
-class ReadNumbers:
+class ReadNumbers(Node, frozen=True):
     """Give variables the numbers or times at so many bytes behind `at`, in the order in which they stand there."""
 
     site: int
@@ -550,8 +504,7 @@ class ReadNumbers:
     fields: tuple[tuple[str, Type, int], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class ReadValue:
+class ReadValue(Node, frozen=True):
     """Give a variable the string, vector or message at `at`, and name the position behind it."""
 
     site: int
@@ -561,16 +514,14 @@ class ReadValue:
     type: Type
 
 
-@dataclass(frozen=True, slots=True)
-class Require:
+class Require(Node, frozen=True):
     """The event does not happen unless this is true."""
 
     site: int
     test: Expression
 
 
-@dataclass(frozen=True, slots=True)
-class Write:
+class Write(Node, frozen=True):
     """A field that gets a value (of the field's type) if `flag` is set; `end` names where one of variable size ends.
 
     `path` leads to it from the whole message: numbers of fields and elements, `sec` or `nsec` at the end.
@@ -583,8 +534,7 @@ class Write:
     path: tuple[int | str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Pending:
+class Pending(Node, frozen=True):
     """Name the fields that this action may assign, for `Whole`."""
 
     site: int
@@ -592,8 +542,7 @@ class Pending:
     writes: tuple[Write, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class WriteBack:
+class WriteBack(Node, frozen=True):
     """Put the fields that were assigned into the message, all of them or, with a fault, none; `name` is a variable for
     what is spliced. Of a dropped message none is written, and the event has happened.
     """
@@ -613,8 +562,7 @@ Statement = (
 # Functions
 
 
-@dataclass(frozen=True, slots=True)
-class Skipper:
+class Skipper(Node, frozen=True):
     """Where an element that begins at the position `p` ends."""
 
     name: str
@@ -622,8 +570,7 @@ class Skipper:
     end: Spot
 
 
-@dataclass(frozen=True, slots=True)
-class Function:
+class Function(Node, frozen=True):
     """A function: of an event (`message` is looked at; it happens from the statement `happens` on), a handler, a timer,
     a helper function, or a stage of the beginning.
 
@@ -641,8 +588,7 @@ class Function:
 # Programs
 
 
-@dataclass(frozen=True, slots=True)
-class Clock:
+class Clock(Node, frozen=True):
     """Of a property with a clock: the table where more than `within` ns have passed since it began, and for each state
     how long after that its deadline is (-1: it has none).
     """
@@ -652,8 +598,7 @@ class Clock:
     waits: tuple[int, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Handled:
+class Handled(Node, frozen=True):
     """The states of a property in which the handler of a category runs when they are entered, also from themselves."""
 
     category: str
@@ -661,8 +606,7 @@ class Handled:
     states: frozenset[int]
 
 
-@dataclass(frozen=True, slots=True)
-class Advance:
+class Advance(Node, frozen=True):
     """What an event does to a property: the next state for each of its states, -1 where the property has no table of
     states. `property` is its number among those with tables; None without one. `event` is the event's number in its
     specification. `handlers` run in their order, and may have it begin anew in its state `initial`. With a `clock`
@@ -677,8 +621,7 @@ class Advance:
     initial: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
+class Event(Node, frozen=True):
     """An event on a topic: its function, and the steps of its specification's properties when it has happened.
 
     `specification` counts from 0 among those of the topic.
@@ -689,8 +632,7 @@ class Event:
     advances: tuple[Advance, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Component:
+class Component(Node, frozen=True):
     """Specifications that share topics or variables, and nothing with others: the variables of each of them, how many
     properties with tables they have, and their topics (of services the request or response, by a name that no topic
     has) with the events on each, in order.
@@ -711,9 +653,9 @@ def nodes(root: object) -> Iterator[object]:
         node = waiting.pop()
         if isinstance(node, tuple):
             waiting += node
-        elif is_dataclass(node):
+        elif isinstance(node, msgspec.Struct):
             yield node
-            waiting += [getattr(node, field.name) for field in fields(node)]
+            waiting += [getattr(node, name) for name in node.__struct_fields__]
 
 
 def acts(root: Expression) -> bool:

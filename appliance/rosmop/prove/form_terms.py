@@ -842,7 +842,7 @@ class Meaning:
         old = self._value(moment, state)
         value = self._converted(self._value(new, state), new.type, kinds.Integer(64, True, "long"))
         seconds, rest = self._parts(old)
-        one, other = (value, rest) if part.value == "sec" else (seconds, value)
+        one, other = (value, rest) if part.value == b"sec" else (seconds, value)
         return self._of_parts(node.type, one, other, state)
 
     def _invoke(self, node: form.Invoke, state: State) -> Any:

@@ -37,8 +37,8 @@ def scaled(value: int, factor: float, site: int) -> int:
     return duration(nanoseconds(value / 1e9 * factor, site), site)
 
 
-def with_part(value: int, part: str, new: int, site: int) -> int:
+def with_part(value: int, part: bytes, new: int, site: int) -> int:
     """A time or duration after `value.sec = new` or `value.nsec = new`."""
     seconds, rest = divmod(value, BILLION)
-    result = new * BILLION + rest if part == "sec" else seconds * BILLION + new
+    result = new * BILLION + rest if part == b"sec" else seconds * BILLION + new
     return result if -MAX_TIME <= result <= MAX_TIME else time(result, site)

@@ -228,6 +228,6 @@ def _set(value: list[Any], path: tuple[int | str, ...], new: Any, site: int) -> 
         value = value[index]  # type: ignore[index]  # only the last is the part of a time
     if isinstance(last, str):
         place = above[-1]
-        value[place] = with_part(value[place], last, new, site)  # type: ignore[index]  # as above
+        value[place] = with_part(value[place], last.encode(), new, site)  # type: ignore[index]  # as above
     else:
         value[last] = new

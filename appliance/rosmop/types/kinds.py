@@ -5,37 +5,35 @@ A type is a value object; its text is how C++ writes it. How values are held whi
 and messages as lists (a message's fields in the order of its definition).
 """
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class Type:
-    """Any type."""
+class _Kind(msgspec.Struct, frozen=True, tag=True, tag_field="kind", array_like=True):
+    """What all types are."""
 
 
-@dataclass(frozen=True, slots=True)
-class Void(Type):
+class Void(_Kind, frozen=True):
     """No value."""
 
     def __str__(self) -> str:
         return "void"
 
 
-@dataclass(frozen=True, slots=True)
-class Index(Type):
+class Index(_Kind, frozen=True):
     """A place in a vector, which no variable holds."""
 
+    def __str__(self) -> str:
+        return "an iterator"
 
-@dataclass(frozen=True, slots=True)
-class Bool(Type):
+
+class Bool(_Kind, frozen=True):
     """`bool`."""
 
     def __str__(self) -> str:
         return "bool"
 
 
-@dataclass(frozen=True, slots=True)
-class Integer(Type):
+class Integer(_Kind, frozen=True):
     """An integer type; `name` is only for messages (`long` and `long long` are the same type)."""
 
     bits: int
@@ -66,8 +64,7 @@ class Integer(Type):
         return self.name
 
 
-@dataclass(frozen=True, slots=True)
-class Floating(Type):
+class Floating(_Kind, frozen=True):
     """`float` or `double`."""
 
     bits: int
@@ -76,51 +73,45 @@ class Floating(Type):
         return "float" if self.bits == 32 else "double"
 
 
-@dataclass(frozen=True, slots=True)
-class String(Type):
+class String(_Kind, frozen=True):
     """`std::string`."""
 
     def __str__(self) -> str:
         return "std::string"
 
 
-@dataclass(frozen=True, slots=True)
-class Characters(Type):
+class Characters(_Kind, frozen=True):
     """`char *` and `char name[n]`: a buffer of characters."""
 
     def __str__(self) -> str:
         return "char *"
 
 
-@dataclass(frozen=True, slots=True)
-class Time(Type):
+class Time(_Kind, frozen=True):
     """`ros::Time`."""
 
     def __str__(self) -> str:
         return "ros::Time"
 
 
-@dataclass(frozen=True, slots=True)
-class Duration(Type):
+class Duration(_Kind, frozen=True):
     """`ros::Duration`."""
 
     def __str__(self) -> str:
         return "ros::Duration"
 
 
-@dataclass(frozen=True, slots=True)
-class Vector(Type):
+class Vector(_Kind, frozen=True):
     """`std::vector<element>`, or with a `length` an array of exactly so many."""
 
-    element: Type
+    element: "Type"
     length: int | None = None
 
     def __str__(self) -> str:
         return f"std::vector<{self.element}>" if self.length is None else f"{self.element}[{self.length}]"
 
 
-@dataclass(frozen=True, slots=True)
-class Record(Type):
+class Record(_Kind, frozen=True):
     """A message type, `package/Type`."""
 
     name: str
@@ -129,8 +120,11 @@ class Record(Type):
         return self.name.replace("/", "::")
 
 
-VOID, BOOL, STRING, CHARACTERS, TIME, DURATION = (
-    Void(), Bool(), String(), Characters(), Time(), Duration()
+Type = Void | Index | Bool | Integer | Floating | String | Characters | Time | Duration | Vector | Record
+"""Any type."""
+
+VOID, BOOL, STRING, CHARACTERS, TIME, DURATION, INDEX = (
+    Void(), Bool(), String(), Characters(), Time(), Duration(), Index()
 )  # fmt: skip
 CHAR = Integer(8, True, "char")
 INT8 = Integer(8, True, "int8_t")

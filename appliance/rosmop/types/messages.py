@@ -4,7 +4,7 @@ The definitions are those of `appliance.ros`. A name that does not exist is refu
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from types import MappingProxyType
@@ -17,7 +17,7 @@ from appliance.rosmop.types.kinds import Type
 
 _COMPARED = 600  # names that a wrong one is compared with
 
-PRIMITIVES = MappingProxyType(
+PRIMITIVES: Mapping[str, Type] = MappingProxyType(
     {
         "bool": kinds.BOOL,
         "int8": kinds.INT8,
