@@ -46,9 +46,7 @@ def covered(
     marked = _Marked([parse(text, name) for name, text in texts.items()])
     counts: Counter[Item] = Counter()
     for recording in recordings:
-        monitors = MonitorSet(
-            compile_files(marked.files, definitions), marked.files, "drop", lambda: lambda: False
-        )
+        monitors = MonitorSet(compile_files(marked.files, definitions), "drop", lambda: lambda: False)
         # who explains tries runs, which are no part of the recording
         monitors.explain_when(lambda *_: False, lambda *_: False)
         watches = _watch(monitors)

@@ -21,7 +21,6 @@ Theory of operation:
 import math
 import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -103,15 +102,16 @@ class MonitorSet:
     def __init__(
         self,
         compiled: Compiled,
-        files: Sequence[tree.File],
         on_fault: OnFault,
         patience: Patience,
         trials: Sequence["MonitorSet"] = (),
         *,
         slices: int = LIMIT,
     ) -> None:
-        """`files` are all in their order; what is on trial in them is compiled in `trials`."""
-        self.files = tuple(files)
+        """`compiled` is all of them in their order; what is on trial is in `trials`."""
+        tried = {name for trial in trials for name in trial.names}
+        self.names: tuple[str, ...] = tuple(one.name for one in compiled.specifications)
+        compiled = compiled.part(frozenset(self.names).difference(tried)) if tried else compiled
         self.trials = trials
         self.tapped: list[Tapped] = []
         self._tapped_ways: frozenset[str] = frozenset()
@@ -120,15 +120,7 @@ class MonitorSet:
         self.interpreter = compiled.interpreter()
         self.on_fault: OnFault = on_fault
         self.patience = patience
-        nodes = {node.name: node for file in files for node in file.specifications}
-        self._order = tuple(nodes)
-        self._monitors = monitors_of(
-            compiled,
-            self.interpreter,
-            [nodes[specification.name] for specification in compiled.specifications],
-            0,
-            slices,
-        )
+        self._monitors = monitors_of(compiled, self.interpreter, 0, slices)
         self.steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
         self._execution = Execution(self.interpreter, on_fault)
@@ -179,21 +171,13 @@ class MonitorSet:
         compiled = compile_files(files, definitions, margins=margins)
         uses = {specification.name: specification.uses for specification in compiled.specifications}
         groups = [group for group in sharing(uses) if not group.isdisjoint(trials)]
-        if not groups:
-            return cls(compiled, files, on_fault, patience, slices=slices)
         tried = []
         for group in groups:
-            own = _part(files, group)
-            trial = cls(
-                compile_files(own, definitions, margins=margins), own, on_fault, trial_patience, slices=slices
-            )
+            trial = cls(compiled.part(group), on_fault, trial_patience, slices=slices)
             for monitor in trial._monitors:
                 monitor.context.most = TRIAL_BUDGET
             tried.append(trial)
-        others = compile_files(_part(files, set(uses).difference(*groups)), definitions, margins=margins)
-        return cls(
-            replace(others, warnings=compiled.warnings), files, on_fault, patience, tried, slices=slices
-        )
+        return cls(compiled, on_fault, patience, tried, slices=slices)
 
     # What there is
 
@@ -421,8 +405,8 @@ class MonitorSet:
             earlier, variables = known.get(monitor.name, (None, {}))
             if (
                 earlier is not None
-                and earlier.node == monitor.node
-                and (not redefined or redefined.isdisjoint(reached(monitor.node, self.definitions)))
+                and earlier.code.node == monitor.code.node
+                and (not redefined or redefined.isdisjoint(reached(monitor.code.node, self.definitions)))
             ):
                 self._take_over(monitor, earlier, variables)
             else:
@@ -536,8 +520,8 @@ class MonitorSet:
         """Which steps a message on which topic, or part of a service, takes."""
         steps: dict[str, list[Step]] = {}
         standing = {monitor.name: monitor.steps for monitor in self._monitors if monitor.enabled}
-        standing |= {trial._order[0]: self._taps(trial) for trial in self.trials}
-        for step in (step for name in self._order for step in standing.get(name, ())):
+        standing |= {trial.names[0]: self._taps(trial) for trial in self.trials}
+        for step in (step for name in self.names for step in standing.get(name, ())):
             steps.setdefault(step.event.way or "", []).append(step)
         for found in steps.values():
             acting = [step for step in found if not isinstance(step, _Tap)]
@@ -571,16 +555,3 @@ class MonitorSet:
             return False
 
         return tap
-
-
-def _part(files: Sequence[tree.File], names: Collection[str]) -> list[tree.File]:
-    """The files with these of their specifications only."""
-    return [
-        replace(
-            file,
-            specifications=tuple(
-                specification for specification in file.specifications if specification.name in names
-            ),
-        )
-        for file in files
-    ]

@@ -13,7 +13,6 @@ from appliance.rosmop.logics.interface import Run
 from appliance.rosmop.runtime.context import Context
 from appliance.rosmop.runtime.wire import Message
 from appliance.rosmop.slices import Slice, Slices
-from appliance.rosmop.syntax import tree
 from appliance.rosmop.why import TRAIL, Bound, Exits, Steps, history_of
 
 FAILING_AFTER = 10
@@ -83,7 +82,6 @@ class Monitor:
     """A running specification."""
 
     code: SpecificationCode
-    node: tree.Specification
     context: Context
     properties: tuple[RunningProperty, ...]
     steps: tuple[Step, ...] = ()
@@ -123,20 +121,14 @@ class Monitor:
 def monitors_of(
     compiled: Compiled,
     interpreter: Interpreter,
-    nodes: list[tree.Specification],
     time_ns: int,
     slices: int,
 ) -> tuple[Monitor, ...]:
     """The running forms of compiled specifications, in their initial state; each with at most so many slices."""
-    return tuple(
-        _monitor(interpreter, code, node, time_ns, slices)
-        for code, node in zip(compiled.specifications, nodes, strict=True)
-    )
+    return tuple(_monitor(interpreter, code, time_ns, slices) for code in compiled.specifications)
 
 
-def _monitor(
-    interpreter: Interpreter, code: SpecificationCode, node: tree.Specification, time_ns: int, slices: int
-) -> Monitor:
+def _monitor(interpreter: Interpreter, code: SpecificationCode, time_ns: int, slices: int) -> Monitor:
     function = interpreter.function
     properties = tuple(
         RunningProperty(
@@ -148,7 +140,7 @@ def _monitor(
         )
         for index, declared in enumerate(code.properties)
     )
-    monitor = Monitor(code, node, interpreter.contexts[code.context], properties)
+    monitor = Monitor(code, interpreter.contexts[code.context], properties)
     if code.slicing is not None:
         monitor.slices = Slices(code, interpreter.variables, slices)
     steps = [

@@ -7,7 +7,7 @@ from itertools import islice
 
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.compile.program import groups
-from appliance.rosmop.compile.specification import Compiled, compile_files
+from appliance.rosmop.compile.specification import Compiled
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.ir.feed import module_of
 from appliance.rosmop.ir.values import Values
@@ -144,7 +144,7 @@ FAULTY = {
 def compiled(text: str, known: Definitions | None = None) -> Compiled:
     """One specification."""
     known = definitions() if known is None else known
-    return compile_files(MonitorSet.load({"a.rv": text}, known).files, known)
+    return MonitorSet.load({"a.rv": text}, known).compiled
 
 
 def faulty(text: str, every: int = 1) -> Iterator[tuple[str, str]]:

@@ -114,6 +114,7 @@ class Loop:
 class Publication:
     """A topic that a specification publishes, and where it says so."""
 
+    specification: str
     topic: str
     type: str
     position: Position
@@ -272,7 +273,7 @@ class Scope:
 
     def published(self, topic: str, kind: str, position: Position) -> None:
         """Note that the topic is published."""
-        self.shared.publications.append(Publication(topic, kind, position))
+        self.shared.publications.append(Publication(self.names.name, topic, kind, position))
 
     # Statements
 

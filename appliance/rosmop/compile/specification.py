@@ -3,8 +3,8 @@
 Specifications of one set see each other's variables. Everything wrong with any of them is found in one pass.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 
@@ -72,7 +72,7 @@ class SpecificationCode:
     `start` are the functions by which it begins: constants and zeros, first values, `init`.
     """
 
-    name: str
+    node: tree.Specification
     file: str
     hold: bool
     start: tuple[str, ...]
@@ -86,6 +86,11 @@ class SpecificationCode:
     """The comparisons that are noted, in the order of the text."""
     slicing: Slicing | None = None
     """Of a parametric specification: what its slices differ in."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.node.name
 
 
 @dataclass(eq=False)
@@ -105,6 +110,14 @@ class Compiled:
         """What runs them, on a state of its own."""
         contexts = {one.context: one.name for one in self.specifications}
         return Interpreter(self.functions, self.sites, self.types, contexts, self.messages)
+
+    def part(self, names: Collection[str]) -> "Compiled":
+        """These of the specifications only; all that share variables with one of them must be among them."""
+        return replace(
+            self,
+            specifications=tuple(one for one in self.specifications if one.name in names),
+            publications=tuple(one for one in self.publications if one.specification in names),
+        )
 
     def is_stamped(self, message_type: str | None) -> bool:
         """Whether messages of a type begin with a `std_msgs/Header`."""
@@ -227,7 +240,7 @@ def _compile(
     variables = {variable.name: variable.code for variable in names.variables.values()}
     uses = frozenset(names.uses)
     return SpecificationCode(
-        specification.name,
+        specification,
         file.name,
         any(modifier.parts == ("hold",) for modifier in specification.modifiers),
         start,

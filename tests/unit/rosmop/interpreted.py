@@ -6,7 +6,7 @@ from appliance.rosmop.outcomes import Fault, Outcome
 
 def beside(monitors: MonitorSet) -> MonitorSet:
     """The same set with a state of its own and no module; not started."""
-    return MonitorSet(monitors.compiled, monitors.files, monitors.on_fault, monitors.patience)
+    return MonitorSet(monitors.compiled, monitors.on_fault, monitors.patience)
 
 
 def check_same(one: Outcome, other: Outcome) -> None:

@@ -44,7 +44,8 @@ class Both:
         self.tried, self.on_fault = tried, on_fault
         place = next(at for at, text in enumerate(texts.values()) if text.startswith(tried))
         others = {file: text for file, text in texts.items() if not text.startswith(tried)}
-        self.enabled = MonitorSet.load(dict(list(texts.items())[: place + 1]), definitions(), on_fault)
+        self.texts = dict(list(texts.items())[: place + 1])
+        self.enabled = MonitorSet.load(self.texts, definitions(), on_fault)
         self.with_trial = MonitorSet.load(texts, definitions(), on_fault, trials=[tried])
         self.without = MonitorSet.load(others, definitions(), on_fault)
         self.stories = [self.story(self.enabled.start(0)), list(self._start())]
@@ -75,9 +76,7 @@ class Both:
     def promote(self, time: int) -> None:
         """The one on trial comes into force, with its state."""
         self.check(time)
-        following = MonitorSet.load(
-            {file.name: file.text for file in self.enabled.files}, definitions(), self.on_fault
-        )
+        following = MonitorSet.load(self.texts, definitions(), self.on_fault)
         following.succeed(self.with_trial, time)
         assert not following.began
         self.with_trial = following
