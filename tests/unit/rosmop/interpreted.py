@@ -1,12 +1,24 @@
 """The same monitors once more, whose messages go nowhere but through the interpreter: what a module is held against."""
 
+from collections.abc import Mapping
+from dataclasses import replace
+
+import msgspec
+
 from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.ir import form
 from appliance.rosmop.outcomes import Fault, Outcome
 
 
+def sent(functions: Mapping[str, form.Function]) -> dict[str, form.Function]:
+    """The form as another process reads it."""
+    return msgspec.msgpack.decode(msgspec.msgpack.encode(functions), type=dict[str, form.Function])
+
+
 def beside(monitors: MonitorSet) -> MonitorSet:
-    """The same set with a state of its own and no module; not started."""
-    return MonitorSet(monitors.compiled, monitors.on_fault, monitors.patience)
+    """The same set, of the form as it is sent, with a state of its own and no module; not started."""
+    compiled = replace(monitors.compiled, functions=sent(monitors.compiled.functions))
+    return MonitorSet(compiled, monitors.on_fault, monitors.patience)
 
 
 def check_same(one: Outcome, other: Outcome) -> None:

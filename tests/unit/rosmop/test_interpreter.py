@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -11,6 +12,7 @@ from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.execution import OnFault
+from appliance.rosmop.ir import form
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
@@ -54,6 +56,29 @@ def test_random_specifications_and_messages(seed: int, on_fault: OnFault, step_n
     except SpecificationError:
         return  # a draw that means nothing
     check(monitors, together, step_ns)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ["Nothing", 1],
+        ["Break", "1"],
+        ["Break"],
+        ["Evaluate", 1, ["Read", ["Integer", 8, True], "x"]],
+        ["Evaluate", 1, ["Break", 1]],
+        ["Evaluate", 1, ["Literal", ["Void"], "text"]],
+    ],
+    ids=["kind", "type", "missing", "missing in a type", "statement as a value", "no value of the language"],
+)
+def test_what_is_no_form_is_not_read(wrong: list[object]) -> None:
+    """Whatever is sent in its place: what is read is what the form can be, throughout."""
+    statement = msgspec.msgpack.Decoder(form.Statement)
+    assert statement.decode(msgspec.msgpack.encode(["Break", 1])) == form.Break(1)
+    with pytest.raises(msgspec.ValidationError):
+        statement.decode(msgspec.msgpack.encode(wrong))
+    deep = b"\x93\xa4Loop\x01\x91" * 100_000 + b"\x92\xa5Break\x01"
+    with pytest.raises(RecursionError):
+        statement.decode(deep)
 
 
 def shipped() -> MonitorSet:
