@@ -14,15 +14,17 @@ def test_no_slot_can_stay_unfilled() -> None:
     Such a slot, forgotten, does nothing and says nothing. Make it an argument of the constructor, which cannot be
     forgotten.
     """
-    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in SOURCES.rglob("*.py")}
+    begun: dict[object, set[str]] = {}
     filled: dict[str, set[object]] = {}
-    for path, tree in trees.items():
+    for path in SOURCES.rglob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        begun[path.relative_to(SOURCES)] = set(slots(tree))
         for name in set_elsewhere(tree):
-            filled.setdefault(name, set()).add(path)
+            filled.setdefault(name, set()).add(path.relative_to(SOURCES))
     unfilled = [
-        f"{path.relative_to(SOURCES)}: {name}, filled in {sorted(map(str, others))}"
-        for path, tree in trees.items()
-        for name in slots(tree)
+        f"{path}: {name}, filled in {sorted(map(str, others))}"
+        for path, names in begun.items()
+        for name in names
         if (others := filled.get(name, set()) - {path})
     ]
     assert unfilled == []
@@ -53,7 +55,7 @@ def slots(tree: ast.Module) -> Iterator[str]:
     for node in ast.walk(tree):
         match node:
             case ast.AnnAssign(target=target, annotation=annotation, value=ast.expr() as value):
-                if "Callable" in ast.unparse(annotation) and empty(value):
+                if empty(value) and "Callable" in ast.unparse(annotation):
                     yield from own(target)
             case ast.Assign(targets=[ast.Attribute() as target], value=ast.Lambda() as value) if empty(value):
                 yield from own(target)

@@ -279,7 +279,7 @@ HARD = {
 @pytest.mark.parametrize("on_fault", ["drop", "pass"])
 def test_hard_cases_are_the_same_together(name: str, on_fault: str) -> None:
     """Changes that are taken back, faults in the middle, drops after changes: as one by one."""
-    for seed in range(8):
+    for seed in range(examples(18)):
         messages = Messages(seed)
         agree({"x.rv": HARD[name]}, definitions(), [messages.traffic() for _ in range(10)], on_fault)
 

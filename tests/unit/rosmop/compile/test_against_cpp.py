@@ -12,6 +12,7 @@ from random import Random
 import pytest
 
 from appliance.rosmop.runtime.numbers import MATH
+from tests.support.examples import examples
 from tests.support.requirements import need_program
 from tests.unit.rosmop.acting import act, load, message
 
@@ -205,7 +206,7 @@ def printed(body: str, before: str, directory: Path, *options: str) -> list[str]
 @pytest.mark.parametrize(
     "make", [(program, FUNCTIONS), (vector_program, VECTORS)], ids=["numbers", "vectors"]
 )
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(examples(12)))
 def test_the_language_agrees_with_a_compiler(
     seed: int, make: tuple[Callable[[Random], str], str], tmp_path: Path
 ) -> None:

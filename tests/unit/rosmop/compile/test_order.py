@@ -5,6 +5,7 @@ from random import Random
 
 import pytest
 
+from tests.support.examples import examples
 from tests.unit.rosmop.acting import act, refused_action
 from tests.unit.rosmop.compile.test_against_cpp import printed
 from tests.unit.rosmop.test_walks import Fed, plain
@@ -185,7 +186,7 @@ def check(programs: Programs, count: int, directory: Path | None) -> Fed:
 
 
 @pytest.mark.parametrize(("numbers", "taken"), [(True, 30), (False, 3)], ids=["numbers", "others"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(examples(12)))
 def test_effects_come_in_the_order_of_the_compiler(
     seed: int, *, numbers: bool, taken: int, tmp_path: Path
 ) -> None:
