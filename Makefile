@@ -10,7 +10,7 @@ BIN := .venv/bin
 PYTEST := $(BIN)/pytest
 CHECKED := appliance tests examples benchmarks distribution
 LONG_PROOFS := $(addprefix tests/proofs/test_,histories.py insertion_mutants.py insertion_traces.py insertion_at_large.py certifier.py events.py)
-LONG_UNIT := $(shell grep --invert-match '^\#' tests/long.txt)
+LONG_UNIT := $(shell grep '^tests/unit' tests/long.txt)
 # What fetches packages needs this machine's network: a worker of pytest-xdist has none but a loopback of its own.
 CONTAINERS := tests/system/containers
 FETCHING := tests/system/vm tests/system/test_examples.py tests/system/test_generated_client.py
@@ -53,7 +53,7 @@ test: setup ## check, the long unit tests, and those with real ROS nodes (root: 
 
 # Tests with real nodes wait half of their time: what computes has the processors then, and after them, for it is nice.
 units: build/collected
-	nice $(PYTEST) tests/proofs/test_insertion.py tests/unit -n logical --dist loadfile --quiet --durations=10
+	nice $(PYTEST) tests/proofs/test_insertion.py tests/unit -n logical --dist loadfile --no-loadscope-reorder --quiet --durations=10
 
 nodes: build/collected
 	$(PYTEST) tests/integration -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10

@@ -130,7 +130,9 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What tests/outside.toml lists is tried a second time when it fails; nothing else is."""
+    """What tests/outside.toml lists is tried a second time when it fails; nothing else is. tests/long.txt is first."""
+    long = set(Path(__file__).with_name("long.txt").read_text(encoding="utf-8").splitlines())
+    items.sort(key=lambda item: item.nodeid.partition("::")[0] not in long)
     listed = outside()
     for item in items:
         if item.nodeid.partition("[")[0] in listed:

@@ -45,6 +45,7 @@ def test_only_what_is_listed_is_tried_again(tmp_path: Path) -> None:
     ):
         text = FAILS_ONCE.format(name=function, tried=str(tmp_path / function))
         (tmp_path / file).write_text(text)
+    (tmp_path / "tests/long.txt").write_text("tests/test_product.py\n")
     (tmp_path / "pyproject.toml").symlink_to(ROOT / "pyproject.toml")
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "tests"],
@@ -57,6 +58,15 @@ def test_only_what_is_listed_is_tried_again(tmp_path: Path) -> None:
     assert f"RERUN {listed}" in done.stdout
     assert " ".join(reason.split()) in done.stdout
     assert (tmp_path / "test_of_the_product").read_text() == "x"
+    assert done.stdout.index("tests/test_product.py") < done.stdout.index(listed.partition("::")[0]), (
+        "long first"
+    )
+
+
+def test_every_file_that_takes_long_is_there() -> None:
+    """One that was renamed is named anew in tests/long.txt."""
+    names = (TESTS / "long.txt").read_text(encoding="utf-8").splitlines()
+    assert [name for name in names if not name.startswith("#") and not (ROOT / name).is_file()] == []
 
 
 def _exists(path: str, name: str) -> bool:
