@@ -134,8 +134,7 @@ class _Operator(ABC):
     def take(self, now: int) -> None:
         """Look at the event."""
 
-    @abstractmethod
-    def settle(self) -> None:
+    def settle(self) -> None:  # noqa: B027  two have open operands, and something to decide then
         """Decide what can be, now that operands are decided."""
 
     def hear(self, value: bool) -> None:
@@ -165,9 +164,6 @@ class _Until(_Operator):
         if not self.run.value(self.left):
             while rows:
                 self.run.decide(rows.popleft().cell, False)
-
-    def settle(self) -> None:
-        raise AssertionError
 
     def pass_by(self, time: int) -> None:
         while self.rows and self.rows[0].time + self.high <= time:
@@ -227,7 +223,7 @@ class _OpenUntil(_Rows):
             self.hopes.append(row)
         if row.right is True or row.left is False:
             self.noted = True
-            self.run.look_at(self)
+            self.run.changed.add(self)
 
     def hear(self, value: bool) -> None:
         self.noted |= value or self.left in self.run.later
@@ -352,9 +348,6 @@ class _OpenPreviously(_Operator):
         self.before, self.time = self.run.value(self.left), now
         _use(self.before, self)
 
-    def settle(self) -> None:
-        """Nothing to do: what asked has the cell itself."""
-
 
 class _Next(_Operator):
     """`next`: the rows ask about the event before; `fresh` are those of the event that happens now."""
@@ -374,9 +367,6 @@ class _Next(_Operator):
                 row.cell.stand_for("or", (value,))
             else:
                 self.run.decide(row.cell, value)
-
-    def settle(self) -> None:
-        raise AssertionError
 
     def pass_by(self, time: int) -> None:
         while self.before and self.before[0].time + self.high <= time:
@@ -479,7 +469,7 @@ class BoundedRun:
         self._places: tuple[int, ...] = ()
         self._values: dict[int, Value] = {}
         self._decided: list[Cell] = []
-        self._looked_at: set[_Operator] = set()
+        self.changed: set[_Operator] = set()
         self._told: dict[bool, int] = {}
         self._about: dict[bool, int] = {}
 
@@ -553,18 +543,14 @@ class BoundedRun:
             cell.value = value
             self._decided.append(cell)
 
-    def look_at(self, operator: _Operator) -> None:
-        """Something has changed for this one."""
-        self._looked_at.add(operator)
-
     def _tell(self) -> Categories:
         """Let everybody know what is decided; the verdicts that come of it."""
-        while self._decided or self._looked_at:
+        while self._decided or self.changed:
             while self._decided:
                 self._pass_on(self._decided.pop())
-            if self._looked_at:
-                innermost = min(self._looked_at, key=lambda operator: operator.number)
-                self._looked_at.remove(innermost)
+            if self.changed:
+                innermost = min(self.changed, key=lambda operator: operator.number)
+                self.changed.remove(innermost)
                 innermost.settle()
         told, self._told = self._told, {}
         self._about = told
@@ -581,7 +567,7 @@ class BoundedRun:
         for user in cell.users:
             if not isinstance(user, Cell):
                 user.hear(cell.value)
-                self._looked_at.add(user)
+                self.changed.add(user)
             elif user.wanted:  # another user may have decided it a moment ago
                 value = user.hear(cell.value)
                 if value is not None:

@@ -282,7 +282,8 @@ class _Fold:
 
 def compile_past(source: Source, formula: Formula) -> CompiledProperty:
     """The monitor of a past formula: tables where they are finite and small, else the program, folded."""
-    folded = fold(program := Program(formula, source.events), [program.result])
+    program = Program(formula, source.events)
+    folded = fold(program, [program.result])
     bounds = [found for found in folded.bounds if found is not None]
     named = event_names(formula)
     of_event, classes = letter_classes(source.events, named)
@@ -290,10 +291,10 @@ def compile_past(source: Source, formula: Formula) -> CompiledProperty:
     try:
         if not bounds:
             return FiniteProperty(source, VERDICTS, spread(_table(folded, letters), of_event))
-        if len(bounds) == 1 and (bounds[0][0] == 0 or bounds[0][1] is None):
+        low, high = bounds[0]
+        if len(bounds) == 1 and (low == 0 or high is None):
             late = [len(classes) + letter for letter in of_event]
             automaton = spread(_table(folded, letters, clocked=True), [*of_event, *late])
-            low, high = bounds[0]
             return ClockedPast(source, automaton, low - 1 if high is None else high)
     except TooManyStatesError:
         pass
