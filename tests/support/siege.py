@@ -92,7 +92,7 @@ class Crowd:
                 sock.connect_ex((APPLIANCE, port))
                 coming.append(sock)
             waiting = set(coming)
-            deadline = time.monotonic() + 1
+            deadline = time.monotonic() + allowed(1.0)  # what the firewall drops answers nothing
             while waiting and time.monotonic() < deadline:
                 poll = select.poll()
                 by_number = {sock.fileno(): sock for sock in waiting}

@@ -16,6 +16,10 @@ def main():
     init_node("action_server")
 
     def work(goal):
+        # The client sees its connections before this side has them: what is published in between reaches nobody.
+        heard = (server.action_server.feedback_pub, server.action_server.result_pub)
+        while not all(topic.get_num_connections() for topic in heard) and not rospy.is_shutdown():
+            rospy.sleep(0.01)
         for number in range(goal.goal):
             if server.is_preempt_requested() or rospy.is_shutdown():
                 server.set_preempted(TestResult(result=number))
