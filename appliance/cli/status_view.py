@@ -45,6 +45,9 @@ def lacking_walls(rows: Sequence[ProcessInfo]) -> str | None:
 
 def doubted_clock(clock: ClockState) -> str | None:
     """Why the times of records cannot be believed; None: they can."""
+    if clock.before_program_seconds:
+        days = clock.before_program_seconds / 86_400
+        return f"wrong: it stands {days:.0f} days before this program was made; set it before hosts get certificates"
     if clock.behind_seconds:
         return f"set back: it stands {clock.behind_seconds:.0f} s before the last record"
     if clock.synchronised is None:

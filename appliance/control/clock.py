@@ -1,8 +1,8 @@
 """Whether the times of the records can be believed: for status, metrics, and the log itself. It blocks nothing.
 
-Three things are looked at: whether a time service keeps the machine's clock (the supervisor tells), whether the clock
-stands before the last record of the log, which it does after it was set back, also while the appliance was off, and
-whether it went further than time has passed.
+Four things are looked at: whether a time service keeps the machine's clock (the supervisor tells), whether the clock
+stands before the last record of the log, which it does after it was set back, also while the appliance was off,
+whether it went further than time has passed, and whether it stands before this program was made.
 """
 
 import asyncio
@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 from appliance.audit_trail import AuditTrail
 from appliance.channel.answers.status import ClockState
+from appliance.shipped import before_program
 
 _LOOK_SECONDS = 10.0
 _STEP_SECONDS = 2.0  # less is what a time service mends
@@ -48,7 +49,7 @@ class Clock:
     def state(self) -> ClockState:
         """As it is now."""
         behind = self._behind()
-        return ClockState(self._synchronised, behind if behind > _STEP_SECONDS else 0.0)
+        return ClockState(self._synchronised, behind if behind > _STEP_SECONDS else 0.0, before_program())
 
     async def watch(self) -> None:
         """Look every ten seconds whether it was set."""

@@ -22,7 +22,7 @@ READERS = {
     "a span that goes on over restarts of the machine, which has no other clock": [
         "hosts/self_service.py", "store/revisions.py",
     ],
-    "whether the wall clock can be believed": ["ages.py", "control/clock.py"],
+    "whether the wall clock can be believed": ["ages.py", "control/clock.py", "shipped.py"],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/moments.py", "cli/audit/filter.py", "cli/evidence.py", "cli/monitor/offline.py", "cli/monitor/recorder.py",
         "cli/policy/learning.py", "cli/protect.py", "cli/record.py", "cli/status.py", "cli/status_view.py",

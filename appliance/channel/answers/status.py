@@ -125,6 +125,9 @@ class ClockState(msgspec.Struct, frozen=True):
     behind_seconds: Annotated[
         float, told("how long the clock stands before the last record: it was set back; 0: it does not")
     ]
+    before_program_seconds: Annotated[
+        float, told("how long it stands before this program was made: it was never set; 0: it does not")
+    ] = 0.0
 
 
 class AuditState(msgspec.Struct, frozen=True):

@@ -19,7 +19,7 @@ from appliance.policy.cases import run_cases
 from appliance.policy.findings import PolicyError
 from appliance.policy.judgement import Known, judge
 from appliance.policy.policy import Policy
-from appliance.shipped import SHIPPED
+from appliance.shipped import SHIPPED, before_program
 from appliance.site_keys import read_signature
 from appliance.specifications.files import SpecificationsRefusedError, check, read_folder
 from appliance.supervisor.state import foreign
@@ -174,6 +174,12 @@ def _space(state: Path) -> Iterator[Found]:
 
 
 def _clock(state: Path) -> Iterator[Found]:
+    before = before_program()
+    if before:
+        yield fail(
+            "clock", f"it stands {before / 86_400:.0f} days before this program was made", "set the clock"
+        )
+        return
     log = state / "control" / "audit.db"
     if not os.access(log, os.R_OK):
         return

@@ -27,7 +27,7 @@ def test_what_the_kernel_says_is_told(appliance: Appliance) -> None:
     """Status and metrics have it, and the log, once, if it is wrong; nodes are served in any case."""
     known = clock_is_synchronised()
     status = json.loads(appliance.rosrv("status", "--json").stdout)
-    assert status["clock"] == {"synchronised": known, "behind_seconds": 0.0}
+    assert status["clock"] == {"synchronised": known, "behind_seconds": 0.0, "before_program_seconds": 0.0}
     value = {None: "-1.0", False: "0.0", True: "1.0"}[known]
     assert f"rosrv_clock_synchronised {value}" in appliance.rest().get("/metrics").body.decode()
     if known is False:

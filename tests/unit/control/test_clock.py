@@ -1,11 +1,15 @@
 """Tests of what control says of the machine's clock: once, and it blocks nothing."""
 
+import time
+from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
+from appliance import shipped
 from appliance.audit_trail import AuditTrail
 from appliance.channel.answers.status import ClockState
+from appliance.cli.status_view import doubted_clock
 from appliance.control.clock import Clock
 
 
@@ -62,3 +66,19 @@ def test_each_step_forward_is_recorded(trail: Trail) -> None:
     for started[0] in (1000.0, 1001.0, 4600.0, 4600.0, 1000.0, 1003.0):
         clock.look()
     assert trail.events == ["clock set forward"] * 2
+
+
+@pytest.mark.parametrize(
+    ("days", "said"), [(0.5, None), (2000.0, "wrong: it stands 2000 days before this program")]
+)
+def test_a_clock_that_stands_before_the_program_was_made_is_told(
+    trail: Trail, monkeypatch: pytest.MonkeyPatch, days: float, said: str | None
+) -> None:
+    """A machine that has not asked for the time yet: there is no record that it could be held against."""
+    made = Path(shipped.__file__).stat().st_mtime
+    clock = Clock(cast(AuditTrail, trail), lambda: 0.0)
+    clock.told(True)
+    monkeypatch.setattr(time, "time", lambda: made - days * 86_400)
+    told = doubted_clock(clock.state())
+    assert (told or "").startswith(said or "")
+    assert (told is None) is (said is None)
