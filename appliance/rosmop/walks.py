@@ -24,12 +24,12 @@ from appliance.rosmop.ir.kept import KeptMessage
 from appliance.rosmop.ir.layout import POSITION, REST, ROOM, SURE, UNDO, Cells
 from appliance.rosmop.ir.output import HEAD
 from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
-from appliance.rosmop.ir.values import Values, struct_code
+from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
 from appliance.rosmop.outcomes import Outcome, Verdict
 from appliance.rosmop.runtime.context import Context, LogLine, Published
-from appliance.rosmop.runtime.wire import Buffer
+from appliance.rosmop.runtime.wire import Buffer, moments, numbers, put_moments, put_numbers
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.why import ClockedSteps, Exits
@@ -186,12 +186,19 @@ class Home:
         self._memory[buffer : buffer + len(text)] = text
         return buffer | len(text) << 32
 
-    def _entered_vector(self, elements: Sequence[Any], buffer: int, code: str) -> int:
+    def _entered_vector(self, elements: list[Any], buffer: int, code: str) -> int:
         """The same of a vector, with the number of its elements."""
-        packed = struct.Struct(f"<{len(elements)}{code}")
-        if packed.size > ROOM:
+        if len(elements) * struct_size(code) > ROOM:
             return BEYOND << 32
-        packed.pack_into(self._memory, buffer, *elements)
+        packed = bytearray()
+        try:
+            if len(code) == 2:
+                put_moments(elements, code[0], packed)
+            else:
+                put_numbers(elements, code, packed)
+        except struct.error:
+            return BEYOND << 32  # a time that no message can have
+        self._memory[buffer : buffer + len(packed)] = packed
         return buffer | len(elements) << 32
 
     def hasten(self) -> None:
@@ -222,11 +229,12 @@ class Home:
         for place, _, code in self._vectors:
             name = self._names[place]
             at, count = found[name] & _ADDRESS, found[name] >> 32
-            found[name] = (
-                self._values[name]
-                if count == BEYOND
-                else [*struct.unpack_from(f"<{count}{code}", self._memory, at)]
-            )
+            if count == BEYOND:
+                found[name] = self._values[name]
+            elif len(code) == 2:
+                found[name] = moments(self._memory, at, count, code[0])[0]
+            else:
+                found[name] = numbers(self._memory, at, count, code, struct_size(code))[0]
         for name, kept in self._records.items():
             found[name] = kept.left(self._memory, self._values[name])
         self._values.update(found)

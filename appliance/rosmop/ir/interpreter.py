@@ -659,7 +659,8 @@ class _Maker:
             return self._both(compare, node.left, node.right)
         left, right, measure = self.value(node.left), self.value(node.right), self._values.measure(kind)
         context, site = self._context, node.site
-        return lambda v: compare(vectors.weighed(context, left(v), measure, site), right(v))
+        equal = node.operator == "=="
+        return lambda v: vectors.same(vectors.weighed(context, left(v), measure, site), right(v)) is equal
 
     def _compare_texts(self, node: form.CompareTexts) -> _Value:
         compare, context, site = _CALCULATED[node.operator], self._context, node.site

@@ -1,7 +1,7 @@
 """A part of the form as WebAssembly: numbers, conditions, loops, what stands in the message, numbers put there, drops.
 
 Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
-has a fixed size (`places.py`); strings are kept (`texts.py`), vectors of numbers are kept, made and changed
+has a fixed size (`places.py`); strings are kept (`texts.py`), vectors of numbers and times are kept, made and changed
 (`vectors.py`); messages without arrays of any length are made and published, and kept, too, if they have no
 arrays (`records.py`).
 
@@ -11,10 +11,10 @@ arrays (`records.py`).
   bits (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`, `RESET`.
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
   it is taken back. Within what it calls it is a trap. Beyond are strings that are made or changed, vectors of anything
-  but numbers, of more than `ROOM` bytes, arrays of the message that become longer or shorter, messages by reference,
-  messages (and `MESSAGE`) of more than `MOST_MADE` bytes or with what is beyond, what is published with a string of
-  more than `MOST_KEPT`, or first of its kind of a second, recursion, `sin` and its like. An event of which no message
-  can come past such a place has no module: `NotScalarError` names what is beyond.
+  but numbers and times, of more than `ROOM` bytes, arrays of the message that become longer or shorter, messages by
+  reference, messages (and `MESSAGE`) of more than `MOST_MADE` bytes or with what is beyond, what is published with a
+  string of more than `MOST_KEPT`, or first of its kind of a second, recursion, `sin` and its like. An event of which
+  no message can come past such a place has no module: `NotScalarError` names what is beyond.
 - A line of output, and a message that is published, is noted behind those before, where `SAID` points, and the message
   at hand stands at `POSITION` (`output.py`).
 - Before a field is written, what stood there is noted in the log (address, size, bytes; 16 bytes each) that `UNDO`
@@ -391,6 +391,9 @@ class _Body(Records):
         size, machine = self._writer.size(kind), machine_type(kind)
         if isinstance(kind, kinds.Bool):
             return self._put_bits(to, 0, size, loaded(element, 0, kind))
+        if len(struct_code(kind) or "") == 2:
+            code, bits = self._parts_of(kind, loaded(element, 0, kind))
+            return code + self._put_bits(to, 0, size, bits)
         bits = element + bytes((MOVES[size][0], 0, 0))
         if machine not in (F32, F64):
             return self._put_bits(to, 0, size, bits)

@@ -1,4 +1,4 @@
-"""Vectors of numbers that variables of the set keep, and that a function makes: assigned, changed, looked at.
+"""Vectors of numbers and times that variables of the set keep, and that a function makes: assigned, changed, looked at.
 
 A variable of the set is 8 bytes: where the first element stands and how many there are (4 bytes each). It has two
 places for elements. What it was before the message at hand stays in the one: the first change of a message goes to the
@@ -99,7 +99,7 @@ class Vectors(Texts):
 
     def _size_of(self, kind: Type) -> int:
         """The bytes of an element of a vector that is kept or made. Raises `NotScalarError` of another."""
-        if not isinstance(kind, kinds.Vector) or not kinds.is_number(kind.element):
+        if not isinstance(kind, kinds.Vector) or struct_code(kind.element) is None:
             raise NotScalarError(str(kind))
         return struct_size(struct_code(kind.element) or "")
 
@@ -157,7 +157,10 @@ class Vectors(Texts):
         return self._place_in(room) + self._bytes(room, count) + b"\x6a"
 
     def _stored(self, room: _Room, address: bytes, value: bytes) -> bytes:
-        return address + value + bytes((_stores(machine_type(room.element), room.size), 0, 0))
+        code = b""
+        if len(struct_code(room.element) or "") == 2:
+            code, value = self._parts_of(room.element, value)
+        return code + address + value + bytes((_stores(machine_type(room.element), room.size), 0, 0))
 
     def _given(self, node: form.Expression) -> tuple[bytes, bytes]:
         """What puts a number into a local variable, and what gets it."""
@@ -200,10 +203,8 @@ class Vectors(Texts):
         self._brief = False
         end = place + count + _WRAP + constant(I32, size) + b"\x6c" + _PLUS
         call = place + end + other + self._routine(3, alike, kind.element)
-        same = f"same {len(self._locals)}"
         code += first + count + length + b"\x51" + IF + bytes((I32,)) + call + ELSE + constant(I32, 0) + END
-        code += self._set(same) + self._when(self._get(same) + constant(I32, 2) + _SAME, self._elsewhere)
-        return code + self._get(same) + (b"\x45" if node.operator == "!=" else b"")
+        return code + (b"\x45" if node.operator == "!=" else b"")
 
     # Assigned
 
@@ -415,12 +416,6 @@ def _moved(size: int, to: bytes, source: bytes) -> bytes:
     return to + source + bytes((load, 0, 0, store, 0, 0))
 
 
-def _unlike_itself(value: bytes, machine: int, answer: int) -> bytes:
-    """Answer where a number is NaN."""
-    none = value + value + bytes((COMPARE[machine]["!="],))
-    return none + IF + NOTHING + constant(I32, answer) + RETURN + END if machine in (F32, F64) else b""
-
-
 def sorting(element: Type, room: int) -> bytes:
     """A function of two addresses, between which elements are put into order, equal ones as they were; it returns
     whether there is one that has no order. `room` is where as many have room.
@@ -441,9 +436,17 @@ def sorting(element: Type, room: int) -> bytes:
         span = begin + width + _PLUS
         return span + end + span + end + b"\x49" + SELECT
 
-    known = turns(
-        at + end + _SAME, _put(9, loaded(at, 0, element)), _unlike_itself(_here(9), machine, 1), on(6, one)
+    none = (
+        _here(9)
+        + _here(9)
+        + bytes((COMPARE[machine]["!="],))
+        + IF
+        + NOTHING
+        + constant(I32, 1)
+        + RETURN
+        + END
     )
+    known = turns(at + end + _SAME, _put(9, loaded(at, 0, element)), none, on(6, one))
     after = loaded(at, 0, element) + loaded(to, 0, element) + bytes((more,))
     is_second = to + high + b"\x47" + IF + bytes((I32,)) + after + ELSE + constant(I32, 0) + END
     merged = turns(
@@ -480,29 +483,15 @@ def reversing(size: int) -> bytes:
 
 
 def alike(element: Type) -> bytes:
-    """A function of where elements begin and end, and where as many others begin: whether they are the same (0, 1), or
-    2 where that is first asked of two NaN.
-    """
+    """A function of where elements begin and end, and where as many others begin: whether they are the same."""
     machine, size = machine_type(element), constant(I32, struct_size(struct_code(element) or ""))
     at, end, to = map(_here, range(3))
-    differs = _here(3) + _here(4) + bytes((COMPARE[machine]["!="],))
-    number = (
-        _here(3)
-        + _here(3)
-        + bytes((COMPARE[machine]["=="],))
-        + IF
-        + NOTHING
-        + constant(I32, 0)
-        + RETURN
-        + END
-    )
-    both = _unlike_itself(_here(4), machine, 2) + constant(I32, 0) + RETURN
+    differs = loaded(at, 0, element) + loaded(to, 0, element) + bytes((COMPARE[machine]["!="],))
     return _function(
-        [unsigned(2) + bytes((machine,))],
+        [],
         turns(
             at + end + _SAME,
-            _put(3, loaded(at, 0, element)) + _put(4, loaded(to, 0, element)),
-            differs + IF + NOTHING + number + both + END,
+            differs + IF + NOTHING + constant(I32, 0) + RETURN + END,
             _put(0, at + size + _PLUS) + _put(2, to + size + _PLUS),
         ),
         constant(I32, 1),

@@ -54,6 +54,15 @@ def weighed(context: Context, values: Values, measure: Callable[[Values], int], 
     return values
 
 
+def same(left: Any, right: Any) -> bool:
+    """Whether two vectors or messages hold the same. A NaN is like nothing, also not like itself."""
+    return left == right and _numbers(left)
+
+
+def _numbers(value: Any) -> bool:
+    return all(map(_numbers, value)) if isinstance(value, list) else value == value  # noqa: PLR0124  NaN
+
+
 def pop(values: Values, site: int) -> None:
     """`values.pop_back()`."""
     if not values:

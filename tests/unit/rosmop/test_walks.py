@@ -136,14 +136,15 @@ class Fed:
                     break
             first = position + 4
             following = first + int.from_bytes(view[position:first], "little")
-            outcome = self.monitors.process(topic, view[first:following], time)
+            body = view[first:following]
+            outcome = self.monitors.process(topic, body, time)
             self.told += (one for each in (*outcome.before, outcome) for one in each.verdicts)
             self.lines += (line for each in (*outcome.before, outcome) for line in each.log)
             self.published += (one for each in (*outcome.before, outcome) for one in each.published)
             if outcome.result == "dropped":
                 pieces.append(view[run:position])
                 run = following
-            elif outcome.buffer is not view and len(outcome.buffer) != following - first:
+            elif outcome.buffer is not body:
                 pieces += (view[run:position], frames([bytes(outcome.buffer)]))
                 run = following
             position = following

@@ -164,14 +164,14 @@ def test_nothing_of_that_is_for_the_engine(body: str) -> None:
 BEYOND = (
     "values.push_back(x);", "values[0] = 0.0 / 0.0;", "n += deep(x);",
     "for (auto one : b) { b.push_back(one); if (n++ > 5) { break; } }", "w[0].push_back(x);",
-    "n = b[(b = a)[0]];", "t.push_back(when);",
+    "n = b[(b = a)[0]];", "t.push_back(word);",
 )  # fmt: skip
 
 
 @pytest.mark.parametrize("body", BEYOND)
 def test_what_is_beyond_is_left(body: str) -> None:
     """And comes to what it does in the engine."""
-    before = """std::vector<std::vector<double>> w; std::vector<ros::Time> t; ros::Time when;
+    before = """std::vector<std::vector<double>> w; std::vector<std::string> t;
         int deep(int k) { if (k > 0) { return deep(k - 1); } return k; }"""
     try:
         fed = Fed(kept(f"if (x == 2) {{ {body} }} n = x;", before=before))
@@ -221,7 +221,7 @@ def test_they_are_sorted_and_put_the_other_way_round(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_two_are_compared(kind: str) -> None:
-    """By what they hold, whatever it is that holds them; two NaN at one place are for the engine."""
+    """By what they hold, whatever it is that holds them; a NaN is like nothing."""
     text = kept(
         "a.clear(); for (auto one : values) { a.push_back(one); } if (a == b) { n++; } if (a != b) { n += 2; }"
         f" d = values; if (x == 1) {{ b = a; }} if (values == d) {{ n += 4; }} std::vector<{kind}> t = a;"
@@ -243,7 +243,42 @@ def test_two_are_compared(kind: str) -> None:
     fed.check([stamped(one) for one in draws], "/stamped")
     assert fed.came == {"together": 2, "passed": 3 * len(draws)}
     none = float("nan")
-    fed.check([stamped((0.0, none)), stamped((none, 1.0))], "/stamped")
+    fed.check([stamped((0.0, none), 1), stamped((none, 1.0)), stamped((0.0, none))], "/stamped")
+    assert fed.came["together"] == 3
+
+
+TIMES = """s() { std::vector<ros::Time> v; std::vector<ros::Duration> d; ros::Duration step; ros::Time last; int n = 0;
+    std::vector<ros::Time> later(std::vector<ros::Time> given) {
+        for (auto& one : given) { one += ros::Duration(1, 500000000); } return given; }
+    event e(ros::Time t, int c) /plain own/Plain '{when:t, count:c}' {
+        v.push_back(t); if (v.size() > 1) { d.push_back(v[v.size() - 2] - t); }
+        if (v.size() > 7) { v.erase(v.begin()); }
+        std::sort(v.begin(), v.end()); if (c == 1) { v = later(v); std::reverse(v.begin(), v.end()); } last = v.back();
+        std::vector<ros::Time> u(3, t); u[1] += ros::Duration(0, 250000000);
+        if (c == 2) { v = u; d.resize(2); step = d[1]; }
+        if (u == v) { n++; } if (c == 3) { n = 1 / (n - n); }
+        for (auto one : d) { if (one < step) { n += 3; } }
+        t = last; } }"""
+
+
+def test_times_and_durations() -> None:
+    """Those that no message can have are the engine's, too: longer ones, and with too many nanoseconds."""
+    fed, random = Fed(TIMES), Random(5)  # noqa: S311  draws examples, not keys
+    for time in range(20):
+        bodies = []
+        for _ in range(9):
+            seconds = random.choice((5, 6, 2**31, random.randrange(2**16)))
+            moment = (seconds, random.choice((0, 7, 10**9 - 1, 10**9, 2**32 - 1)))
+            if time > 15:
+                moment = (2**32 - random.choice((1, 2, 6)), moment[1])
+            body = plain(random.choice((0, 1, 2, 3) if time % 3 == 2 else (0, 1, 2)))
+            bodies.append(body[:18] + struct.pack("<II", *moment) + body[26:])
+        fed.check(bodies, time=time)
+    assert min(fed.came[what] for what in ("fault", "changed", "together")) > 10
+    fed = Fed(TIMES)
+    for time in range(4):
+        fed.check([plain(count) for count in (0, 1, 2, 0, 1)], time=time)
+    assert fed.came["together"] == 4
 
 
 ARRAYS = """s() { int n = 0;
