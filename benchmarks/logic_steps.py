@@ -3,7 +3,7 @@
     python -m benchmarks.logic_steps [--long EVENTS] [--beside]
 
 The cost must not grow with the trace or with a time bound. The loop around the step is measured alone and subtracted.
-For monitors that are tables the cost of generated code that looks the tables up inline is shown as well. `--beside`
+For monitors that are tables the cost of a loop that looks the tables up inline is shown as well. `--beside`
 measures formulas of `mtl` about the past beside reelay and rtamt: one event for each unit of time, the same verdicts,
 in this process, the call of a step included.
 """
