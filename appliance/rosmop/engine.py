@@ -123,6 +123,8 @@ class MonitorSet:
         self._monitors = monitors_of(compiled, self.interpreter, 0, slices)
         self.steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
+        self._silent: dict[tuple[str, int], Prepared] = {}
+        """What is prepared for `judge`, by topic and source."""
         self._execution = Execution(self.interpreter, on_fault)
         self._agenda = Agenda(self._monitors, self._execution, patience)
         self.began: tuple[str, ...] = ()
@@ -466,7 +468,11 @@ class MonitorSet:
         """What `process` says, by the walk where that takes the message: as in the relay."""
 
         def silent(walker: Walker) -> Prepared:
-            return walker.prepare(loud=True, told=[True] * len(walker.events), source=sender.source)
+            key = topic, sender.source
+            if key not in self._silent:
+                told = [True] * len(walker.events)
+                self._silent[key] = walker.prepare(loud=True, told=told, source=sender.source)
+            return self._silent[key]
 
         taken = self.taken(topic, buffer, time_ns, silent)
         return self.process(topic, buffer, time_ns, sender) if taken is None else taken
@@ -518,6 +524,7 @@ class MonitorSet:
 
     def _index(self) -> None:
         """Which steps a message on which topic, or part of a service, takes."""
+        self._silent.clear()
         steps: dict[str, list[Step]] = {}
         standing = {monitor.name: monitor.steps for monitor in self._monitors if monitor.enabled}
         standing |= {trial.names[0]: self._taps(trial) for trial in self.trials}

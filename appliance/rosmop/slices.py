@@ -61,6 +61,11 @@ class Slice:
     values: tuple[Any, ...]
     kept: bool = False
 
+    def stand(self, states: Sequence[int]) -> None:
+        """Its automata are in these states."""
+        for run, state in zip(self.runs, states, strict=True):
+            run.state = state  # type: ignore[attr-defined]  # of tables
+
 
 @dataclass(eq=False, slots=True)
 class _Known:
@@ -163,10 +168,14 @@ class Slices:
             return True
         after = [*map(getitem, calm, _states(slice_.runs))]
         if min(after, default=0) >= 0:
-            for run, state in zip(slice_.runs, after, strict=True):
-                run.state = state
+            slice_.stand(after)
             return True
         return None
+
+    def standing(self, key: Key) -> list[tuple[Slice, Sequence[int]]]:
+        """The slice of all parameters with this key, and the states of its automata, if there is one."""
+        slice_ = self._whole.get(key)
+        return [] if slice_ is None else [(slice_, _states(slice_.runs))]
 
     def targets(self, event: EventCode, key: Key) -> tuple[Sequence[Slice], Sequence[Slice]]:
         """The slices with all parameters that an event belongs to, in the order in which they began, and the others.

@@ -18,11 +18,13 @@ from typing import Any, NamedTuple, Protocol
 
 from appliance.rosmop.compile.program import groups
 from appliance.rosmop.compile.specification import Compiled
+from appliance.rosmop.happened import SEQ, Sender
 from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, SOONER, TOLD, Feed, FeedModule, module_of
 from appliance.rosmop.ir.interpreter import Interpreter
 from appliance.rosmop.ir.kept import KeptMessage
 from appliance.rosmop.ir.layout import POSITION, REST, ROOM, SURE, UNDO, Cells
 from appliance.rosmop.ir.output import HEAD
+from appliance.rosmop.ir.output import Key as Noted
 from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.machine import Machine, MachineTrap
@@ -30,9 +32,10 @@ from appliance.rosmop.monitor import Monitor, RunningProperty
 from appliance.rosmop.outcomes import Outcome, Verdict
 from appliance.rosmop.runtime.context import Context, LogLine, Published
 from appliance.rosmop.runtime.wire import Buffer, moments, numbers, put_moments, put_numbers
+from appliance.rosmop.slices import Key, Slice, Slices
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
-from appliance.rosmop.why import ClockedSteps, Exits
+from appliance.rosmop.why import Bound, ClockedSteps, Exits
 
 FUEL = 50_000_000
 """Instructions of one call at most: some hundredths of a second. What a call leaves is for the next ones: setting it
@@ -43,6 +46,9 @@ BEGINNING = 8192
 """Bytes that are looked at of a frame that was not received into the module's memory."""
 
 _FIRST = 512  # that are shown if they suffice: caches are cold when a large frame has gone through them
+
+_FEW = 16  # messages
+_STAMPED = 12  # bytes that a header has at least
 
 _ADDRESS = 0xFFFFFFFF
 _LENGTH = struct.Struct("<I")
@@ -289,6 +295,7 @@ class Walker:
         self._owner = self._memory.obj
         self._feed = feed
         self._frames = module.frames
+        self._machine = home.machine
         self._shown = _FIRST
         self._effects = module.effects + _EFFECT.size
         self._home = home
@@ -516,6 +523,129 @@ class Walker:
         return more[: len(self.events)], more[len(self.events) :]
 
 
+class _Keyed(NamedTuple):
+    """An event of a `SliceWalker`: what is noted of it, its place, and what its slices need."""
+
+    noted: Noted
+    place: int
+    monitor: Monitor
+    event: int
+    slices: Slices
+    binds: tuple[int, ...]
+    creates: bool
+
+
+class SliceWalker(Walker):
+    """The walk of a topic whose events all do nothing but to happen in the one slice that they bind: the module notes
+    what messages bind, and what is done with it is done here (`Slices.step`). Where more comes of a message it is left.
+    """
+
+    def __init__(
+        self,
+        home: Home,
+        module: FeedModule,
+        feed: Feed,
+        events: Sequence[tuple[Monitor, int]],
+        *,
+        stamped: bool,
+    ) -> None:
+        codes = [monitor.code.events[index] for monitor, index in events]
+        names = [f"{monitor.name}.{code.name}" for (monitor, _), code in zip(events, codes, strict=True)]
+        super().__init__(home, module, feed, [monitor for monitor, _ in events], names)
+        self._stamped = stamped
+        self._times = [0] * len(codes)
+        known: dict[str, tuple[int, Monitor, int, Slices, tuple[int, ...], bool]] = {}
+        for place, ((monitor, index), code) in enumerate(zip(events, codes, strict=True)):
+            assert monitor.slices is not None  # noqa: S101  it is parametric
+            known[code.key] = place, monitor, index, monitor.slices, code.binds, code.creates
+        self._keys = [
+            _Keyed(key, *known[key.function]) if key.function in known else None for key in module.keys
+        ]
+
+    def happened(self) -> Sequence[int]:
+        """How often each event has happened since this was last asked."""
+        times, self._times = self._times, [0] * len(self._times)
+        return times
+
+    def walk(
+        self, view: memoryview, position: int, run: int, _: list[Any], time_ns: int, prepared: Prepared
+    ) -> Walked | None:
+        """As `Walker.walk`. Few messages at first, as those behind one that is left are looked at again."""
+        end = len(view)
+        if view.obj is not self._owner:
+            if end > AREA:
+                return Walked(position, run, ())
+            self._memory[self._frames : self._frames + end] = view
+        most = _FEW
+        while position < end:
+            following = self._noted(position, end, most)
+            done = self._done(following, time_ns, prepared.source)
+            if done < following or done == position:
+                return Walked(done, run, ())
+            position, most = done, 4 * most
+        return None
+
+    def _noted(self, position: int, end: int, most: int) -> int:
+        """Have the module note what messages bind; where the first one begins of which nothing is noted."""
+        frames = self._frames
+        try:
+            return (self._call(frames + position, frames + end, most) or 0) - frames
+        except MachineTrap:
+            self._machine.refuel(FUEL)
+            at = _LENGTH.unpack_from(self._memory, POSITION)[0]
+            _LENGTH.pack_into(self._memory, POSITION, 0)
+            if at:
+                return int(at) - frames
+            return self._noted(position, end, most)  # the calls before have used up the fuel
+
+    def _done(self, until: int, time_ns: int, source: int) -> int:
+        """Do what follows for the messages that are noted; where the first one begins that is left."""
+        memory, keys, stamped = self._memory, self._keys, self._stamped
+        at, end = self._said, _LENGTH.unpack_from(memory, SURE)[0]
+        head, several = HEAD.unpack_from, len(self.events) > 1
+        sender, before = Sender(source), 0
+        happened: list[tuple[_Keyed, Key]] = []  # because of the message at hand, if it may be several
+        undo: list[tuple[Slice, Sequence[int]]] = []
+        while at < end:
+            number, frame = head(memory, at)
+            keyed = keys[number]
+            assert keyed is not None  # noqa: S101  this walk's module notes no other
+            if frame != before:
+                for each, key in happened:
+                    self._happen(each, key, time_ns, sender)
+                happened.clear()
+                undo.clear()
+                before = frame
+                if stamped:
+                    sender = self._sender(frame, source)
+            key = (True, *keyed.noted.values_at(memory, at))
+            at += keyed.noted.size
+            if not keyed.monitor.enabled:
+                continue
+            if several:
+                undo += keyed.slices.standing(key)
+            comes = keyed.slices.step(keyed.event, key)
+            if comes is None:
+                for slice_, states in undo[::-1]:
+                    slice_.stand(states)
+                return int(frame) - self._frames
+            if comes and several:
+                happened.append((keyed, key))
+            elif comes:
+                self._happen(keyed, key, time_ns, sender)
+        for each, key in happened:
+            self._happen(each, key, time_ns, sender)
+        return until
+
+    def _happen(self, keyed: _Keyed, key: Key, time_ns: int, sender: Sender) -> None:
+        keyed.monitor.trail.append(Bound(keyed.event, keyed.binds, key, time_ns, sender, keyed.creates))
+        self._times[keyed.place] += 1
+
+    def _sender(self, frame: int, source: int) -> Sender:
+        size, seq = _POSITION.unpack_from(self._memory, frame)
+        return Sender(source, seq, SEQ) if size >= _STAMPED else Sender(source)
+
+
 def _sums(one: Sequence[int], other: Sequence[int]) -> Sequence[int]:
     return [sum(counts) for counts in zip_longest(one, other, fillvalue=0)]
 
@@ -541,10 +671,10 @@ def walks_of(compiled: Compiled, interpreter: Interpreter, monitors: Sequence[Mo
     components = [group.component for group in found]
     values = Values(compiled.messages)
     module = module_of(compiled.functions, components, values, compiled.stamped)
-    if not module.feeds:
+    if not module.feeds and not module.keyed:
         return Walks()
     machine = Machine(module.code, module.memory)
-    walks = {}
+    walks: dict[str, Walker] = {}
     for group, cells in zip(found, module.cells, strict=True):
         running = [monitors[number].properties[index] for number, index in group.properties]
         for number, address in cells.exits.items():
@@ -568,4 +698,9 @@ def walks_of(compiled: Compiled, interpreter: Interpreter, monitors: Sequence[Mo
                     for number, index in events
                 ]
                 walks[topic] = Walker(home, module, module.feeds[topic], own, names)
+        for (topic, _), events in zip(group.component.keyed, group.keyed, strict=True):
+            if topic in module.keyed:
+                stamped = topic in compiled.stamped
+                acting = [(monitors[number], index) for number, index in events]
+                walks[topic] = SliceWalker(home, module, module.keyed[topic], acting, stamped=stamped)
     return Walks(walks, machine.memory[module.frames : module.frames + AREA])

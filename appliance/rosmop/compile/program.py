@@ -7,18 +7,21 @@ from appliance.rosmop.compile.specification import SpecificationCode
 from appliance.rosmop.ir import form
 from appliance.rosmop.logics.interface import ClockedProperty, FiniteProperty
 from appliance.rosmop.sharing import connected
+from appliance.rosmop.types.kinds import Type
 
 
 @dataclass(frozen=True)
 class Group:
     """A component, with the numbers of its specifications and of its properties with tables (specification, property),
-    and for each topic, and part of a service, the events on it (specification, event).
+    and for each topic, and part of a service, the events on it (specification, event); `keyed`: for those of them that
+    the component has keyed.
     """
 
     component: form.Component
     specifications: Sequence[int]
     properties: tuple[tuple[int, int], ...]
     events: tuple[tuple[tuple[int, int], ...], ...]
+    keyed: tuple[tuple[tuple[int, int], ...], ...]
 
 
 def groups(specifications: Sequence[SpecificationCode]) -> Iterator[Group]:
@@ -54,7 +57,12 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
             if event.way is not None:
                 topics.setdefault(event.way, []).append((number, index))
     rows = []
-    # A message of a parametric specification is always for Python, which has the slices.
+    # Python has the slices of parametric specifications.
+    keyed = {
+        topic: events
+        for topic, events in topics.items()
+        if all(_keyed(specifications, *event) for event in events)
+    }
     topics = {
         topic: events
         for topic, events in topics.items()
@@ -71,8 +79,37 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
                 ),
             )
         )
-    component = form.Component(tuple(variables), len(properties), tuple(rows), tuple(noted))
-    return Group(component, numbers, tuple(properties), tuple(map(tuple, topics.values())))
+    keys = tuple(
+        (topic, tuple(_key(specifications, *event) for event in events)) for topic, events in keyed.items()
+    )
+    component = form.Component(tuple(variables), len(properties), tuple(rows), tuple(noted), keys)
+    return Group(
+        component,
+        numbers,
+        tuple(properties),
+        tuple(map(tuple, topics.values())),
+        tuple(map(tuple, keyed.values())),
+    )
+
+
+def _keyed(specifications: Sequence[SpecificationCode], number: int, index: int) -> bool:
+    """Whether an event binds all parameters, and nothing comes of it but states of automata."""
+    specification = specifications[number]
+    event, slicing = specification.events[index], specification.slicing
+    return (
+        slicing is not None
+        and event.plain
+        and len(event.binds) == len(slicing.parameters)
+        and all(isinstance(declared.property, FiniteProperty) for declared in specification.properties)
+    )
+
+
+def _key(
+    specifications: Sequence[SpecificationCode], number: int, index: int
+) -> tuple[str, tuple[Type, ...]]:
+    slicing = specifications[number].slicing
+    assert slicing is not None
+    return specifications[number].events[index].key, tuple(kind for _, _, kind in slicing.parameters)
 
 
 def _event(

@@ -20,7 +20,7 @@ Python.
 """
 
 import struct
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.rosmop.happened import NO_NUMBER, SEQ
@@ -28,7 +28,7 @@ from appliance.rosmop.ir import form
 from appliance.rosmop.ir.assembly import PAGE, assembled
 from appliance.rosmop.ir.layout import NOW, POSITION, ROOM, SAID, SURE, UNDO, Cells, NotScalarError
 from appliance.rosmop.ir.module import CHANGED, DROPPED, HAPPENED, RESET, Writer, Written
-from appliance.rosmop.ir.output import Line, Publication
+from appliance.rosmop.ir.output import Key, Line, Publication
 from appliance.rosmop.ir.parts import ELSEWHERE
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.ir.wasm import (
@@ -124,6 +124,11 @@ class FeedModule:
     """Where it must stand (i64) whether what a context publishes on a topic is only counted."""
     places: Sequence[range]
     """What it uses for messages that it makes."""
+    keyed: Mapping[str, Feed]
+    """Exports `keys(at, end, most)` for the keyed topics: they note what frames bind, of so many at most, where lines
+    are noted, and answer where the first one begins that was not looked at, or is left.
+    """
+    keys: Sequence[Key]
 
 
 def module_of(
@@ -152,6 +157,15 @@ def module_of(
                 walks[topic] = _Walk(writer, own, tables, effects, events, stamped=topic in stamped)
             except (NotScalarError, RecursionError):
                 continue
+    keyed = {}
+    for topic, noted in (each for component in components for each in component.keyed):
+        try:
+            keyed[topic] = (
+                [writer.key(*event) for event in noted],
+                {functions[name].context for name, _ in noted},
+            )
+        except (NotScalarError, RecursionError):
+            continue
     settled = [writer.settling(own) for own in cells if own.kept]
     codes: list[bytes] = []
     for topic, walk in walks.items():
@@ -165,6 +179,8 @@ def module_of(
     wholes = [(one.parameters, one.result, one.code) for one in writer.written]
     exports = {f"settle {number}": number for number in settled}
     exports |= {feed.name: len(wholes) + place for place, feed in enumerate(feeds.values())}
+    exports |= {f"keys {place}": len(wholes) + len(feeds) + place for place in range(len(keyed))}
+    codes += [_keys(writer, *noting) for noting in keyed.values()]
     wholes += [(_PARAMETERS, I64, code) for code in codes]
     code = assembled(wholes, exports, writer.constants, memory)
     return FeedModule(
@@ -182,6 +198,8 @@ def module_of(
         writer.said,
         writer.publications,
         writer.places,
+        {topic: _noting(place, written) for place, (topic, (written, _)) in enumerate(keyed.items())},
+        writer.keys,
     )
 
 
@@ -215,6 +233,35 @@ def _get(local: int) -> bytes:
 
 def _set(local: int, value: bytes) -> bytes:
     return value + b"\x21" + unsigned(local)
+
+
+def _noting(place: int, written: Sequence[Written]) -> Feed:
+    """What is said about what notes keys."""
+    functions = [one.number for one in written]
+    nothing: frozenset[int] = frozenset()
+    return Feed(
+        f"keys {place}", nothing, nothing, (), counters=0, log=0, undo=(), brief=False, functions=functions,
+        says=False, settle="", publishes=(),
+    )  # fmt: skip
+
+
+def _keys(writer: Writer, written: Sequence[Written], contexts: Collection[str]) -> bytes:
+    """The function."""
+    room, out = _get(_END) + _get(_AT) + _SUB, _BR_IF + b"\x01"
+    size = 3
+    frame = [store(I32, POSITION, _get(_AT)), store(I32, SURE, load(I32, SAID))]
+    frame += [store(I64, writer.budget(context), constant(I64, BUDGET)) for context in contexts]
+    frame += [_get(_NOW), _EQZ64, out, room, constant(I32, 4), b"\x49", out]
+    frame += [_set(size, _get(_AT) + b"\x28\x00\x00"), _get(size), room, constant(I32, 4), _SUB, b"\x4b", out]
+    for one in written:
+        frame.append(_get(_AT) + constant(I32, 4) + _ADD + _get(size) + b"\x10" + unsigned(one.number))
+        frame += [constant(I32, ELSEWHERE), _AND, out]
+    frame.append(_set(_AT, _get(_AT) + _get(size) + _ADD + constant(I32, 4) + _ADD))
+    frame.append(_set(_NOW, _get(_NOW) + constant(I64, 1) + b"\x7d"))
+    body = [store(I32, SAID, constant(I32, writer.said)), _BLOCK, _LOOP, *frame, _BR + b"\x00", END, END]
+    body += [store(I32, POSITION, constant(I32, 0)), _get(_AT), b"\xad", END]
+    whole = row([b"\x01" + bytes((I32,))]) + b"".join(body)
+    return unsigned(len(whole)) + whole
 
 
 class _Walk:

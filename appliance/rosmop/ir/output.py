@@ -4,11 +4,14 @@ A line stands in the module's memory as its number among those of the module, th
 bytes for each value: an integer, a double, or a string's address (the low 32 bits) and length. It costs the most that
 it can: text is not made before it is paid for.
 
+What a message binds of parameters (`Key`) is noted as a line is, with a number among those of the keys.
+
 A message that is published has behind number and frame its fields as they are sent, of strings address and length.
 """
 
 import struct
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.functions import FAULTING, FUNCTIONS
@@ -22,6 +25,7 @@ HEAD = struct.Struct("<II")
 BYTES = BYTES_PER_INSTRUCTION // 4
 """Of a string, for an instruction more."""
 
+_ADDRESS = 0xFFFFFFFF
 _TEXT = struct.Struct("<II")
 _LENGTH = struct.Struct("<I")
 _PIECE = 512  # bytes that a number may take
@@ -29,19 +33,43 @@ _SHORT = 1024  # bytes of a text whose size is not charged
 _Make = Callable[[Sequence[object]], object]
 
 
-class Line:
+class _Noted:
+    """What is noted of values, and how they are read."""
+
+    def __init__(self, context: str, values: Sequence[form.Expression]) -> None:
+        self.context = context
+        self._texts = [place for place, expression in enumerate(values) if is_text(expression)]
+        self._slots = struct.Struct("<" + "".join(map(_code, values)))
+        self.size = HEAD.size + self._slots.size
+
+    def values_at(self, memory: memoryview, at: int) -> list[Any]:
+        """Those that stand there."""
+        values: list[Any] = [*self._slots.unpack_from(memory, at + HEAD.size)]
+        for place in self._texts:
+            text = values[place]
+            where = text & _ADDRESS
+            values[place] = bytes(memory[where : where + (text >> 32)])
+        return values
+
+
+class Key(_Noted):
+    """What a message binds of the parameters of a specification; `function` is that which notes it."""
+
+    def __init__(self, context: str, values: Sequence[form.Expression], function: str) -> None:
+        super().__init__(context, values)
+        self.function = function
+
+
+class Line(_Noted):
     """A line: the `values` that it is made of, and how many bytes it may have besides those of its strings."""
 
     def __init__(self, node: form.Log, context: str) -> None:
         self.node = node
         self.level = node.level
-        self.context = context
         self.values: list[form.Expression] = []
         self.longest = 0
         self._make = self._made(node.text)
-        self._texts = [place for place, expression in enumerate(self.values) if is_text(expression)]
-        self._slots = struct.Struct("<" + "".join(map(_code, self.values)))
-        self.size = HEAD.size + self._slots.size
+        super().__init__(context, self.values)
 
     @property
     def cost(self) -> int:
@@ -50,11 +78,7 @@ class Line:
 
     def put_out(self, memory: memoryview, at: int, monitor: str) -> LogLine:
         """The line that stands there."""
-        values: list[object] = [*self._slots.unpack_from(memory, at + HEAD.size)]
-        for place in self._texts:
-            where, size = divmod(values[place], 1 << 32)[::-1]  # type: ignore[operator]  # an integer
-            values[place] = bytes(memory[where : where + size])
-        text = self._make(values)
+        text = self._make(self.values_at(memory, at))
         assert isinstance(text, bytes)  # noqa: S101  as its type says
         return line_of(self.level, text, monitor)
 

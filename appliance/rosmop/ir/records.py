@@ -9,10 +9,11 @@ too many nanoseconds) is written anew, and a message that puts a NaN there is le
 
 from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import Any
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.layout import LINES, MOST_MADE, POSITION, SAID, NotScalarError, machine_type
-from appliance.rosmop.ir.output import HEAD, Line, Publication
+from appliance.rosmop.ir.output import HEAD, Key, Line, Publication
 from appliance.rosmop.ir.places import loaded, root, root_of
 from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
 from appliance.rosmop.ir.values import struct_code, struct_size
@@ -264,15 +265,16 @@ class Records(Vectors):
 
     # What is published
 
-    def _noted_line(self, line: Line | Publication, cost: bytes) -> bytes:
-        """Pay for a line of output or a publication and begin it, where the local variable `line` says then."""
+    def _noted_line(self, line: Line | Publication | Key, cost: bytes) -> bytes:
+        """Pay for a line of output, a publication or key and begin it, where the local variable `line` says then."""
+        known: list[Any] = self._layout.keys if isinstance(line, Key) else self._layout.lines
         code = self._cell(0x28, SAID) + self._set("line")
         end = self._get("line") + constant(I32, line.size) + b"\x6a"
         full = end + constant(I32, self._layout.said + LINES) + b"\x4b"
         code += self._when(full, self._elsewhere) + self._spend(cost) + self._cell(0x36, SAID, end)
-        for offset, head in ((0, constant(I32, len(self._layout.lines))), (4, self._cell(0x28, POSITION))):
+        for offset, head in ((0, constant(I32, len(known))), (4, self._cell(0x28, POSITION))):
             code += self._get("line") + head + b"\x36\x00" + unsigned(offset)
-        self._layout.lines.append(line)
+        known.append(line)
         return code
 
     def _publish(self, node: form.Publish) -> bytes:

@@ -1,7 +1,7 @@
 """A batch through the monitors together is what its messages are one by one: bytes, records, counters, state."""
 
 import struct
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -19,11 +19,13 @@ from appliance.relay.monitors.middle import Middle
 from appliance.relay.monitors.places import Place
 from appliance.relay.report import Reporter
 from appliance.ros.definitions import Definitions
+from appliance.rosmop import walks
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import ClockedRun, FiniteRun
+from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.runtime.context import Published
 from appliance.rosmop.syntax.errors import SpecificationError
-from appliance.rosmop.walks import Walked
+from appliance.rosmop.walks import FUEL, SliceWalker, Walked
 from tests.support.examples import examples
 from tests.support.relay_memory import share
 from tests.unit.rosmop.acting import message
@@ -140,11 +142,24 @@ class Monitored:
             names = self.set.interpreter.variables
             state += [(name, repr(names.get(code))) for name, code in monitor.code.variables.items()]
             state += [
-                one.run.state for one in monitor.properties if isinstance(one.run, FiniteRun | ClockedRun)
+                one.run.state
+                for one in monitor.properties
+                if isinstance(one.run, FiniteRun | ClockedRun) and monitor.slices is None
             ]
             state += [timer.due for timer in monitor.timers]
-            state += [one.run.deadline for one in monitor.properties]
+            state += [one.run.deadline for one in monitor.properties if monitor.slices is None]
+            state += slices(monitor)
         return state
+
+
+def slices(monitor: Monitor) -> list[object]:
+    """What happened last in a parametric specification, how many slices it has, and the states of those."""
+    if monitor.slices is None:
+        return []
+    state: list[object] = [monitor.slices.live, *monitor.trail]
+    for key in {repr(bound.key): bound.key for bound in monitor.trail}.values():
+        state.append([(slice_.values, states) for slice_, states in monitor.slices.standing(key)])
+    return [repr(each) for each in state]  # a NaN is not equal to itself
 
 
 def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traffic], on_fault: str = "drop",
@@ -282,6 +297,85 @@ def test_hard_cases_are_the_same_together(name: str, on_fault: str) -> None:
     for seed in range(examples(18)):
         messages = Messages(seed)
         agree({"x.rv": HARD[name]}, definitions(), [messages.traffic() for _ in range(10)], on_fault)
+
+
+PARAMETRIC = {
+    "one property": """s(std::string id) { event a(std::string id) /stamped own/Stamped '{frame:id}' { }
+        ere: a a a a @match { ROS_WARN("four"); } }""",
+    "several kinds of a message": """s(int n, double x) {
+        creation event a(int n, double x) /plain own/Plain '{count:n, x:x, kind:1}' { }
+        event b(int n, double x) /plain own/Plain '{count:n, x:x, kind:0}' { }
+        event c(double x, int n) /plain own/Plain '{count:n, x:x}' { }
+        fsm: i [ a -> o, b -> i, c -> o ] o [ a -> o, b -> p, c -> o ] p [ a -> q, c -> o ] q [ c -> o ]
+        @fail { ROS_INFO("failed"); } @q { } }""",
+    "two specifications": """s(unsigned int n) { event a(unsigned int n) /plain own/Plain '{when.sec:n}' { }
+            event b(unsigned int n) /plain own/Plain '{when.sec:n, kind:1}' { }
+            fsm: i [ a -> o, b -> o ] o [ a -> p, b -> o ] p [ a -> o, b -> q ] q [ a -> o, b -> q ] @q { } }
+        t(float y, ros::Time w) { event e(ros::Time w, float y) /plain own/Plain '{y:y, when:w}' { }
+            event f(ros::Time w, float y) /plain own/Plain '{y:y, when:w, kind:1}' { }
+            fsm: j [ e -> k, f -> l ] k [ e -> l, f -> k ] l [ e -> m ] m [ e -> k, f -> m ] @m { } @fail { } }""",
+    "past the end": """s(double v) { event a(double v) /stamped own/Stamped '{values[1]:v}' { }
+        ere: a a a @match { DROP; } }""",
+    "an action on another event": """s(int n) { int times = 0; event a(int n) /plain own/Plain '{count:n}' { }
+        event b(int n) /stamped own/Stamped '{count:n}' { times++; if (times > 3) { return; } }
+        event t() every 3ms { times = 0; } fsm: i [ a -> o, b -> i ] o [ a -> i, b -> o ] @fail { } }""",
+    "requests": """s(int n) { event a(int n) service /serve own/Serve request '{count:n}' { }
+        event b(int n) service /serve own/Serve response '{count:n}' { }
+        fsm: i [ a -> o, b -> o ] o [ a -> o, b -> p ] p [ a -> o, b -> q ] q [ a -> o ] @q { DROP; } }""",
+}
+
+
+def together(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How often events happen in slices without the engine from now on."""
+    counts: list[int] = []
+    happened = SliceWalker.happened
+
+    def noted(walker: SliceWalker) -> Sequence[int]:
+        found = happened(walker)
+        counts.extend(found)
+        return found
+
+    monkeypatch.setattr(SliceWalker, "happened", noted)
+    return counts
+
+
+@pytest.mark.parametrize("name", PARAMETRIC)
+@pytest.mark.parametrize("on_fault", ["drop", "pass"])
+def test_slices_are_the_same_together(name: str, on_fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which there are, their states, what is told and counted, and the events that explain verdicts."""
+    happened = together(monkeypatch)
+    for seed in range(8):
+        messages = Messages(4 * seed + 3 if name == "requests" else seed)
+        traffic = [messages.traffic() for _ in range(12)]
+        again = [one for one in traffic for _ in range(3)]
+        switched = (3 * seed + 3, "s")
+        agree({"x.rv": PARAMETRIC[name]}, definitions(), again, on_fault, switched)
+    assert sum(happened) > 8
+
+
+@pytest.mark.parametrize("fuel", [FUEL, 20_000])
+def test_slices_of_many_messages_are_the_same_together(fuel: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More than there is room to note, with a header whose seq is told, some for the engine; with little fuel, too."""
+    monkeypatch.setattr(walks, "FUEL", fuel)
+    text = """s(double x) { event a(double x) /point geometry_msgs/PointStamped '{point.x:x}' { }
+        event b(double x) /point geometry_msgs/PointStamped '{point.x:x, point.y:1}' { }
+        fsm: i [ a -> o, b -> o ] o [ a -> o, b -> p ] p [ a -> s, b -> p ] s [ a -> p, b -> q ]
+             q [ a -> o, b -> o ] @q { ROS_INFO("q"); } }"""
+    random = Random(5)  # noqa: S311  draws examples, not keys
+    traffic = []
+    for count in (1, 40, 3000, 4000, 3000):
+        bodies = [
+            message("geometry_msgs/PointStamped", header__seq=number, point__x=float(random.randrange(60)),
+                    point__y=float(random.random() < 0.02))
+            for number in range(count)
+        ]  # fmt: skip
+        frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
+        traffic.append(Traffic("/point", frames, count))
+    happened = together(monkeypatch)
+    monitored = agree({"x.rv": text}, definitions(), traffic)
+    assert monitored.rows()[0].verdicts > 10
+    assert sum(happened) > 5000
+    assert any(event.sender.number > 0 for event in monitored.set.monitors[0].trail)
 
 
 def _shipped_traffic(seed: int) -> list[Traffic]:
