@@ -26,7 +26,7 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from appliance.config import Settings
-from appliance.wrong_values import must_be
+from appliance.wrong_values import must_be, not_yaml
 
 if typing.TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -134,11 +134,11 @@ class _Gathered:
             values = yaml.safe_load(text)
         except yaml.MarkedYAMLError as error:
             line = error.problem_mark.line + 1 if error.problem_mark else 1
-            raise ConfigError([Mistake(f"{file}:{line}", f"is not YAML: {error.problem}")]) from error
+            raise ConfigError([Mistake(f"{file}:{line}", not_yaml(error.problem))]) from error
         except RecursionError as error:
             raise ConfigError([Mistake(str(file), "is nested too deep, or refers to itself")]) from error
         except (yaml.YAMLError, ValueError) as error:
-            raise ConfigError([Mistake(str(file), f"is not YAML: {error}")]) from error
+            raise ConfigError([Mistake(str(file), not_yaml(error))]) from error
         if values is None:
             return
         if not isinstance(values, dict):
@@ -158,7 +158,7 @@ class _Gathered:
                     value = yaml.safe_load(value)
                 except yaml.YAMLError as error:
                     problem = error.problem if isinstance(error, yaml.MarkedYAMLError) else error
-                    self._mistakes.append(Mistake(name, f"is not YAML: {problem}"))
+                    self._mistakes.append(Mistake(name, not_yaml(problem)))
                     continue
             if name in _SHORT_NAMES and not isinstance(value, dict):
                 path = _SHORT_NAMES[name]

@@ -57,6 +57,25 @@ _BODY: dict[str, Callable[..., str]] = {
 """What msgspec says of a value, and what is said of it here."""
 
 
+_YAML = {
+    r"'\\t'": "indent with spaces, not tabs",
+    "mapping values are not allowed": "put a text that has `: ` in quotes, and begin the keys of a section alike",
+    "<block end>": "begin the lines that belong together alike",
+    "but got '<stream end>'|node content": "close the bracket, or write what belongs there",
+    "end of stream": "close the quote",
+    "cannot start any token|undefined alias": "put the text in quotes",
+}
+"""What to do about what the parser says of a text that is not YAML."""
+
+
+def not_yaml(problem: object) -> str:
+    """`is not YAML: ` with what the parser says of it, and what to do."""
+    said = " ".join(str(problem).split())
+    return "; ".join(
+        [f"is not YAML: {said}", *[do for what, do in _YAML.items() if re.search(what, said)][:1]]
+    )
+
+
 def nearest(word: str, candidates: Collection[str]) -> str | None:
     """The candidate that `word` was most likely meant to be."""
     if len(candidates) > _MAXIMUM_CANDIDATES or len(word) > 100:

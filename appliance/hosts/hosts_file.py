@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 from appliance.policy.findings import quoted
-from appliance.wrong_values import meant
+from appliance.wrong_values import meant, not_yaml
 
 _LARGEST = 1 << 20
 _MOST_GROUPS = 32
@@ -90,10 +90,10 @@ def read_declared(path: Path) -> dict[str, DeclaredHost]:
         reading.file(yaml.compose(text, Loader=yaml.SafeLoader))
     except yaml.MarkedYAMLError as error:
         place = _place(error.problem_mark) if error.problem_mark else "1:1"
-        raise DeclaredHostsError(f"{path}:{place}: is not YAML: {error.problem}") from error
+        raise DeclaredHostsError(f"{path}:{place}: {not_yaml(error.problem)}") from error
     except (yaml.YAMLError, RecursionError) as error:
         reason = "nested too deep, or refers to itself" if isinstance(error, RecursionError) else str(error)
-        raise DeclaredHostsError(f"{path}: is not YAML: {' '.join(reason.split())}") from error
+        raise DeclaredHostsError(f"{path}: {not_yaml(reason)}") from error
     if reading.mistakes:
         more = len(reading.mistakes) - _MOST_MISTAKES
         told = [f"{path}:{mistake}" for mistake in reading.mistakes[:_MOST_MISTAKES]]

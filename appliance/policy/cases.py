@@ -26,7 +26,7 @@ from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, needs_node, rights_of
 from appliance.ros.names import is_global_name
-from appliance.wrong_values import meant
+from appliance.wrong_values import meant, not_yaml
 
 MAXIMUM_CHARACTERS = 1024 * 1024
 MAXIMUM_CHECKS = 100_000
@@ -88,7 +88,7 @@ def _compose(text: str, findings: Findings) -> _Node | None:
     except yaml.MarkedYAMLError as fault:
         mark = fault.problem_mark or fault.context_mark
         line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
-        findings.error(line, column, f"not YAML: {fault.problem or fault.context}")
+        findings.error(line, column, not_yaml(fault.problem or fault.context).removeprefix("is "))
     except yaml.YAMLError as fault:
         findings.error(1, 1, f"not YAML: {quoted(str(fault), 120)}")
     return None

@@ -123,3 +123,24 @@ def _keys(values: dict[str, Any]) -> Iterator[tuple[str, ...]]:
         yield (key,)
         if isinstance(value, dict):
             yield from ((key, *below) for below in _keys(value))
+
+
+@pytest.mark.parametrize(
+    ("text", "do"),
+    [
+        ("a: [1\n", "close the bracket, or write what belongs there"),
+        ("a: [", "close the bracket, or write what belongs there"),
+        ("a:\n\tb: 1\n", "indent with spaces, not tabs"),
+        ("a: b: c\n", "put a text that has `: ` in quotes, and begin the keys of a section alike"),
+        ("a: 'x\n", "close the quote"),
+        ("- a\nb: 1\n", "begin the lines that belong together alike"),
+        ("a: @x", "put the text in quotes"),
+        ("a: *x", "put the text in quotes"),
+    ],
+)
+def test_what_is_not_yaml_is_told_with_what_to_do(tmp_path: Path, text: str, do: str) -> None:
+    """Behind the place and what the parser says of it."""
+    file = tmp_path / "appliance.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=rf"^{re.escape(str(file))}:\d+: is not YAML: .*; {re.escape(do)}$"):
+        resolve(file, {}, {})
