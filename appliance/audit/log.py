@@ -362,6 +362,7 @@ class AuditLog:
             if scarce is not None:
                 severity, left = (Severity.ALARM if scarce else Severity.NOTICE), self._room.left
                 event = "disk nearly full" if scarce else "disk has room"
+                _logger.warning(event, left=left, reason=self._room.scarce)
                 self._held.append(self._own(event, severity, self._room.scarce or "", {"left": left}))
 
     def _attempt(self, action: Callable[[], None]) -> bool:

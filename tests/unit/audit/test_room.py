@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from structlog.testing import capture_logs
 
 from appliance.audit.budget import Budget
 from appliance.audit.log import AuditLog
@@ -38,13 +39,16 @@ def await_degraded(log: AuditLog, *, degraded: bool) -> None:
 def test_a_disk_that_fills_is_told_before_it_is_full(disk: Path) -> None:
     """Below the reserve an alarm says so and who owes much waits, nobody else; with room again all is as before."""
     budget = Budget(lambda _host: Standing.REGISTERED)
-    log = AuditLog(disk / "audit.db", budget=budget, reserve=_RESERVE)
-    log.record(decision(log))
-    assert settle(log) is None
-    assert log.degraded is None
-    filler = disk / "filler"
-    filler.write_bytes(b"x" * (5 << 20))
-    await_degraded(log, degraded=True)
+    with capture_logs() as said:
+        log = AuditLog(disk / "audit.db", budget=budget, reserve=_RESERVE)
+        log.record(decision(log))
+        assert settle(log) is None
+        assert log.degraded is None
+        filler = disk / "filler"
+        filler.write_bytes(b"x" * (5 << 20))
+        await_degraded(log, degraded=True)
+        eventually(lambda: [one["event"] for one in said] == ["disk nearly full"], lambda: str(said))
+    assert "make room" in said[0]["reason"]
     assert "reserve" in (log.degraded or "")
     assert log.failed is None
     for number in range(2000):
