@@ -14,8 +14,9 @@ _TRUTH = struct.Struct("<q")
 
 
 class KeptMessage:
-    """One, of numbers, times and strings; `texts` are where these may be put, by where they are noted. Whether it is
-    there stands at `known`: one with a time that no message can have is not.
+    """One, of numbers, times, strings and arrays of fixed length; `texts` are where strings may be put, by where they
+    are noted. Whether it is there stands at `known`: one with a time that no message can have, or with more or fewer
+    elements than an array has, is not.
     """
 
     def __init__(
@@ -35,12 +36,12 @@ class KeptMessage:
 
     def enter(self, memory: memoryview, value: Any, entered: Callable[[bytes, int], int]) -> None:
         """Put it into the memory; `entered` does that with a string, and says what is noted of it."""
-        leaves = [*self._leaves(self._kind, value)]
-        for number, buffer in self._texts:
-            leaves[number] = entered(leaves[number], buffer)
         try:
+            leaves = [*self._leaves(self._kind, value)]
+            for number, buffer in self._texts:
+                leaves[number] = entered(leaves[number], buffer)
             raw = self._pack(leaves)
-        except struct.error:
+        except (struct.error, ValueError):
             _TRUTH.pack_into(memory, self._known, False)
             return
         memory[self._begin : self._begin + len(raw)] = raw
@@ -56,20 +57,27 @@ class KeptMessage:
             leaves[number] = old[number] if size == BEYOND else bytes(memory[at : at + size])
         return self._built(self._kind, iter(leaves))
 
+    def _parts(self, kind: Type) -> list[Type] | None:
+        """The types of what a message or array is made of, in order; None of what stands for itself."""
+        if isinstance(kind, kinds.Vector):
+            return [kind.element] * (kind.length or 0)
+        return self._values.fields(kind) if isinstance(kind, kinds.Record) else None
+
     def _kinds(self, kind: Type) -> Iterator[Type]:
-        for inner in self._values.fields(kind) if isinstance(kind, kinds.Record) else ():
-            yield from self._kinds(inner)
-        if not isinstance(kind, kinds.Record):
+        parts = self._parts(kind)
+        if parts is None:
             yield kind
+        for inner in parts or ():
+            yield from self._kinds(inner)
 
     def _leaves(self, kind: Type, value: Any) -> Iterator[Any]:
-        if not isinstance(kind, kinds.Record):
+        parts = self._parts(kind)
+        if parts is None:
             yield value
             return
-        for inner, part in zip(self._values.fields(kind), value, strict=True):
+        for inner, part in zip(parts, value, strict=True):
             yield from self._leaves(inner, part)
 
     def _built(self, kind: Type, leaves: Iterator[Any]) -> Any:
-        if not isinstance(kind, kinds.Record):
-            return next(leaves)
-        return [self._built(inner, leaves) for inner in self._values.fields(kind)]
+        parts = self._parts(kind)
+        return next(leaves) if parts is None else [self._built(inner, leaves) for inner in parts]

@@ -212,8 +212,6 @@ class Layout:
         if name not in cells.records:
             if not isinstance(kind, kinds.Record):
                 raise NotScalarError(str(kind))
-            if any(True for _ in self.arrays(kind)):
-                raise NotScalarError(str(kind))  # in Python it may have more elements, or fewer
             begin = self.made(kind)
             cells.records[name] = (begin, kind)
             cells.inner[name] = [

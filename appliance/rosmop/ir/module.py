@@ -2,8 +2,8 @@
 
 Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
 has a fixed size (`places.py`); strings are kept (`texts.py`), vectors of numbers and times are kept, made and changed
-(`vectors.py`); messages without arrays of any length are made and published, and kept, too, if they have no
-arrays (`records.py`).
+(`vectors.py`); messages without arrays of any length are made, published and kept
+(`records.py`).
 
 `Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
 

@@ -1,7 +1,7 @@
 """Messages that are made or kept: fields that are put into them, copies, and what is published of them.
 
 Each has its own part of the memory and stands there as it is sent, but of a string stands its address and length; so
-what has arrays of any length is beyond. One that is kept has no arrays at all, and its strings as `texts.py` has them.
+what has arrays of any length is beyond. Strings of one that is kept are as `texts.py` has them.
 
 Whatever is put there has one encoding only: what has several in the message that it comes from (a truth, a time with
 too many nanoseconds) is written anew, and a message that puts a NaN there is left. So what is published is copied.

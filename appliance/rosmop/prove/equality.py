@@ -245,11 +245,15 @@ class Validation:
 
     def _parts(self, kind: Type, at: int = 0) -> Iterator[tuple[int, int]]:
         """Where each number and string of a message that is kept stands in it, and its bytes."""
-        if not isinstance(kind, kinds.Record):
+        if not isinstance(kind, kinds.Record | kinds.Vector):
             yield at, 8 if isinstance(kind, kinds.String) else struct_size(struct_code(kind) or "")
             return
         end = at
-        for field in self._values.fields(kind):
+        for field in (
+            [kind.element] * (kind.length or 0)
+            if isinstance(kind, kinds.Vector)
+            else self._values.fields(kind)
+        ):
             for place, size in self._parts(field, at):
                 yield place, size
                 end = place + size

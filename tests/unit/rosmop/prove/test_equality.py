@@ -97,6 +97,10 @@ PROVED = {
     ),
     "a string that is put out": """s() { event e(std::string f) /stamped own/Stamped '{frame:f}' {
         ROS_INFO("from %s", f.c_str()); } }""",
+    "a message with an array that is kept": event(
+        "pose.pose.position.x = x; if (x > 1) { PUBLISH(/out, geometry_msgs/PoseWithCovariance, pose); }",
+        "double x", "x:x", "geometry_msgs::PoseWithCovariance pose;",
+    ),
 }  # fmt: skip
 
 
