@@ -264,7 +264,7 @@ def test_failure_and_recovery_are_logged_once(small_disk: Path) -> None:
     """Who reads standard error learns that nothing is recorded, with the file and the reason, and when it is over."""
     filler = small_disk / "filler"
     with structlog.testing.capture_logs() as said:
-        log = AuditLog(small_disk / "audit.db")
+        log = AuditLog(small_disk / "audit.db", reserve=0)
         assert settle(log) is None
         fill(filler)
         while log.failed is None:
