@@ -275,6 +275,7 @@ class MonitorSet:
 
     def write_module(self) -> None:
         """Write the module that `walker` offers the walks of."""
+        self._silent.clear()
         self._walks = walks_of(self.compiled, self.interpreter, self._monitors, self._agenda.when_due)
 
     def explain_when(self, asked: Asked, tried: Asked) -> None:

@@ -304,6 +304,7 @@ class Walker:
         )
         """The verdicts that it may come to, not explained."""
         self._counts = struct.Struct(f"<{len(events)}q")
+        self._none = (0,) * len(events)
         self._later = struct.Struct(f"<{len(events) + len(feed.verdicts)}q")
         self._before: Sequence[int] = (0,) * (len(events) + len(feed.verdicts))
         self._call = home.machine.function(feed.name)
@@ -316,7 +317,7 @@ class Walker:
     def happened(self) -> Sequence[int]:
         """How often each event has happened since this was last asked."""
         counts: Sequence[int] = self._counts.unpack_from(self._memory, self._feed.counters)
-        self._counts.pack_into(self._memory, self._feed.counters, *(0 for _ in counts))
+        self._counts.pack_into(self._memory, self._feed.counters, *self._none)
         return counts
 
     def ready(self) -> bool:
@@ -410,9 +411,8 @@ class Walker:
         if walked is not None and not walked.position:
             return None
         outcome = Outcome(message, time_ns)
-        outcome.events = tuple(
-            name for (name,), count in zip(self.events, self.happened(), strict=True) if count
-        )
+        happened = zip(self.events, self.happened(), strict=True)
+        outcome.events = tuple([name for (name,), count in happened if count])
         for who in prepared.changed:
             outcome.result, outcome.buffer, outcome.changed_by = (
                 "changed",
