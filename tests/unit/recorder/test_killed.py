@@ -67,10 +67,23 @@ def _killed_at(scene: Scene, operation: int) -> bool:
     return status == _KILLED
 
 
+def _read_both_ways(bag: Path, target: Path) -> int:
+    """How many messages on /chatter a recording has; the same as a bag and as MCAP."""
+    with Reader(bag) as reader:
+        rows = [(one.topic, time, bytes(data)) for one, time, data in reader.messages()]
+    target.write_bytes(b"".join(as_mcap(bag)).replace(b"ros1", b"ros2"))
+    mcap = McapReader(target)
+    mcap.open()
+    found = [(one.topic, time, bytes(data)) for one, time, data in mcap.messages(mcap.connections)]
+    mcap.close()
+    assert sorted(found) == sorted(rows)
+    return [row[0] for row in rows].count("/chatter")
+
+
 @pytest.mark.parametrize("memory", ["same", "another"])
 def test_killed_at_each_operation_with_files(tmp_path: Path, memory: str) -> None:
     """Each recording that has a name is whole; what was removed is told until it is noted; nothing else is left."""
-    removed, kept = set[int](), set[int]()
+    removed, kept, chatter = set[int](), set[int](), dict[str, int]()
     for operation in count(1):
         folder = tmp_path / str(operation)
         folder.mkdir()
@@ -97,19 +110,9 @@ def test_killed_at_each_operation_with_files(tmp_path: Path, memory: str) -> Non
             place = scene.folder / found.id
             assert msgspec.json.decode((place / "recording.json").read_bytes(), type=Recording) == found
             assert hashlib.sha256((place / "recording.bag").read_bytes()).hexdigest() == found.sha256
-            with Reader(place / "recording.bag") as reader:
-                rows = [(one.topic, time, bytes(data)) for one, time, data in reader.messages()]
-            assert sum(topic.messages for topic in found.topics) == [row[0] for row in rows].count("/chatter")
-            (folder / "a.mcap").write_bytes(
-                b"".join(as_mcap(place / "recording.bag")).replace(b"ros1", b"ros2")
-            )
-            mcap = McapReader(folder / "a.mcap")
-            mcap.open()
-            found_there = [
-                (one.topic, time, bytes(data)) for one, time, data in mcap.messages(mcap.connections)
-            ]
-            mcap.close()
-            assert sorted(found_there) == sorted(rows)
+            if found.sha256 not in chatter:  # equal bytes are read alike
+                chatter[found.sha256] = _read_both_ways(place / "recording.bag", folder / "a.mcap")
+            assert sum(topic.messages for topic in found.topics) == chatter[found.sha256]
         kept.add(len(stated))
         removed.add(len(gone))
         scene.later(0, *(messages.RecordingNoted(name) for name in names | gone))
