@@ -1,6 +1,7 @@
 """Fixtures that tests with real nodes share, each ends what it started; how many run at once; what is tried again."""
 
 import contextlib
+import gc
 import os
 import signal
 from collections.abc import Generator, Iterator
@@ -110,6 +111,8 @@ def pytest_configure(config: pytest.Config) -> None:
     A node that a test killed is remembered by its master with a port; on a common loopback the next node that takes
     this port may be another worker's. It would answer for the dead one, or be told to shut down in its place.
     """
+    # What was collected stays: the collector would look through millions of objects again and again.
+    gc.set_threshold(700, 10, 100)
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     if not hasattr(config, "workerinput") or not has_privileges():
