@@ -139,7 +139,8 @@ class MonitorSet:
                 self.interpreter.variables |= {left: math.inf, right: 0.0}
         self._index()
         # What is replaced goes at once: a garbage collector that had to look for it would hold up all messages.
-        weakref.finalize(self, self._agenda.let_go).atexit = False
+        for part in (self._agenda, self.interpreter):
+            weakref.finalize(self, part.let_go).atexit = False
 
     @classmethod
     def load(

@@ -141,8 +141,7 @@ class Execution:
         try:
             has_happened = step.function(message)
         except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
-            failed = self._interpreter.failed
-            if error is failed.error and failed.happened:
+            if self._interpreter.had_happened(error):
                 outcome.events = (*outcome.events, step.name)
             self._fault(error, step.monitor, step.event.position, outcome)
             self._block(message, outcome)

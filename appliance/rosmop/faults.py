@@ -12,6 +12,7 @@ from appliance.rosmop.runtime.context import FaultError, MalformedError
 def explain(error: Exception, interpreter: Interpreter, monitor: str, otherwise: Position) -> Fault:
     """The fault that an exception is. `otherwise` is where it stands if there is no better place."""
     failed = interpreter.failed if error is interpreter.failed.error else Failed()
+    interpreter.failed = Failed()  # the error has what it came through, and so much else
     site = interpreter.sites[failed.site] if failed.site >= 0 else Site(otherwise)
     values = {}
     for variable in site.variables:

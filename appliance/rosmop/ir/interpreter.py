@@ -18,7 +18,7 @@ import operator
 import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from types import MappingProxyType
 from typing import Any
@@ -97,18 +97,24 @@ class Interpreter:
         self.variables: dict[str, Any] = {}
         self.failed = Failed()
         self._values = Values(messages)
-        measures = {name: self._values.measure(kind) for name, kind in types.items()}
-        self.contexts = {
-            name: Context(monitor, self.turn, measures, self._live) for name, monitor in contexts.items()
-        }
         self._functions = functions
         self._made: dict[str, Callable[[Variables], Any]] = {}
         self._calls: list[Variables] = []
+        measures = {name: self._values.measure(kind) for name, kind in types.items()}
+        variables, calls = self.variables, self._calls
+        self.contexts = {
+            name: Context(monitor, self.turn, measures, lambda: [variables, *calls])
+            for name, monitor in contexts.items()
+        }
         self._site = -1
 
-    def _live(self) -> list[Mapping[str, Any]]:
-        """All variables that have values now."""
-        return [self.variables, *self._calls]
+    def had_happened(self, error: Exception) -> bool:
+        """Whether the event that an error stopped had happened by then."""
+        return error is self.failed.error and self.failed.happened
+
+    def let_go(self) -> None:
+        """The set is gone: its functions have no part any more that has them."""
+        self._made.clear()
 
     def value(self, name: str, variables: Mapping[str, Any]) -> Any:
         """What a variable of the set, or of a call with these variables, is now. Raises KeyError."""
@@ -159,8 +165,7 @@ class Interpreter:
                     site = error.site if isinstance(error, FaultError) and error.site >= 0 else self._site
                     self.failed = Failed(error, site, variables, happened)
                 elif events:  # it came out of a function that was called
-                    failed = self.failed
-                    self.failed = Failed(error, failed.site, failed.variables, happened)
+                    self.failed = replace(self.failed, happened=happened)
                 raise
             finally:
                 calls.pop()

@@ -9,6 +9,7 @@ import pytest
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.ir.interpreter import Interpreter
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.outcomes import Outcome
 from tests.unit.rosmop.acting import fields, message
@@ -218,16 +219,21 @@ def test_an_id_is_that_of_one_goal() -> None:
     assert slices.live == 0
 
 
-def test_a_set_that_is_gone_leaves_no_monitor_to_the_garbage_collector() -> None:
+def test_a_set_that_is_gone_leaves_nothing_to_the_garbage_collector() -> None:
     """It would hold up all messages for as long as it looks: a tenth of a second after some loads of fifty."""
     monitors = shipped(*(path.stem for path in MONITORS.glob("*.rv")))
     monitors.write_module()
     monitors.process("/landshark_control/base_velocity", drive(1.0), SECOND)
-    known = {id(monitor) for monitor in monitors.monitors}
+    assert monitors.process("/landshark_control/base_velocity", b"", SECOND).faults
+    known = {id(part) for part in (*monitors.monitors, monitors.interpreter)}
     gc.disable()
     try:
         del monitors
-        left = [one for one in gc.get_objects() if isinstance(one, Monitor) and id(one) in known]
+        left = [
+            part
+            for part in gc.get_objects()
+            if id(part) in known and isinstance(part, (Monitor, Interpreter))
+        ]
     finally:
         gc.enable()
     assert not left
