@@ -33,7 +33,7 @@ from appliance.rosmop.happened import NOBODY, Sender
 from appliance.rosmop.monitor import Monitor, Step, monitors_of
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding, Position
-from appliance.rosmop.reach import reached, redefined
+from appliance.rosmop.reach import redefined
 from appliance.rosmop.runtime.context import TRIAL_BUDGET, Context
 from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.sharing import sharing, way_of
@@ -172,6 +172,22 @@ class MonitorSet:
         if findings:
             raise SpecificationError([*findings, *findings_of(files, definitions)])
         compiled = compile_files(files, definitions, margins=margins)
+        return cls.of(
+            compiled, on_fault, patience, trials=trials, trial_patience=trial_patience, slices=slices
+        )
+
+    @classmethod
+    def of(
+        cls,
+        compiled: Compiled,
+        on_fault: OnFault = "drop",
+        patience: Patience = lambda: _never,
+        *,
+        trials: Collection[str] = (),
+        trial_patience: Patience = lambda: _never,
+        slices: int = LIMIT,
+    ) -> "MonitorSet":
+        """The set of what was compiled; the rest as `load` says."""
         uses = {specification.name: specification.uses for specification in compiled.specifications}
         groups = [group for group in sharing(uses) if not group.isdisjoint(trials)]
         tried = []
@@ -409,8 +425,8 @@ class MonitorSet:
             earlier, variables = known.get(monitor.name, (None, {}))
             if (
                 earlier is not None
-                and earlier.code.node == monitor.code.node
-                and (not redefined or redefined.isdisjoint(reached(monitor.code.node, self.definitions)))
+                and earlier.code.identity == monitor.code.identity
+                and (not redefined or redefined.isdisjoint(monitor.code.reached))
             ):
                 self._take_over(monitor, earlier, variables)
             else:

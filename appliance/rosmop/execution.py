@@ -307,7 +307,7 @@ class Execution:
         elif monitor.broken and self.on_fault == "drop":
             outcome.reason = f"{monitor.name} could not begin: its first values or `init` faulted"
         if outcome.reason is not None:
-            outcome.dropped_at = monitor.code.node.position
+            outcome.dropped_at = monitor.code.position
             message.dropped = True
             return True
         monitor.seen = True
@@ -423,6 +423,6 @@ class Execution:
                 try:
                     self._interpreter.function(monitor.code.start[stage])()
                 except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of its beginning and is recorded
-                    self._fault(error, monitor, monitor.code.node.position, outcome)
+                    self._fault(error, monitor, monitor.code.position, outcome)
                     monitor.broken = True
                     beginning.remove(monitor)

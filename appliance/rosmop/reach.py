@@ -5,6 +5,8 @@ What is found may be more than what is used (a string that is the name of a type
 
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
+from hashlib import sha256
+from typing import Any
 
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.syntax import tree
@@ -35,6 +37,20 @@ def reached(node: tree.Specification, definitions: Definitions) -> frozenset[str
             found.add(name)
             waiting += [field.type for field in definitions.message(name).fields]
     return frozenset(found)
+
+
+def identity(node: tree.Specification) -> bytes:
+    """The same for specifications that are the same but for where they stand."""
+    return sha256(repr(_plain(node)).encode()).digest()
+
+
+def _plain(node: Any) -> object:
+    if isinstance(node, tuple):
+        return tuple(map(_plain, node))
+    if is_dataclass(node):
+        parts = (_plain(getattr(node, field.name)) for field in fields(node) if field.compare)
+        return (type(node).__name__, *parts)
+    return node
 
 
 def _names(root: object) -> Iterator[str]:

@@ -9,6 +9,7 @@ from appliance.ros.errors import DefinitionError
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.certify.properties import certificates_of
 from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.sent import encoded
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.specifications.files import SpecificationsRefusedError
 
@@ -17,7 +18,7 @@ def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
     """What is in these files, with these definitions. Raises `SpecificationsRefusedError` with all that is wrong."""
     try:
         definitions = _standard().extended(Definitions.from_files(texts))
-        monitors = MonitorSet.load(files, definitions)
+        monitors = MonitorSet.load(files, definitions, margins=True)
     except SpecificationError as error:
         raise SpecificationsRefusedError([str(finding) for finding in error.findings]) from error
     except DefinitionError as error:
@@ -48,6 +49,7 @@ def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
         {monitor.name: monitor.code.uses for monitor in monitors.monitors},
         {name: monitors.published_by(name) for name in files},
         certificates,
+        encoded(monitors.compiled),
     )
 
 

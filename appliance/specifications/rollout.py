@@ -243,13 +243,12 @@ class Rollout:
         restarted: bool = False,
         ahead: bool = False,
     ) -> messages.SpecificationsStated:
-        files = [(name, text) for name, text in revision.sources.files.items() if of_file(name) == relay]
         mine = {name for name, file in revision.checked.monitors.items() if of_file(file) == relay}
         states = self.states(revision.checked)
         return messages.SpecificationsStated(
             revision.number,
-            files,
-            revision.sources.definitions,
+            [],
+            {},
             {name: states[name] is not False for name in revision.checked.monitors if name in mine},
             restarted,
             self.on_fault,
@@ -258,6 +257,7 @@ class Rollout:
             ahead,
             tuple(name for name in revision.checked.monitors if name in mine and states[name] == TRIAL),
             self.slices,
+            revision.checked.compiled if mine else b"",
         )
 
     # --- what the relays say ---

@@ -10,7 +10,7 @@ class Contents(msgspec.Struct, frozen=True):
 
     `uses` are the other monitors whose variables a monitor uses, `published_by` the topics each file publishes.
     `types` has the message type of each topic, `texts` the full text of each such type. `certificates` says of each
-    property of a monitor whether its automaton was proved to be what is written.
+    property of a monitor whether its automaton was proved to be what is written. `compiled` is what relays run.
     """
 
     monitors: dict[str, str] = {}
@@ -23,6 +23,7 @@ class Contents(msgspec.Struct, frozen=True):
     uses: dict[str, frozenset[str]] = {}
     published_by: dict[str, frozenset[str]] = {}
     certificates: dict[str, list[str]] = {}
+    compiled: bytes = b""
 
 
 class ContentsWanted(Message):

@@ -298,6 +298,7 @@ class SpecificationsStated(Message):
     ahead: bool = False
     trials: tuple[str, ...] = ()
     slices: int = 100_000
+    compiled: bytes = b""
 
 
 class MonitorSwitched(Message):

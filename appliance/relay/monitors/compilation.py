@@ -11,6 +11,7 @@ from appliance.ros.errors import DefinitionError
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.certify.properties import certificates_of
 from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.sent import decoded
 from appliance.rosmop.syntax.errors import SpecificationError
 
 _TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in one go
@@ -19,6 +20,17 @@ _TRIAL_TICKS_SECONDS = 0.02
 
 def compiled(message: SpecificationsStated) -> Result:
     """The set that these specifications make, or what is wrong with them."""
+    if message.compiled:
+        monitors = MonitorSet.of(
+            decoded(message.compiled).part(message.enabled),
+            message.on_fault,
+            _patience,
+            trials=message.trials,
+            trial_patience=lambda: _patience(_TRIAL_TICKS_SECONDS),
+            slices=message.slices,
+        )
+        monitors.write_module()
+        return monitors
     try:
         if not message.files:
             return MonitorSet.load({}, Definitions({}), message.on_fault, _patience)

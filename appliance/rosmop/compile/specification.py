@@ -37,7 +37,8 @@ from appliance.rosmop.ir.interpreter import Interpreter
 from appliance.rosmop.ir.sites import Site
 from appliance.rosmop.logics.catalogue import compile_property
 from appliance.rosmop.logics.interface import CompiledProperty, FormulaError
-from appliance.rosmop.positions import Finding
+from appliance.rosmop.positions import Finding, Position
+from appliance.rosmop.reach import identity, reached
 from appliance.rosmop.runtime.context import MAX_BYTES
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -72,7 +73,12 @@ class SpecificationCode:
     `start` are the functions by which it begins: constants and zeros, first values, `init`.
     """
 
-    node: tree.Specification
+    name: str
+    position: Position
+    identity: bytes
+    """The same for the same text, wherever it stands."""
+    reached: frozenset[str]
+    """The message types that it names, and those they are made of (`reach.py`)."""
     file: str
     hold: bool
     start: tuple[str, ...]
@@ -86,11 +92,6 @@ class SpecificationCode:
     """The comparisons that are noted, in the order of the text."""
     slicing: Slicing | None = None
     """Of a parametric specification: what its slices differ in."""
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        return self.node.name
 
 
 @dataclass(eq=False)
@@ -240,7 +241,10 @@ def _compile(
     variables = {variable.name: variable.code for variable in names.variables.values()}
     uses = frozenset(names.uses)
     return SpecificationCode(
-        specification,
+        specification.name,
+        specification.position,
+        identity(specification),
+        reached(specification, shared.messages.definitions),
         file.name,
         any(modifier.parts == ("hold",) for modifier in specification.modifiers),
         start,

@@ -22,7 +22,7 @@ A ``FiniteProperty`` and a ``ClockedProperty`` offer their tables as well, so th
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, Self
 
 from appliance.rosmop.logics.automaton import Automaton
 from appliance.rosmop.positions import Finding, Position
@@ -91,8 +91,17 @@ class CompiledProperty(ABC):
     expiry = "deadline"
     """What the passing of a run's deadline is called in records (``timeout`` for machines)."""
 
+    made_of: tuple[Any, ...]
+    """What it was made of: all that another process needs to make the same."""
+
     remedy: str | None = None
     """The function of the specification that publishes what was due when a deadline passes (`enforced by`)."""
+
+    def __new__(cls, *made_of: Any) -> Self:
+        """Keep what it is made of."""
+        made = super().__new__(cls)
+        made.made_of = made_of
+        return made
 
     def __init__(self, source: Source, categories: Sequence[str]) -> None:
         self.source = source
