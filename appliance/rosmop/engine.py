@@ -26,21 +26,16 @@ from typing import Any, NamedTuple
 
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.agenda import Agenda, Patience
-from appliance.rosmop.compile.events import EventCode
-from appliance.rosmop.compile.specification import Compiled, compile_files, findings_of
+from appliance.rosmop.compiled import Compiled, EventCode
 from appliance.rosmop.execution import Asked, Execution, OnFault
 from appliance.rosmop.happened import NOBODY, Sender
 from appliance.rosmop.monitor import Monitor, Step, monitors_of
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding, Position
-from appliance.rosmop.reach import redefined
 from appliance.rosmop.runtime.context import TRIAL_BUDGET, Context
 from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.sharing import sharing, way_of
 from appliance.rosmop.slices import LIMIT
-from appliance.rosmop.syntax import tree
-from appliance.rosmop.syntax.errors import SpecificationError
-from appliance.rosmop.syntax.parser import parse
 from appliance.rosmop.walks import Prepared, Walker, Walks, walks_of
 
 
@@ -162,16 +157,9 @@ class MonitorSet:
         `margins` they note how close comparisons of numbers come (`take_margins`). A parametric specification has at
         most so many `slices`.
         """
-        files: list[tree.File] = []
-        findings: list[Finding] = []
-        for name, text in sources.items():
-            try:
-                files.append(parse(text, name))
-            except SpecificationError as error:
-                findings += error.findings
-        if findings:
-            raise SpecificationError([*findings, *findings_of(files, definitions)])
-        compiled = compile_files(files, definitions, margins=margins)
+        from appliance.rosmop.compile.sources import compiled_from  # noqa: PLC0415  the compiler: not in a relay
+
+        compiled = compiled_from(sources, definitions, margins=margins)
         return cls.of(
             compiled, on_fault, patience, trials=trials, trial_patience=trial_patience, slices=slices
         )
@@ -405,7 +393,7 @@ class MonitorSet:
             for part in (before, *before.trials)
             for monitor in part.monitors
         }
-        others = redefined(before.definitions, self.definitions)
+        others = _redefined(before.definitions, self.definitions)
         tried = [trial._follow(known, others, time_ns) for trial in self.trials]
         for monitor in self.tried:
             monitor.held = False
@@ -580,3 +568,11 @@ class MonitorSet:
             return False
 
         return tap
+
+
+def _redefined(before: Definitions, after: Definitions) -> frozenset[str]:
+    """The message types that are in both and not the same."""
+    if before is after:
+        return frozenset()
+    both = set(before.message_types) & set(after.message_types)
+    return frozenset(name for name in both if before.message(name) != after.message(name))

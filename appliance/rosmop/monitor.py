@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol
 
-from appliance.rosmop.compile.events import EventCode
-from appliance.rosmop.compile.specification import Compiled, PropertyCode, SpecificationCode
+from appliance.rosmop.compiled import Compiled, EventCode, PropertyCode, SpecificationCode
 from appliance.rosmop.ir.interpreter import Interpreter
 from appliance.rosmop.logics.interface import Run
 from appliance.rosmop.runtime.context import Context

@@ -11,7 +11,7 @@ import msgspec
 
 from appliance.ros.definitions import Definitions
 from appliance.ros.message_text import MessageDefinition, ServiceDefinition
-from appliance.rosmop.compile.specification import Compiled
+from appliance.rosmop.compiled import Compiled
 from appliance.rosmop.logics.bounded import BoundedProperty
 from appliance.rosmop.logics.cfg import GrammarProperty
 from appliance.rosmop.logics.interface import CompiledProperty, FiniteProperty
@@ -33,7 +33,7 @@ _PROPERTIES = {
 
 def _parts(kind: type) -> Any:
     """The types of what a property is made of, in order."""
-    hints = get_type_hints(kind.__init__)
+    hints = get_type_hints(vars(kind)["__init__"])
     return tuple[tuple(hints[name] for name in list(inspect.signature(kind).parameters))]  # type: ignore[misc]
 
 

@@ -30,8 +30,7 @@ from itertools import repeat
 from operator import contains, getitem
 from typing import Any
 
-from appliance.rosmop.compile.events import EventCode
-from appliance.rosmop.compile.specification import PropertyCode, SpecificationCode
+from appliance.rosmop.compiled import EventCode, PropertyCode, SpecificationCode
 from appliance.rosmop.ir.sites import showing
 from appliance.rosmop.logics.interface import FiniteProperty, Run
 from appliance.rosmop.types import kinds

@@ -16,8 +16,7 @@ from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
-from appliance.rosmop.compile.program import groups
-from appliance.rosmop.compile.specification import Compiled
+from appliance.rosmop.compiled import Compiled
 from appliance.rosmop.happened import SEQ, Sender
 from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, SOONER, TOLD, Feed, FeedModule, module_of
 from appliance.rosmop.ir.interpreter import Interpreter
@@ -30,6 +29,7 @@ from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
 from appliance.rosmop.outcomes import Outcome, Verdict
+from appliance.rosmop.program import groups
 from appliance.rosmop.runtime.context import Context, LogLine, Published
 from appliance.rosmop.runtime.wire import Buffer, moments, numbers, put_moments, put_numbers
 from appliance.rosmop.slices import Key, Slice, Slices

@@ -6,11 +6,11 @@ from dataclasses import replace
 from itertools import islice
 
 from appliance.ros.definitions import Definitions
-from appliance.rosmop.compile.program import groups
-from appliance.rosmop.compile.specification import Compiled
+from appliance.rosmop.compiled import Compiled
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.ir.feed import module_of
 from appliance.rosmop.ir.values import Values
+from appliance.rosmop.program import groups
 from appliance.rosmop.prove.decoding import Code, Instruction
 from appliance.rosmop.prove.equality import EQUAL, Validation
 from tests.unit.rosmop.random_specifications import definitions

@@ -5,7 +5,7 @@ the `when` or a constant of the pattern look at are decoded; only fields that we
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from appliance.ros.errors import DefinitionError
 from appliance.rosmop.compile.conversion import condition, refusal
@@ -16,48 +16,15 @@ from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.compile.scope import Scope, Shared, SpecificationNames
 from appliance.rosmop.compile.slicing import acts, binds, creates
 from appliance.rosmop.compile.statements import check_topic, write
+from appliance.rosmop.compiled import EventCode
 from appliance.rosmop.ir import form
-from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.numbers import f32
-from appliance.rosmop.sharing import way_of
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import UnknownNameError, nearest, shown
 from appliance.rosmop.types.resolve import resolve
-
-
-@dataclass(frozen=True)
-class EventCode:
-    """A compiled event: the name of its function, and what makes it happen.
-
-    `type` is the message type (of a service: that of the request or response), `service_type` the service's.
-    """
-
-    name: str
-    function: str
-    position: Position
-    topic: str | None = None
-    type: str | None = None
-    part: str | None = None
-    service_type: str | None = None
-    period_ns: int | None = None
-    binds: tuple[int, ...] = ()
-    """The parameters of the specification that it binds, by their numbers."""
-    key: str = ""
-    """Of an event on messages of a parametric specification: its function for the values of these."""
-    creates: bool = False
-    """A slice may begin with it."""
-    plain: bool = False
-    """Where its key is known it has happened, and there is nothing to do."""
-    acts: bool = False
-    """Its action does more than to change the slice's own variables."""
-
-    @property
-    def way(self) -> str | None:
-        """What its messages come on: the topic, or the part of a service (see `way_of`); None of a timer."""
-        return self.topic if self.topic is None or self.part is None else way_of(self.topic, self.part)
 
 
 def compile_event(

@@ -11,7 +11,8 @@ import msgspec
 
 from appliance.rosmop.compile.conversion import number
 from appliance.rosmop.compile.places import Value
-from appliance.rosmop.compile.scope import Comparison, Scope
+from appliance.rosmop.compile.scope import Scope
+from appliance.rosmop.compiled import Comparison
 from appliance.rosmop.ir import form
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.types import kinds

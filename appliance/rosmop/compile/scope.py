@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from appliance.rosmop.compile.places import Variable
+from appliance.rosmop.compiled import Comparison, Publication
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.sites import Site, SiteVariable, Symbols
 from appliance.rosmop.ir.values import Values
@@ -50,24 +51,6 @@ class Loan:
     variable: Variable
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A comparison of a specification. `when_true` and `when_false` are variables of the code (double) for its sides.
-
-    The left one is infinite until it came up. `threshold`: the side that is a constant, 0 or 1; None if neither is.
-    """
-
-    position: Position
-    threshold: int | None
-    when_true: tuple[str, str]
-    when_false: tuple[str, str]
-
-    @property
-    def variables(self) -> tuple[str, ...]:
-        """All of them."""
-        return (*self.when_true, *self.when_false)
-
-
 @dataclass(eq=False)
 class SpecificationNames:
     """What one specification declares, and the code's name for its context."""
@@ -108,16 +91,6 @@ class Loop:
     blocks: list[dict[str, Variable]] = field(default_factory=list)
     flag: str | None = None  # of a switch: tells the loop around it to continue
     continued: bool = False  # of a switch: whether a `continue` in it sets the flag
-
-
-@dataclass(frozen=True)
-class Publication:
-    """A topic that a specification publishes, and where it says so."""
-
-    specification: str
-    topic: str
-    type: str
-    position: Position
 
 
 @dataclass

@@ -4,10 +4,9 @@ An event binds a parameter of the specification by one of its own with that name
 one that gives the values that it binds, for which nothing else of the message is read.
 """
 
-from dataclasses import dataclass
-
 from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.compile.scope import Shared, SpecificationNames
+from appliance.rosmop.compiled import Slicing
 from appliance.rosmop.ir import form
 from appliance.rosmop.logics.interface import CompiledProperty
 from appliance.rosmop.logics.past import PastProperty
@@ -21,14 +20,6 @@ from appliance.rosmop.types.resolve import resolve
 MOST_PARAMETERS = 6
 
 _ACTS = (form.Log, form.Throttle, form.Drop, form.Publish, form.Invoke)
-
-
-@dataclass(frozen=True)
-class Slicing:
-    """What slices differ in: the parameters (name in the text, name in the code, type), and their own variables."""
-
-    parameters: tuple[tuple[str, str, kinds.Type], ...]
-    own: tuple[str, ...]
 
 
 def declare_parameters(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:

@@ -3,8 +3,7 @@
 Specifications of one set see each other's variables. Everything wrong with any of them is found in one pass.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TypeVar
 
@@ -15,7 +14,7 @@ from appliance.rosmop.compile.enforcement import (
     topics_of_remedy,
     with_remedy,
 )
-from appliance.rosmop.compile.events import EventCode, compile_event
+from appliance.rosmop.compile.events import compile_event
 from appliance.rosmop.compile.functions import (
     compile_function,
     compile_handler,
@@ -24,25 +23,16 @@ from appliance.rosmop.compile.functions import (
     declare_variables,
 )
 from appliance.rosmop.compile.lint import lint_property, unused_events
-from appliance.rosmop.compile.scope import Comparison, Publication, Shared, SpecificationNames
-from appliance.rosmop.compile.slicing import (
-    Slicing,
-    check_parameters,
-    declare_parameters,
-    slicing_of,
-    unsliceable,
-)
-from appliance.rosmop.ir import form
-from appliance.rosmop.ir.interpreter import Interpreter
-from appliance.rosmop.ir.sites import Site
+from appliance.rosmop.compile.reach import identity, reached
+from appliance.rosmop.compile.scope import Shared, SpecificationNames
+from appliance.rosmop.compile.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
+from appliance.rosmop.compiled import Compiled, PropertyCode, SpecificationCode
 from appliance.rosmop.logics.catalogue import compile_property
 from appliance.rosmop.logics.interface import CompiledProperty, FormulaError
-from appliance.rosmop.positions import Finding, Position
-from appliance.rosmop.reach import identity, reached
+from appliance.rosmop.positions import Finding
 from appliance.rosmop.runtime.context import MAX_BYTES
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
-from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import Messages, nearest, shown
 
 _T = TypeVar("_T")
@@ -51,90 +41,6 @@ _TAKEN = "revisions"
 MODIFIERS = frozenset({"hold"})
 IGNORED_MODIFIERS = frozenset({"unsynchronized", "decentralized", "perthread", "suffix", "creation"})
 """Modifiers of MOP that say how a monitor is generated, and mean nothing here (`creation` does before an event)."""
-
-
-@dataclass(frozen=True)
-class PropertyCode:
-    """A compiled property: its monitor, and for each category that is handled the name of the function.
-
-    `enforcement` says whether and how a violation can be prevented.
-    """
-
-    property: CompiledProperty
-    handlers: Mapping[str, str]
-    order: tuple[str, ...]
-    enforcement: str
-
-
-@dataclass(frozen=True)
-class SpecificationCode:
-    """A compiled specification. `variables` are its shared variables: name in the text to name in the code.
-
-    `start` are the functions by which it begins: constants and zeros, first values, `init`.
-    """
-
-    name: str
-    position: Position
-    identity: bytes
-    """The same for the same text, wherever it stands."""
-    reached: frozenset[str]
-    """The message types that it names, and those they are made of (`reach.py`)."""
-    file: str
-    hold: bool
-    start: tuple[str, ...]
-    context: str
-    events: tuple[EventCode, ...]
-    properties: tuple[PropertyCode, ...]
-    variables: Mapping[str, str]
-    uses: frozenset[str]
-    """The other specifications whose variables it uses."""
-    comparisons: tuple[Comparison, ...] = ()
-    """The comparisons that are noted, in the order of the text."""
-    slicing: Slicing | None = None
-    """Of a parametric specification: what its slices differ in."""
-
-
-@dataclass(eq=False)
-class Compiled:
-    """A set of specifications: their functions in the intermediate form, by name, and what is in them."""
-
-    specifications: tuple[SpecificationCode, ...]
-    warnings: tuple[Finding, ...]
-    functions: Mapping[str, form.Function]
-    sites: Sequence[Site]
-    types: Mapping[str, Type]
-    """Those of variables, by their names in the form."""
-    messages: Messages
-    publications: tuple[Publication, ...]
-
-    def interpreter(self) -> Interpreter:
-        """What runs them, on a state of its own."""
-        contexts = {one.context: one.name for one in self.specifications}
-        return Interpreter(self.functions, self.sites, self.types, contexts, self.messages)
-
-    def part(self, names: Collection[str]) -> "Compiled":
-        """These of the specifications only; all that share variables with one of them must be among them."""
-        return replace(
-            self,
-            specifications=tuple(one for one in self.specifications if one.name in names),
-            publications=tuple(one for one in self.publications if one.specification in names),
-        )
-
-    def is_stamped(self, message_type: str | None) -> bool:
-        """Whether messages of a type begin with a `std_msgs/Header`."""
-        fields = self.messages.definitions.message(message_type).fields if message_type is not None else ()
-        return bool(fields) and fields[0].notation == "std_msgs/Header"
-
-    @property
-    def stamped(self) -> frozenset[str]:
-        """The topics whose messages do."""
-        events = [
-            event
-            for specification in self.specifications
-            for event in specification.events
-            if event.part is None
-        ]
-        return frozenset(event.topic for event in events if event.topic and self.is_stamped(event.type))
 
 
 def compile_files(files: Sequence[tree.File], definitions: Definitions, *, margins: bool = False) -> Compiled:

@@ -19,11 +19,11 @@ from typing import Any
 
 import z3
 
-from appliance.rosmop.compile.program import groups
-from appliance.rosmop.compile.specification import Compiled
+from appliance.rosmop.compiled import Compiled
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.feed import AREA, FeedModule, module_of
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
+from appliance.rosmop.program import groups
 from appliance.rosmop.prove.decoding import functions_of
 from appliance.rosmop.prove.form_terms import Meaning, wrapped
 from appliance.rosmop.prove.module_terms import Done, Execution, made_at

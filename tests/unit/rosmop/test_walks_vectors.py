@@ -8,11 +8,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.rosmop import walks
-from appliance.rosmop.compile.program import groups
 from appliance.rosmop.ir import layout
 from appliance.rosmop.ir.feed import module_of
 from appliance.rosmop.ir.layout import ROOM
 from appliance.rosmop.ir.values import Values
+from appliance.rosmop.program import groups
 from appliance.rosmop.syntax.errors import SpecificationError
 from tests.support.examples import examples
 from tests.unit.rosmop.test_walks import Fed, plain

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from appliance.rosmop.compile.specification import SpecificationCode
+from appliance.rosmop.compiled import SpecificationCode
 from appliance.rosmop.ir import form
 from appliance.rosmop.logics.interface import ClockedProperty, FiniteProperty
 from appliance.rosmop.sharing import connected

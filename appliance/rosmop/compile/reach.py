@@ -12,14 +12,6 @@ from appliance.ros.definitions import Definitions
 from appliance.rosmop.syntax import tree
 
 
-def redefined(before: Definitions, after: Definitions) -> frozenset[str]:
-    """The message types that are in both and not the same."""
-    if before is after:
-        return frozenset()
-    both = set(before.message_types) & set(after.message_types)
-    return frozenset(name for name in both if before.message(name) != after.message(name))
-
-
 def reached(node: tree.Specification, definitions: Definitions) -> frozenset[str]:
     """The message types that a specification names, and those they are made of."""
     messages, services = set(definitions.message_types), set(definitions.service_types)
