@@ -26,7 +26,6 @@ from appliance.channel.messages import (
     NodePlaced,
     PublicationPlaced,
     SpecificationsRefused,
-    SpecificationsStated,
     SpecificationsTaken,
     UpstreamFound,
     UpstreamWanted,
@@ -34,6 +33,7 @@ from appliance.channel.messages import (
 from appliance.config import RecorderRules
 from appliance.supervisor.rings import Rings
 from tests.support.relay_driver import LOOPBACK, ChannelPeer, RelayProcess, call, free_port
+from tests.support.stated import stated
 from tests.support.waiting import eventually
 
 HERE = Path(__file__).parent
@@ -140,7 +140,7 @@ class Relay:
 
     def monitor(self, files: list[tuple[str, str]], definitions: dict[str, str]) -> None:
         """Put these specifications in force."""
-        self._link.send(SpecificationsStated(1, files, definitions, {}, restarted=False))
+        self._link.send(stated(1, files, definitions, {}, restarted=False))
         answer = self._link.wait_for(lambda one: isinstance(one, SpecificationsTaken | SpecificationsRefused))
         if isinstance(answer, SpecificationsRefused):
             raise SystemExit(f"the relay does not take the specifications: {answer.findings}")

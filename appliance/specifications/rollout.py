@@ -247,8 +247,7 @@ class Rollout:
         states = self.states(revision.checked)
         return messages.SpecificationsStated(
             revision.number,
-            [],
-            {},
+            revision.checked.compiled if mine else b"",
             {name: states[name] is not False for name in revision.checked.monitors if name in mine},
             restarted,
             self.on_fault,
@@ -257,7 +256,6 @@ class Rollout:
             ahead,
             tuple(name for name in revision.checked.monitors if name in mine and states[name] == TRIAL),
             self.slices,
-            revision.checked.compiled if mine else b"",
         )
 
     # --- what the relays say ---

@@ -702,7 +702,7 @@ class _Monitors:
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
         """As `Monitors`."""
-        return messages.SpecificationsStated(0, [], {}, {}, restarted=False)
+        return messages.SpecificationsStated(0, b"", {}, restarted=False)
 
 
 @contextlib.contextmanager

@@ -278,8 +278,8 @@ class TrafficReported(Message):
 class SpecificationsStated(Message):
     """Control states the specifications in force: before anything is placed, and at every change.
 
-    `files` are pairs of name and text, in order; `definitions` are `.msg` and `.srv` files by name, besides ROS's own.
-    `enabled` says of each monitor whether its events happen. `restarted`: a relay that has no specifications yet
+    `compiled` is the set of all specifications as the compiler made it (`rosmop/sent.py`; empty: there is none);
+    `enabled` says of each monitor of this relay whether its events happen. `restarted`: a relay that has none yet
     takes the place of one that died, so monitors with the modifier `hold` block their topics. So do those in `moved`:
     they come from another relay, and begin here. `statement` is a number of its own for every statement, which the
     answer has, too: the same revision may be stated again. `ahead`: what is stated after it is carried out when it is
@@ -288,8 +288,7 @@ class SpecificationsStated(Message):
     """
 
     revision: int
-    files: list[tuple[str, str]]
-    definitions: dict[str, str]
+    compiled: bytes
     enabled: dict[str, bool]
     restarted: bool
     on_fault: Literal["drop", "pass"] = "drop"
@@ -298,7 +297,6 @@ class SpecificationsStated(Message):
     ahead: bool = False
     trials: tuple[str, ...] = ()
     slices: int = 100_000
-    compiled: bytes = b""
 
 
 class MonitorSwitched(Message):

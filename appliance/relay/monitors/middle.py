@@ -107,7 +107,7 @@ class Middle:
             if self._stated is not None and not self.blocked and _same(message, self._stated):
                 self._taken(message, [], frozenset())
                 return
-            if not (message.files or message.compiled) and (self._stated is None or self.blocked):
+            if not message.compiled and (self._stated is None or self.blocked):
                 self._stated, self.blocked = message, ""
                 self._taken(message, [], None)
                 return
@@ -390,11 +390,9 @@ def _replaced(before: MonitorSet | None, after: MonitorSet) -> list[Monitor]:
 
 
 def _same(one: SpecificationsStated, other: SpecificationsStated) -> bool:
-    if (one.compiled, one.enabled.keys()) != (other.compiled, other.enabled.keys()):
-        return False
-    return (one.files, one.definitions, one.on_fault, one.trials, one.slices) == (
-        other.files,
-        other.definitions,
+    return (one.compiled, one.enabled.keys(), one.on_fault, one.trials, one.slices) == (
+        other.compiled,
+        other.enabled.keys(),
         other.on_fault,
         other.trials,
         other.slices,

@@ -37,6 +37,11 @@ def taken(statement: messages.SpecificationsStated) -> messages.SpecificationsTa
     return messages.SpecificationsTaken(statement.revision, [], [], statement.statement)
 
 
+def files_of(message: messages.SpecificationsStated) -> list[str]:
+    """The files of the monitors that a relay is told to have."""
+    return list(dict.fromkeys(f"{name[0]}.rv" for name in message.enabled))
+
+
 class Fleet:
     """Two relays and what was done with them, in order; `answer(relay, statement)` is what one says to it."""
 
@@ -63,9 +68,7 @@ class Fleet:
             return False
         assert isinstance(message, messages.SpecificationsStated)
         self.stated.append((relay, message))
-        self.story.append(
-            ("stated", relay, message.revision, [name for name, _ in message.files], message.moved)
-        )
+        self.story.append(("stated", relay, message.revision, files_of(message), message.moved))
         answer = self.answer(relay, message)
         if answer is not None:
             asyncio.get_running_loop().call_soon(self.rollout.received, answer, relay)
@@ -115,8 +118,8 @@ def world(tmp_path: Path) -> Iterator[World]:
 async def test_each_relay_is_told_its_own(world: World) -> None:
     """And of a change, before anything comes into force. What a relay is told first goes ahead of all else."""
     assert world.rollout.statement(0).ahead
-    assert [name for name, _ in world.rollout.statement(0).files] == ["a.rv"]
-    assert [name for name, _ in world.rollout.statement(1).files] == ["b.rv"]
+    assert files_of(world.rollout.statement(0)) == ["a.rv"]
+    assert files_of(world.rollout.statement(1)) == ["b.rv"]
     assert await world.rollout.take(revision(2, **world.files, c=spec("c", "/b"))) == []
     assert not any(one.ahead for _, one in world.fleet.stated)
     assert world.fleet.story[:2] == [("stated", 0, 2, ["a.rv"], ()), ("stated", 1, 2, ["b.rv", "c.rv"], ())]
@@ -150,7 +153,7 @@ async def test_a_relay_that_dies_of_it_refuses_it(world: World) -> None:
         await taking
     world.fleet.away = {1}
     await world.rollout.take(revision(2, **world.files, c=spec("c", "/b")))
-    assert [name for name, _ in world.rollout.statement(1).files] == ["b.rv", "c.rv"]
+    assert files_of(world.rollout.statement(1)) == ["b.rv", "c.rv"]
 
 
 async def test_a_topic_moves_only_between_monitors(world: World) -> None:

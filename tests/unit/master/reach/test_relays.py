@@ -28,6 +28,7 @@ from appliance.shares.pool import Bounds
 from appliance.shares.table import GRANTS
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Plan
 from appliance.store.state import PermissionRow, StateStore
+from tests.support.stated import stated
 
 pytestmark = pytest.mark.anyio
 HOST = ipaddress.ip_address("10.0.0.5")
@@ -151,7 +152,7 @@ class World:
 
     def statement(self, _relay: int) -> messages.SpecificationsStated:
         """As `Monitors`."""
-        return messages.SpecificationsStated(1, [], {}, {}, restarted=False)
+        return stated(1, [], {}, {}, restarted=False)
 
     def relay_lost(self, relay: int) -> None:
         """As `Monitors`."""

@@ -29,6 +29,7 @@ from appliance.relay.monitors.lane import TOO_LONG
 from appliance.relay.monitors.places import Place
 from appliance.ros.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
 from appliance.rosmop.engine import MonitorSet
+from tests.support.stated import stated
 from tests.unit.relay.world import ASK, HEADER, LOOPBACK, Peer, World
 
 STRING_MD5 = "992ce8a1687cec8c8bd883ec73ca41d1"
@@ -69,7 +70,7 @@ class Monitored(World):
     def load(self, *texts: str, revision: int = 1, restarted: bool = False, **enabled: bool) -> Any:
         """State these files; the relay's answer."""
         files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
-        self.state(SpecificationsStated(revision, files, {}, enabled, restarted))
+        self.state(stated(revision, files, {}, enabled, restarted))
         return self.until(
             lambda: self.taken(SpecificationsTaken, revision) or self.taken(SpecificationsRefused, revision)
         )
@@ -210,7 +211,7 @@ def test_the_first_specifications_hold_up_nothing_but_what_is_to_be_carried(
 
     monkeypatch.setattr(Compiler, "compile", staticmethod(compile_late))
     late = GUARD.replace("/chatter", "/late")
-    world.state(SpecificationsStated(1, [("0.rv", late)], {}, {}, True, statement=7))
+    world.state(stated(1, [("0.rv", late)], {}, {}, True, statement=7))
     world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
     world.state(GrantInstalled("k", "/late", LOOPBACK, "/listener"))
     world.state(MonitorSwitched("guard", False))
@@ -231,7 +232,7 @@ def test_statements_that_come_while_the_first_is_compiled_come_into_force_in_ord
     """What waited for the first may be others, and the same again."""
     other = GUARD.replace("/chatter", "/other")
     for revision, text in enumerate((GUARD, other, GUARD, "nonsense", other, other), 1):
-        world.control.send(SpecificationsStated(revision, [("0.rv", text)], {}, {}, True, statement=revision))
+        world.control.send(stated(revision, [("0.rv", text)], {}, {}, True, statement=revision))
     world.link.catch_up()
     world.until(lambda: any(getattr(one, "revision", 0) == 6 for one in world.told))
     answers = [one for one in world.told if isinstance(one, SpecificationsTaken | SpecificationsRefused)]
@@ -258,7 +259,7 @@ def test_what_a_new_control_begins_with_is_in_force_before_it_places_anything(
         return compile_now(message)
 
     monkeypatch.setattr(Compiler, "compile", staticmethod(compile_late))
-    world.state(SpecificationsStated(2, [("0.rv", text)], {}, {}, True, ahead=True))
+    world.state(stated(2, [("0.rv", text)], {}, {}, True, ahead=True))
     world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
     assert ("k", "/late") not in world.engine.topics
     compiled.set()
@@ -271,7 +272,7 @@ def test_bad_specifications_change_nothing(world: Monitored) -> None:
     world.load(GUARD)
     refused = world.load("nonsense", revision=2)
     assert isinstance(refused, SpecificationsRefused)
-    assert refused.findings[0].startswith("0.rv:1:")
+    assert refused.findings[0].startswith("what control states is no set of specifications")
     publisher, subscriber = world.typed()
     publisher.send(string("bad") + string("good"))
     world.gets(subscriber, string("good"))
@@ -629,7 +630,7 @@ def test_what_happens_without_a_control_is_told_to_the_next_one(world: Monitored
     world.link.close()
     world.control.close()
     world.connect_control()
-    world.state(SpecificationsStated(1, [("0.rv", GUARD)], {}, {}, True))
+    world.state(stated(1, [("0.rv", GUARD)], {}, {}, True))
     assert world.event("drop", count=0).monitor == "guard"
 
 
@@ -644,7 +645,7 @@ def test_nothing_is_lost_while_specifications_come_and_go(world: Monitored) -> N
     for revision in range(1, 7):
         text = specification % revision
         files = [] if revision == 4 else [("a.rv", text)]
-        world.control.send(SpecificationsStated(revision, files, {}, {"mark": revision != 5}, False))
+        world.control.send(stated(revision, files, {}, {"mark": revision != 5}, False))
         while world.taken(SpecificationsTaken, revision) is None:
             world.push(publisher, b"".join(string(f" {sent + number}") for number in range(100)))
             sent += 100
@@ -690,13 +691,13 @@ def test_a_monitor_that_comes_from_another_relay_holds_its_topics_if_it_is_decla
     free = "free() { event e() /other std_msgs/String '{}' { } }"
     world.load(free)
     files = [("gate.rv", held), ("free.rv", free)]
-    world.state(SpecificationsStated(2, files, {}, {}, False, moved=("gate", "free")))
+    world.state(stated(2, files, {}, {}, False, moved=("gate", "free")))
     taken = world.until(lambda: world.taken(SpecificationsTaken, 2))
     assert (taken.began, taken.held) == (["gate"], ["gate"])
-    world.state(SpecificationsStated(3, files, {}, {}, False, moved=("gate", "free")))
+    world.state(stated(3, files, {}, {}, False, moved=("gate", "free")))
     assert world.until(lambda: world.taken(SpecificationsTaken, 3)).held == ["gate"]
     world.state(MonitorResumed("gate"))
-    world.state(SpecificationsStated(4, files, {}, {}, False, moved=("gate", "free")))
+    world.state(stated(4, files, {}, {}, False, moved=("gate", "free")))
     assert world.until(lambda: world.taken(SpecificationsTaken, 4)).held == []
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from appliance.channel.messages import Message, MonitorRow, SpecificationsStated
+from appliance.channel.messages import Message, MonitorRow
 from appliance.relay.connections.frames import FrameReceiver, Scratch
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
@@ -28,6 +28,7 @@ from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.walks import FUEL, SliceWalker, Walked
 from tests.support.examples import examples
 from tests.support.relay_memory import share
+from tests.support.stated import stated
 from tests.unit.rosmop.acting import message
 from tests.unit.rosmop.random_specifications import Messages, Specifications, Traffic, definitions
 
@@ -81,7 +82,7 @@ class Monitored:
         self.set = MonitorSet.load(texts, known, on_fault, trials=trials)
         if together:
             self.set.write_module()
-        self.middle.compiled(SpecificationsStated(1, [], {}, {}, restarted=restarted), self.set)
+        self.middle.compiled(stated(1, [], {}, {}, restarted=restarted), self.set)
 
     def close(self) -> None:
         """End."""

@@ -10,11 +10,11 @@ from appliance.channel.messages import (
     MonitorsCounted,
     MonitorsReported,
     PublicationRefused,
-    SpecificationsStated,
     SpecificationsTaken,
 )
 from appliance.relay.monitors import trials
 from appliance.ros.tcpros import encode_frame, encode_header, encode_service_reply
+from tests.support.stated import stated
 from tests.unit.relay.monitors.test_middle import (
     GUARD,
     TYPED,
@@ -32,7 +32,7 @@ class Trying(Monitored):
     def state_trials(self, *texts: str, tried: tuple[str, ...] = (), revision: int = 1) -> list[str]:
         """State these; those that began."""
         files = [(f"{number}.rv", text) for number, text in enumerate(texts)]
-        self.state(SpecificationsStated(revision, files, {}, {}, False, trials=tried))
+        self.state(stated(revision, files, {}, {}, False, trials=tried))
         taken: SpecificationsTaken = self.until(lambda: self.taken(SpecificationsTaken, revision))
         return taken.began
 

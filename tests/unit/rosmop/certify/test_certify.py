@@ -9,7 +9,6 @@ from random import Random
 import pytest
 
 import appliance.rosmop.certify
-from appliance.channel.messages import SpecificationsStated
 from appliance.relay.loop import Loop
 from appliance.relay.monitors.compiler import Compiler
 from appliance.rosmop.certify.check import MOST_STEPS, Tables, certify
@@ -23,6 +22,7 @@ from appliance.rosmop.logics.tfsm import TimedMachine
 from appliance.rosmop.positions import Position
 from appliance.specifications.files import Sources, SpecificationsRefusedError, check
 from tests.support.examples import examples
+from tests.support.stated import stated
 
 EVENTS = ["a", "b", "c", "d"]
 ORIGIN = Position("x.rv", 1, 1)
@@ -288,7 +288,7 @@ def test_a_compiler_that_is_wrong_loads_nothing(monkeypatch: pytest.MonkeyPatch)
         return FiniteProperty(source, ("violation", "validation"), Automaton(0, ((0, 0),), ((),)))
 
     stated = [
-        SpecificationsStated(1, [("guard.rv", SPECIFICATION)], {}, {"guard": True}, False, trials=trials)
+        stated(1, [("guard.rv", SPECIFICATION)], {}, {"guard": True}, False, trials=trials)
         for trials in ((), ("guard",))
     ]
     compiler = Compiler(Loop(), lambda _message, _result: None)

@@ -1,0 +1,36 @@
+"""What control states to a relay, of texts that are compiled here as the compiler does it."""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+from appliance.channel.messages import SpecificationsStated
+from appliance.ros.definitions import Definitions
+from appliance.ros.standard import standard_definitions
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.sent import encoded
+from appliance.rosmop.syntax.errors import SpecificationError
+
+NOTHING_LIKE_IT = b"\xc1"
+
+_standard = cache(standard_definitions)
+
+
+def stated(
+    revision: int,
+    files: Sequence[tuple[str, str]],
+    definitions: Mapping[str, str] = {},
+    enabled: Mapping[str, bool] = {},
+    restarted: bool = False,
+    **more: Any,
+) -> SpecificationsStated:
+    """A statement of these files; monitors that are not in `enabled` are. Of wrong ones it is no set at all."""
+    if not files:
+        return SpecificationsStated(revision, b"", {}, restarted, **more)
+    known = _standard().extended(Definitions.from_files(definitions))
+    try:
+        monitors = MonitorSet.load(dict(files), known, margins=True)
+    except SpecificationError:
+        return SpecificationsStated(revision, NOTHING_LIKE_IT, dict(enabled), restarted, **more)
+    switches = {monitor.name: enabled.get(monitor.name, True) for monitor in monitors.monitors}
+    return SpecificationsStated(revision, encoded(monitors.compiled), switches, restarted, **more)
