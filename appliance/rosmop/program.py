@@ -108,7 +108,7 @@ def _key(
     specifications: Sequence[SpecificationCode], number: int, index: int
 ) -> tuple[str, tuple[Type, ...]]:
     slicing = specifications[number].slicing
-    assert slicing is not None
+    assert slicing is not None  # noqa: S101  the caller has looked
     return specifications[number].events[index].key, tuple(kind for _, _, kind in slicing.parameters)
 
 
