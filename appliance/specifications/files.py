@@ -1,6 +1,6 @@
 """Files of specifications: read from the folder, checked as a whole, named by what is in them.
 
-What is checked here is compiled again in the relay; nothing comes into force that either refuses.
+What was compiled for the check is what relays run.
 """
 
 from collections.abc import Mapping, Sequence

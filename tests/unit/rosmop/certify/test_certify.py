@@ -9,11 +9,8 @@ from random import Random
 import pytest
 
 import appliance.rosmop.certify
-from appliance.relay.loop import Loop
-from appliance.relay.monitors.compiler import Compiler
 from appliance.rosmop.certify.check import MOST_STEPS, Tables, certify
 from appliance.rosmop.certify.properties import certificate_of
-from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics import catalogue
 from appliance.rosmop.logics.automaton import Automaton
 from appliance.rosmop.logics.catalogue import compile_property
@@ -22,7 +19,6 @@ from appliance.rosmop.logics.tfsm import TimedMachine
 from appliance.rosmop.positions import Position
 from appliance.specifications.files import Sources, SpecificationsRefusedError, check
 from tests.support.examples import examples
-from tests.support.stated import stated
 
 EVENTS = ["a", "b", "c", "d"]
 ORIGIN = Position("x.rv", 1, 1)
@@ -287,17 +283,9 @@ def test_a_compiler_that_is_wrong_loads_nothing(monkeypatch: pytest.MonkeyPatch)
     def compile_wrong(source: Source) -> FiniteProperty:
         return FiniteProperty(source, ("violation", "validation"), Automaton(0, ((0, 0),), ((),)))
 
-    stated = [
-        stated(1, [("guard.rv", SPECIFICATION)], {}, {"guard": True}, False, trials=trials)
-        for trials in ((), ("guard",))
-    ]
-    compiler = Compiler(Loop(), lambda _message, _result: None)
-    assert all(isinstance(compiler.compile(one), MonitorSet) for one in stated)
     monkeypatch.setattr(catalogue, "LOGICS", {**catalogue.LOGICS, "ltl": compile_wrong})
     with pytest.raises(SpecificationsRefusedError) as refused:
         check(Sources({"guard.rv": SPECIFICATION}), ())
-    for one in stated:  # the relay makes its own of the same text
-        assert compiler.compile(one) == refused.value.findings
     assert refused.value.findings == [
         "guard.rv:5:10: error: the automaton of this property is not what is written: after a a the automaton says"
         " nothing, the definition violation; this is a defect of the appliance: nothing is loaded with it; report it"
