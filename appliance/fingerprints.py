@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from urllib.parse import quote
 
 
-def fingerprint(text: str) -> str:
-    """SHA-256 of a text, in hexadecimal."""
-    return hashlib.sha256(text.encode()).hexdigest()
+def fingerprint(text: str | bytes) -> str:
+    """SHA-256 of a text, or of bytes, in hexadecimal."""
+    return hashlib.sha256(text.encode() if isinstance(text, str) else text).hexdigest()
 
 
 def fingerprint_of_all(texts: Mapping[str, str]) -> str:

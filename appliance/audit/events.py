@@ -37,7 +37,7 @@ EVENTS: dict[str, str] = {
     "packets refused": "Packets of tunnels were dropped: sent again, or under another's address (user-space ESP only).",
     "specifications confirmed": "Specifications that were loaded on trial were confirmed and stay in force.",
     "specifications loaded": "Specifications of monitors came into force; `detail` has who, which files changed, and"
-    " the hash of all of them.",
+    " the hashes of all of them and of what they were compiled to, which is what relays run.",
     "specifications refused": "Specifications have errors and were refused whole; those before stay in force.",
     "monitor enabled": "A monitor was switched on; `detail` has who.",
     "monitor disabled": "A monitor was switched off: messages pass it untouched; `detail` has who.",

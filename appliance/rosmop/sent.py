@@ -69,7 +69,7 @@ _DECODER = msgspec.msgpack.Decoder(Compiled, dec_hook=_made)
 
 
 def encoded(compiled: Compiled) -> bytes:
-    """The set as bytes."""
+    """The set as bytes: of the same set always the same."""
     definitions = compiled.messages.definitions
     reached = {name for one in compiled.specifications for name in one.reached}
     reached |= {one.type for one in compiled.publications}
@@ -84,7 +84,7 @@ def encoded(compiled: Compiled) -> bytes:
     def plain(value: Any) -> Any:
         return used if value is compiled.messages else _plain(value)
 
-    return msgspec.msgpack.encode(compiled, enc_hook=plain)
+    return msgspec.msgpack.encode(compiled, enc_hook=plain, order="deterministic")
 
 
 def decoded(data: bytes) -> Compiled:

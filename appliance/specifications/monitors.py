@@ -35,7 +35,7 @@ from appliance.audit_trail import AuditTrail
 from appliance.channel import admin, messages
 from appliance.channel.answers import monitors as answers
 from appliance.channel.answers.monitors import Replaced, Switched
-from appliance.fingerprints import fingerprint_of_all
+from appliance.fingerprints import fingerprint, fingerprint_of_all
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError
 from appliance.specifications.folder import SpecificationFolder
@@ -533,6 +533,7 @@ class Monitors:
             who=by or who,
             revision_of_specifications=row.revision,
             sha256=fingerprint_of_all(sources.named()),
+            compiled_sha256=fingerprint(checked.compiled),
             monitors=list(checked.monitors),
             added=added,
             changed=changed,

@@ -157,6 +157,8 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
     ]
     of_all = [hashlib.sha256("".join(some).encode()).hexdigest() for some in (lines[:1], lines, lines[:1])]
     assert [fields["sha256"] for fields in loaded] == of_all, "what sha256sum makes of the files"
+    compiled = [fields["compiled_sha256"] for fields in loaded]
+    assert compiled[0] == compiled[2] != compiled[1], "the same of the same texts, whoever compiled them"
 
 
 async def test_a_reload_takes_nothing_away_that_the_folder_did_not_bring(desk: Desk) -> None:
