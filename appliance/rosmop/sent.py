@@ -34,7 +34,7 @@ _PROPERTIES = {
 def _parts(kind: type) -> Any:
     """The types of what a property is made of, in order."""
     hints = get_type_hints(vars(kind)["__init__"])
-    return tuple[tuple(hints[name] for name in list(inspect.signature(kind).parameters))]  # type: ignore[misc]
+    return tuple[tuple(hints[name] for name in list(inspect.signature(kind).parameters))]  # type: ignore[misc]  # made here
 
 
 _MADE_OF = {name: _parts(kind) for name, kind in _PROPERTIES.items()}
