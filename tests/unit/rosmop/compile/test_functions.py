@@ -3,7 +3,7 @@
 import pytest
 
 from appliance.rosmop.engine import MonitorSet
-from tests.unit.rosmop.acting import definitions, message, refused, shown
+from tests.unit.rosmop.acting import definitions, load, message, refused, shown
 
 EVENT = "event e(int x) %s std_msgs/Int32 '{data:x}' { %s }"
 READERS = [
@@ -76,3 +76,17 @@ def test_declarations_of_cpp(before: str, expression: str | None, value: str) ->
         assert value in refused("s() {" + before + EVENT % ("/t", "") + "}")[0].text
     else:
         assert shown(expression, conversion="%d", before=before) == value
+
+
+def test_a_fault_behind_a_call_is_told_where_the_call_stands() -> None:
+    """And not where the function ended that was called before it in the same statement."""
+    text = """s() { int n;
+    int f(int a) {
+        return a;
+    }
+    void keep(int a, sensor_msgs::JointState state) { n = a; }
+    event e(int seq) /t sensor_msgs/JointState '{header.seq:seq}' {
+        keep(f(1), MESSAGE);
+    } }"""
+    (fault,) = load(text).process("/t", bytes(4), 0).faults
+    assert fault.position.line == 7
