@@ -7,8 +7,7 @@ Invariants:
 1. The folder is the baseline and only read; what is loaded, replaced or removed while the robot runs is a revision in
    the store (`revisions.py`) and survives a restart, as the switches (`switches.py`) do.
 2. New specifications are compiled before anything changes, by the process that `check` asks; bad ones change nothing
-   and say everything that is wrong with them. The relays are given what was compiled,
-   and have the last word.
+   and say everything that is wrong with them. The relays are given what was compiled, and have the last word.
 3. What is loaded joins monitors on trial that it shares variables with; no load and no switch takes one that is in
    force along.
 4. A reload takes what the folder has, and leaves what the folder does not have in force unless it is told to remove
