@@ -29,6 +29,7 @@ from appliance.rosmop.agenda import Agenda, Patience
 from appliance.rosmop.compiled import Compiled, EventCode
 from appliance.rosmop.execution import Asked, Execution, OnFault
 from appliance.rosmop.happened import NOBODY, Sender
+from appliance.rosmop.ir.abi import FeedModule
 from appliance.rosmop.monitor import Monitor, Step, monitors_of
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding, Position
@@ -279,9 +280,15 @@ class MonitorSet:
         return None
 
     def write_module(self) -> None:
-        """Write the module that `walker` offers the walks of."""
+        """Have the module written that `walker` offers the walks of."""
+        from appliance.rosmop.modules import module_of  # noqa: PLC0415  the compiler: not in a relay
+
+        self.take_module(module_of(self.compiled))
+
+    def take_module(self, module: FeedModule) -> None:
+        """Offer the walks of this module, which was written of these specifications without those on trial."""
         self._silent.clear()
-        self._walks = walks_of(self.compiled, self.interpreter, self._monitors, self._agenda.when_due)
+        self._walks = walks_of(self.compiled, module, self.interpreter, self._monitors, self._agenda.when_due)
 
     def explain_when(self, asked: Asked, tried: Asked) -> None:
         """Explain only verdicts that are asked for, by themselves and the source of the message; and those on trial."""

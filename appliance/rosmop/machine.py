@@ -61,20 +61,21 @@ class MachineTrap(Exception):  # noqa: N818  its name in WebAssembly
 class Machine:
     """A module, which has no imports, and the memory that it exports as `memory`.
 
+    `code` is what `translated` has made, with the same `limit`; nothing else may be given, for it is run as it is.
     `limit` is how large the memory may become, in bytes. Raises `MachineError`, and `MachineTrap` for what the module
     does at its start.
     """
 
     def __init__(self, code: bytes, limit: int) -> None:
         c = load()
-        engine = _engine(max(limit - 1, PAGE - 1).bit_length())
+        engine = _engine(_bits(limit))
         store = _Store(engine, limit)
         self._store: _Store | None = store
         self._functions: dict[str | int, Call] = {}
         self._memory: _Export | None = None
         self._view = memoryview(b"")
         module, instance, trap = ctypes.c_void_p(), (ctypes.c_uint64 * 2)(), ctypes.c_void_p()
-        _check(c.wasmtime_module_new(engine, code, len(code), ctypes.byref(module)))
+        _check(c.wasmtime_module_deserialize(engine, code, len(code), ctypes.byref(module)))
         try:
             _check(c.wasmtime_context_set_fuel(store.context, _FUEL_AT_START))
             _check(c.wasmtime_instance_new(store.context, module, None, 0, instance, ctypes.byref(trap)))
@@ -192,13 +193,32 @@ _C: dict[str, tuple[Any, ...]] = {  # what each function gives, and what it take
     "wasmtime_memory_data_size": (_SIZE, _P, _P),
     "wasmtime_memory_grow": (_P, _P, _P, ctypes.c_uint64, _P),
     "wasmtime_module_delete": (None, _P),
+    "wasmtime_module_deserialize": (_P, _P, _P, _SIZE, _P),
     "wasmtime_module_new": (_P, _P, _P, _SIZE, _P),
+    "wasmtime_module_serialize": (_P, _P, _P),
     "wasmtime_store_context": (_P, _P),
     "wasmtime_store_delete": (None, _P),
     "wasmtime_store_limiter": (None, _P, *[ctypes.c_int64] * 5),
     "wasmtime_store_new": (_P, _P, _P, _P),
     "wasmtime_trap_code": (ctypes.c_bool, _P, _P),
 }
+
+
+def translated(code: bytes, limit: int) -> bytes:
+    """A module of WebAssembly as code of this machine, for a `Machine` with this limit; the same gives the same.
+
+    Raises `MachineError` where it is no module.
+    """
+    c, module, native = load(), ctypes.c_void_p(), _Vector()
+    _check(c.wasmtime_module_new(_engine(_bits(limit)), code, len(code), ctypes.byref(module)))
+    try:
+        _check(c.wasmtime_module_serialize(module, ctypes.byref(native)))
+    finally:
+        c.wasmtime_module_delete(module)
+    try:
+        return ctypes.string_at(native.data, native.size)
+    finally:
+        c.wasm_byte_vec_delete(ctypes.byref(native))
 
 
 @cache
@@ -216,6 +236,10 @@ def load() -> ctypes.PyDLL:
         function = getattr(library, name)
         function.restype, function.argtypes = result, given
     return library
+
+
+def _bits(limit: int) -> int:
+    return max(limit - 1, PAGE - 1).bit_length()
 
 
 @cache

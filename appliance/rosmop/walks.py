@@ -18,13 +18,27 @@ from typing import Any, NamedTuple, Protocol
 
 from appliance.rosmop.compiled import Compiled
 from appliance.rosmop.happened import SEQ, Sender
-from appliance.rosmop.ir.feed import AREA, LEFT, LOUD, SOONER, TOLD, Feed, FeedModule, module_of
+from appliance.rosmop.ir.abi import (
+    AREA,
+    BEYOND,
+    LEFT,
+    LOUD,
+    MOST_KEPT,
+    POSITION,
+    REST,
+    ROOM,
+    SOONER,
+    SURE,
+    TOLD,
+    UNDO,
+    Cells,
+    Feed,
+    FeedModule,
+)
 from appliance.rosmop.ir.interpreter import Interpreter
 from appliance.rosmop.ir.kept import KeptMessage
-from appliance.rosmop.ir.layout import POSITION, REST, ROOM, SURE, UNDO, Cells
 from appliance.rosmop.ir.output import HEAD
 from appliance.rosmop.ir.output import Key as Noted
-from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
@@ -665,14 +679,14 @@ class Walks(NamedTuple):
     area: memoryview | None = None
 
 
-def walks_of(compiled: Compiled, interpreter: Interpreter, monitors: Sequence[Monitor], due: Due) -> Walks:
-    """The walkers of all topics that can have one; their monitors are told where their state is."""
-    found = list(groups(compiled.specifications))
-    components = [group.component for group in found]
-    values = Values(compiled.messages)
-    module = module_of(compiled.functions, components, values, compiled.stamped)
+def walks_of(
+    compiled: Compiled, module: FeedModule, interpreter: Interpreter, monitors: Sequence[Monitor], due: Due
+) -> Walks:
+    """The walkers of all topics that the module of a set has; their monitors are told where their state is."""
     if not module.feeds and not module.keyed:
         return Walks()
+    found = list(groups(compiled.specifications))
+    values = Values(compiled.messages)
     machine = Machine(module.code, module.memory)
     walks: dict[str, Walker] = {}
     for group, cells in zip(found, module.cells, strict=True):

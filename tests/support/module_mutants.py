@@ -8,7 +8,7 @@ from itertools import islice
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.compiled import Compiled
 from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.ir.feed import module_of
+from appliance.rosmop.ir.feed import written
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.program import groups
 from appliance.rosmop.prove.decoding import Code, Instruction
@@ -152,7 +152,7 @@ def faulty(text: str, every: int = 1) -> Iterator[tuple[str, str]]:
     code = compiled(text)
     (group,) = groups(code.specifications)
     values = Values(code.messages)
-    module = module_of(code.functions, [group.component], values)
+    module = written(code.functions, [group.component], values)
     validation = Validation(code.functions, values, module, time.monotonic, patience=100)
     ((topic, (one,)),) = group.component.topics
     assert validation.finding(topic, "s.e", one.function, 0).answer == EQUAL

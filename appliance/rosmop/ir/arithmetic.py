@@ -3,7 +3,8 @@
 from math import inf
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.layout import NOW, NotScalarError, is_signed, machine_type
+from appliance.rosmop.ir.abi import NOW
+from appliance.rosmop.ir.layout import NotScalarError, is_signed, machine_type
 from appliance.rosmop.ir.parts import Parts
 from appliance.rosmop.ir.wasm import (
     ABS,

@@ -1,6 +1,6 @@
 """The walk over a read, as WebAssembly: frame by frame, the events of every message in order, patches in place.
 
-`module_of` writes one module for a set: for each topic an export `feed(at, end, now)` that takes the frames
+`written` writes one module for a set: for each topic an export `feed(at, end, now)` that takes the frames
 (4 bytes of length, little-endian, and the message) from `at` to before `end` in the memory, and answers where the first
 one begins that is left (i64: the low 32 bits), how many effects there are (the next 24), and `LEFT` if that one is for
 Python.
@@ -25,10 +25,23 @@ from dataclasses import dataclass
 
 from appliance.rosmop.happened import NO_NUMBER, SEQ
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.abi import (
+    AREA,
+    LEFT,
+    NOW,
+    POSITION,
+    ROOM,
+    SAID,
+    SURE,
+    TOLD,
+    UNDO,
+    Cells,
+    Feed,
+    FeedModule,
+)
 from appliance.rosmop.ir.assembly import PAGE, assembled
-from appliance.rosmop.ir.layout import NOW, POSITION, ROOM, SAID, SURE, UNDO, Cells, NotScalarError
+from appliance.rosmop.ir.layout import NotScalarError
 from appliance.rosmop.ir.module import CHANGED, DROPPED, HAPPENED, RESET, Writer, Written
-from appliance.rosmop.ir.output import Key, Line, Publication
 from appliance.rosmop.ir.parts import ELSEWHERE
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.ir.wasm import (
@@ -52,13 +65,6 @@ from appliance.rosmop.why import CLOCKED_ROOM, ENTRY, KEPT, RING, RUNS
 EFFECT = 4
 """Where the address of the last effect stands."""
 
-AREA = 512 << 10
-"""Bytes of frames that are fed together: as many as one read takes."""
-
-LEFT = 1 << 62
-SOONER = 1 << 61
-TOLD = 1 << 60
-LOUD = 1 << 63
 MAX_EVENTS = 63
 MAX_VERDICTS = 63
 MAX_EFFECTS = 4096
@@ -72,71 +78,25 @@ _BR, _BR_IF, _LOOP, _BLOCK = b"\x0c", b"\x0d", b"\x03\x40", b"\x02\x40"
 
 
 @dataclass(frozen=True)
-class Feed:
-    """The walk for one topic: the name of its export, which events may drop or change, where events are counted.
+class WrittenModule(FeedModule):
+    """A module whose `code` is WebAssembly, and what else there is to know of it."""
 
-    `verdicts` have the place of an event, of its step of a property, and of the handler. `log` is where the log of
-    patches begins, `undo` the addresses of variables and of what they held before the message that is left. `brief`:
-    it has no loops. `functions` are the numbers of those of the events in the module. `says`: it may put out
-    lines or publish; all before the address at `SURE` are. `publishes`: the contexts and topics of what it may publish.
-    """
-
-    name: str
-    droppers: frozenset[int]
-    writers: frozenset[int]
-    verdicts: Sequence[tuple[int, int, int]]
-    counters: int
-    log: int
-    undo: tuple[tuple[int, int], ...]
-    brief: bool
-    functions: Sequence[int]
-    says: bool
-    settle: str
-    """The export that is called when what was done to the message that is left is taken back; none if it is empty."""
-    publishes: Sequence[tuple[str, str]]
-
-
-@dataclass(frozen=True)
-class FeedModule:
-    """A module: its bytes, how much memory it has, where frames are put and effects stand, the topics that it takes,
-    and where each component keeps its state.
-
-    `throttles`: where it must stand (i64, ns) when output at a site was last due, by the context and the site.
-    """
-
-    code: bytes
-    memory: int
-    frames: int
-    effects: int
-    feeds: Mapping[str, Feed]
-    cells: Sequence[Cells]
-    throttles: Mapping[tuple[str, int], int]
     budgets: Mapping[str, int]
     """Where the budget of each specification stands, by its context."""
-    lines: Sequence[Line | Publication]
     strings: Mapping[bytes, int]
     """Where constant strings stand."""
     rooms: Sequence[range]
     """Where vectors stand that are kept or made."""
-    said: int
-    """Where lines of output and publications are noted, by their places among the `lines`."""
-    publications: Mapping[tuple[str, str], int]
-    """Where it must stand (i64) whether what a context publishes on a topic is only counted."""
     places: Sequence[range]
     """What it uses for messages that it makes."""
-    keyed: Mapping[str, Feed]
-    """Exports `keys(at, end, most)` for the keyed topics: they note what frames bind, of so many at most, where lines
-    are noted, and answer where the first one begins that was not looked at, or is left.
-    """
-    keys: Sequence[Key]
 
 
-def module_of(
+def written(
     functions: Mapping[str, form.Function],
     components: Sequence[form.Component],
     values: Values,
     stamped: Container[str] = (),
-) -> FeedModule:
+) -> WrittenModule:
     """The module of all topics that can have a walk. The messages of the `stamped` begin with a `std_msgs/Header`."""
     shared: dict[str, Cells] = {}
     writer = Writer(functions, shared, values)
@@ -183,7 +143,7 @@ def module_of(
     codes += [_keys(writer, *noting) for noting in keyed.values()]
     wholes += [(_PARAMETERS, I64, code) for code in codes]
     code = assembled(wholes, exports, writer.constants, memory)
-    return FeedModule(
+    return WrittenModule(
         code,
         memory,
         frames,
@@ -191,15 +151,15 @@ def module_of(
         feeds,
         cells,
         writer.throttles,
-        writer.budgets,
         writer.lines,
-        {raw: writer.constants[raw] for raw in writer.strings},
-        writer.rooms,
         writer.said,
         writer.publications,
-        writer.places,
         {topic: _noting(place, written) for place, (topic, (written, _)) in enumerate(keyed.items())},
         writer.keys,
+        writer.budgets,
+        {raw: writer.constants[raw] for raw in writer.strings},
+        writer.rooms,
+        writer.places,
     )
 
 

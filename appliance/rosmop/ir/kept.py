@@ -4,7 +4,7 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from appliance.rosmop.ir.texts import BEYOND
+from appliance.rosmop.ir.abi import BEYOND
 from appliance.rosmop.ir.values import Values, packer, struct_code, unpacker
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type

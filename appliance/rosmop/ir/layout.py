@@ -1,33 +1,20 @@
-"""What stands where in the memory of a module, and how large the values of a type are there.
+"""What stands where in the memory of a module, and how large the values of a type are there. See `abi.py`."""
 
-A variable of the set stands at its address, in 8 bytes: a number, or of a string (`texts.py`) or vector (`vectors.py`)
-where it is and how long; a message stands as it is sent (`records.py`).
-"""
-
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
 
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.abi import FIRST, ROOM, Cells
 from appliance.rosmop.ir.output import Key, Line, Publication
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.ir.wasm import F32, F64, I32, I64
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
-POSITION, UNDO, SAID, NOW, SURE, REST, FIRST = 0, 8, 12, 16, 24, 32, 40
-"""Where it stands which frame is looked at, where the log and the lines end, the time, where the lines end of the
-messages before, and how many bytes the message has behind those that are shown (i64); and what is given out begins.
-"""
-
 LINES = 64 << 10
 """Bytes for lines of output and messages that are published; a message whose line has no room is left."""
 
 MOST_MADE = 1024
 """Bytes of a message that is made or kept here, without what its strings have."""
-
-
-ROOM = 8 << 10
-"""Bytes of a vector that a variable keeps, or that is made."""
 
 MAX_ROOMS = 16 << 20
 """Bytes that all vectors of a set may take."""
@@ -51,72 +38,6 @@ def machine_type(kind: Type) -> int:
 def is_signed(kind: Type) -> bool:
     """Whether numbers of the type may be negative."""
     return not isinstance(kind, kinds.Integer) or kind.signed
-
-
-@dataclass
-class Cells:
-    """Where the state of specifications that share topics or variables stands: 8 bytes for each property's state, then
-    for each variable that is used. Those that are `noted` only are not undone.
-    """
-
-    base: int
-    properties: int
-    source: int = 0
-    """Where the sender of what is looked at stands (`Sender.source` from bit 32 on), what is told, and which are
-    enabled: three i64 (see `feed.py`).
-    """
-    noted: frozenset[str] = frozenset()
-    exits: dict[int, int] = field(default_factory=dict)
-    """Where it is kept how the states of a property were left (`why.Exits`, `why.ClockedSteps`), by its number."""
-    clocks: dict[int, int] = field(default_factory=dict)
-    """Where it stands when the clock of a property began, and its time (`ClockedRun`), by its number."""
-    until: int = 0
-    """Where it stands (i64) when the next is due that Python knows of: an earlier deadline is told."""
-    variables: dict[str, tuple[int, Type]] = field(default_factory=dict)
-    """Where each stands, and its type; in the order of the places."""
-    texts: dict[int, int] = field(default_factory=dict)
-    """Where strings may be put when there is 0 (i32) at `generation`, by where that is noted (`texts.py`)."""
-    records: dict[str, tuple[int, kinds.Record]] = field(default_factory=dict)
-    """Where each variable that is a message stands, and its type."""
-    sizes: dict[str, int] = field(default_factory=dict)
-    """The bytes of each of these, a multiple of 8."""
-    inner: dict[str, Sequence[int]] = field(default_factory=dict)
-    """Where it is noted in each of these where its strings are."""
-    known: dict[str, int] = field(default_factory=dict)
-    """Where it stands (i64) whether each of these is here: Python may have a time that no message can have."""
-    generation: int = 0
-    settle: int = 0
-    """The number of the function that puts them there."""
-    vectors: dict[str, int] = field(default_factory=dict)
-    """Where the elements of a vector may be, by the variable that holds it: the first of two places of `ROOM` bytes.
-    Behind them stands what the variable was before the message at hand.
-    """
-
-    @property
-    def kept(self) -> Sequence[int]:
-        """Where it is noted where strings are."""
-        return [at for name in (*self.variables, *self.records) for at in self.texts_of(name)]
-
-    def texts_of(self, name: str) -> Sequence[int]:
-        """The same of one variable."""
-        if name in self.records:
-            return self.inner[name]
-        address, kind = self.variables[name]
-        return (address,) if isinstance(kind, kinds.String) else ()
-
-    def address(self, name: str, kind: Type) -> int:
-        """Where a variable stands."""
-        if not isinstance(kind, kinds.String | kinds.Vector):
-            machine_type(kind)
-        place = self.base + 8 * (self.properties + len(self.variables))
-        return self.variables.setdefault(name, (place, kind))[0]
-
-    def words(self, name: str) -> Sequence[int]:
-        """Where the 8 bytes of a variable stand, or each 8 of a message."""
-        if name not in self.records:
-            return (self.variables[name][0],)
-        begin = self.records[name][0]
-        return range(begin, begin + self.sizes[name], 8)
 
 
 class Layout:
@@ -147,6 +68,14 @@ class Layout:
         self._spare = 0
         self.said = self.take(LINES)
         """Where lines stand."""
+
+    def variable(self, name: str, kind: Type) -> int:
+        """Where a variable of the set stands."""
+        cells = self.shared[name]
+        if not isinstance(kind, kinds.String | kinds.Vector):
+            machine_type(kind)
+        place = cells.base + 8 * (cells.properties + len(cells.variables))
+        return cells.variables.setdefault(name, (place, kind))[0]
 
     def size(self, kind: Type) -> int:
         """The bytes of every value of a type in a message. Raises `NotScalarError` where they differ."""

@@ -29,12 +29,9 @@ from types import MappingProxyType
 from typing import Any
 
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.abi import NOW, ROOM, UNDO, Cells
 from appliance.rosmop.ir.arithmetic import to_floating
 from appliance.rosmop.ir.layout import (
-    NOW,
-    ROOM,
-    UNDO,
-    Cells,
     Layout,
     NotScalarError,
     is_signed,
@@ -471,7 +468,7 @@ class _Body(Records):
         cells = self._writer.shared.get(node.name)
         if cells is None:
             return self._get(node.name, machine)
-        return self._cell(_LOADS[machine], cells.address(node.name, node.type))
+        return self._cell(_LOADS[machine], self._writer.variable(node.name, node.type))
 
     def _assigned_to(self, node: form.Assign) -> bytes:
         if isinstance(node.type, kinds.String):
@@ -487,14 +484,14 @@ class _Body(Records):
         if cells is None:
             return value + self._set(node.name, machine)
         self._assigned.add(node.name)
-        return self._cell(_STORES[machine], cells.address(node.name, node.type), value)
+        return self._cell(_STORES[machine], self._writer.variable(node.name, node.type), value)
 
     def _assign(self, node: form.Assign) -> bytes:
         return self._assigned_to(node) + self._read(form.Read(node.type, node.name))
 
     def _log(self, node: form.Log) -> bytes:
         """Note the values of a line, and what line it is."""
-        line, number = Line(node, self._context), len(self._locals)
+        line, number = Line(self._context, node), len(self._locals)
         code, cost, stores = b"", constant(I64, line.cost), b""
         for place, value in enumerate(line.values):
             first, slot, size = self._slot(value, f"value {place} {number}", HEAD.size + 8 * place)

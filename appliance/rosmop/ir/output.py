@@ -13,6 +13,8 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import msgspec
+
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.functions import FAULTING, FUNCTIONS
 from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, OUTPUT_COST, LogLine, Published, line_of
@@ -33,11 +35,12 @@ _SHORT = 1024  # bytes of a text whose size is not charged
 _Make = Callable[[Sequence[object]], object]
 
 
-class _Noted:
-    """What is noted of values, and how they are read."""
+class _Noted(msgspec.Struct, tag=True, array_like=True, dict=True):
+    """What is noted of values, and how they are read: data that can be sent, and what is made of them."""
 
-    def __init__(self, context: str, values: Sequence[form.Expression]) -> None:
-        self.context = context
+    context: str
+
+    def _note(self, values: Sequence[form.Expression]) -> None:
         self._texts = [place for place, expression in enumerate(values) if is_text(expression)]
         self._slots = struct.Struct("<" + "".join(map(_code, values)))
         self.size = HEAD.size + self._slots.size
@@ -55,21 +58,23 @@ class _Noted:
 class Key(_Noted):
     """What a message binds of the parameters of a specification; `function` is that which notes it."""
 
-    def __init__(self, context: str, values: Sequence[form.Expression], function: str) -> None:
-        super().__init__(context, values)
-        self.function = function
+    values: Sequence[form.Expression]
+    function: str
+
+    def __post_init__(self) -> None:
+        self._note(self.values)
 
 
 class Line(_Noted):
     """A line: the `values` that it is made of, and how many bytes it may have besides those of its strings."""
 
-    def __init__(self, node: form.Log, context: str) -> None:
-        self.node = node
-        self.level = node.level
+    node: form.Log
+
+    def __post_init__(self) -> None:
         self.values: list[form.Expression] = []
         self.longest = 0
-        self._make = self._made(node.text)
-        super().__init__(context, self.values)
+        self._make = self._made(self.node.text)
+        self._note(self.values)
 
     @property
     def cost(self) -> int:
@@ -80,7 +85,7 @@ class Line(_Noted):
         """The line that stands there."""
         text = self._make(self.values_at(memory, at))
         assert isinstance(text, bytes)  # noqa: S101  as its type says
-        return line_of(self.level, text, monitor)
+        return line_of(self.node.level, text, monitor)
 
     def _made(self, node: form.Expression) -> _Make:
         """How a part of the text is made of the values."""
@@ -105,30 +110,31 @@ class Line(_Noted):
         return lambda values: values[place]
 
 
-class Publication:
+class Publication(msgspec.Struct, tag=True, array_like=True, dict=True):
     """A message that is published; `room` and `texts`: the bytes of what is noted of it, and where its strings are."""
 
-    def __init__(self, node: form.Publish, context: str, room: int, texts: Sequence[int]) -> None:
-        self.context = context
-        self.cost = OUTPUT_COST + room
-        self.size = HEAD.size + -(-room // 8) * 8
-        self.node = node
-        self._room = room
-        self._texts = texts
+    context: str
+    node: form.Publish
+    room: int
+    texts: Sequence[int]
+
+    def __post_init__(self) -> None:
+        self.cost = OUTPUT_COST + self.room
+        self.size = HEAD.size + -(-self.room // 8) * 8
 
     def put_out(self, memory: memoryview, at: int, monitor: str) -> Published:
         """The message that stands there."""
         node, begin = self.node, at + HEAD.size
-        if not self._texts:
-            data = bytes(memory[begin : begin + self._room])
+        if not self.texts:
+            data = bytes(memory[begin : begin + self.room])
             return Published(monitor, node.topic, node.kind.name, data, node.site)
         done = begin
         pieces: list[bytes | memoryview] = []
-        for text in self._texts:
+        for text in self.texts:
             where, size = _TEXT.unpack_from(memory, begin + text)
             pieces += (memory[done : begin + text], _LENGTH.pack(size), memory[where : where + size])
             done = begin + text + _TEXT.size
-        pieces.append(memory[done : begin + self._room])
+        pieces.append(memory[done : begin + self.room])
         return Published(monitor, node.topic, node.kind.name, b"".join(pieces), node.site)
 
 

@@ -8,8 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.abi import REST
 from appliance.rosmop.ir.arithmetic import Arithmetic
-from appliance.rosmop.ir.layout import REST, NotScalarError, machine_type
+from appliance.rosmop.ir.layout import NotScalarError, machine_type
 from appliance.rosmop.ir.values import struct_code, struct_size
 from appliance.rosmop.ir.wasm import I32, I64, LOAD, constant, unsigned
 from appliance.rosmop.runtime.times import BILLION

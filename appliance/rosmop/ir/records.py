@@ -12,10 +12,10 @@ from functools import partial
 from typing import Any
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.layout import LINES, MOST_MADE, POSITION, SAID, NotScalarError, machine_type
+from appliance.rosmop.ir.abi import BEYOND, MOST_KEPT, POSITION, SAID
+from appliance.rosmop.ir.layout import LINES, MOST_MADE, NotScalarError, machine_type
 from appliance.rosmop.ir.output import HEAD, Key, Line, Publication
 from appliance.rosmop.ir.places import loaded, root, root_of
-from appliance.rosmop.ir.texts import BEYOND, MOST_KEPT
 from appliance.rosmop.ir.values import struct_code, struct_size
 from appliance.rosmop.ir.vectors import Vectors
 from appliance.rosmop.ir.wasm import COMPARE, F32, F64, I32, I64, MOVES, STORE, constant, unsigned
@@ -284,7 +284,7 @@ class Records(Vectors):
         if size > MOST_MADE:
             raise NotScalarError(f"{kind} of {size} bytes")
         texts = [at for at, leaf in self._layout.leaves(kind) if isinstance(leaf, kinds.String)]
-        publication = Publication(node, self._context, size, texts)
+        publication = Publication(self._context, node, size, texts)
         counted = self._cell(0x29, self._layout.publication(self._context, node.topic))
         self._publishes.add((self._context, node.topic))
         code = self._when(counted + b"\x50", self._elsewhere)

@@ -10,7 +10,8 @@ only that is known (`BEYOND`); the message that looks at it is left.
 """
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.layout import Cells, Layout, NotScalarError
+from appliance.rosmop.ir.abi import MOST_KEPT, Cells
+from appliance.rosmop.ir.layout import Layout, NotScalarError
 from appliance.rosmop.ir.places import Places
 from appliance.rosmop.ir.wasm import (
     COMPARE,
@@ -29,12 +30,6 @@ from appliance.rosmop.ir.wasm import (
 )
 from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION
 from appliance.rosmop.types import kinds
-
-MOST_KEPT = 1024
-"""Bytes of a string that a variable keeps."""
-
-BEYOND = 0xFFFFFFFF
-"""In the place of the length of a longer one."""
 
 
 class Texts(Places):
@@ -55,7 +50,7 @@ class Texts(Places):
         if isinstance(node, form.Conditional):
             return self._chosen(node)
         if isinstance(node, form.Read) and node.name in self._layout.shared:
-            at = self._layout.shared[node.name].address(node.name, node.type)
+            at = self._layout.variable(node.name, node.type)
             code = self._cell(0x28, at) + self._cell(0x35, at + 4)
             return self._noted(code, MOST_KEPT)
         return super()._elements(node)
@@ -89,7 +84,7 @@ class Texts(Places):
         if cells is None:
             code = first + place + count + self._set(f"count of {node.name}", I64)
             return code + self._set(f"place of {node.name}")
-        at = cells.address(node.name, node.type)
+        at = self._layout.variable(node.name, node.type)
         code, place, count = self._noted(first + place + count, MOST_KEPT)
         self._assigned.add(node.name)
         return code + self._cell(0x36, at, place) + self._cell(0x36, at + 4, count + b"\xa7")

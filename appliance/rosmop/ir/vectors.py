@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.layout import ROOM, NotScalarError, is_signed, machine_type
+from appliance.rosmop.ir.abi import ROOM
+from appliance.rosmop.ir.layout import NotScalarError, is_signed, machine_type
 from appliance.rosmop.ir.places import loaded, root_of
 from appliance.rosmop.ir.texts import Texts, turns
 from appliance.rosmop.ir.values import struct_code, struct_size
@@ -89,7 +90,7 @@ class Vectors(Texts):
         if cells is not None:
             if node.name not in cells.vectors:
                 cells.vectors[node.name] = self._layout.room(2 * ROOM + 8)
-            at = cells.address(node.name, kind)
+            at = self._layout.variable(node.name, kind)
             return _Room(node.name, kind.element, size, cells.vectors[node.name], at)
         if node.name not in self._made:
             raise NotScalarError(f"{kind} of a message")

@@ -21,7 +21,8 @@ import z3
 
 from appliance.rosmop.compiled import Compiled
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.feed import AREA, FeedModule, module_of
+from appliance.rosmop.ir.abi import AREA
+from appliance.rosmop.ir.feed import WrittenModule, written
 from appliance.rosmop.ir.values import Values, struct_code, struct_size
 from appliance.rosmop.program import groups
 from appliance.rosmop.prove.decoding import functions_of
@@ -80,7 +81,7 @@ def findings_of(
     """What is known of every event of a set but timers, in their order; `patience` in seconds of the clock for each."""
     found = list(groups(compiled.specifications))
     values = Values(compiled.messages)
-    module = module_of(compiled.functions, [group.component for group in found], values)
+    module = written(compiled.functions, [group.component for group in found], values)
     validation = Validation(compiled.functions, values, module, clock, patience)
     for group in found:
         for (topic, events), numbers in zip(group.component.topics, group.events, strict=True):
@@ -102,7 +103,7 @@ class Validation:
         self,
         functions: Mapping[str, form.Function],
         values: Values,
-        module: FeedModule,
+        module: WrittenModule,
         clock: Callable[[], float],
         patience: float = PATIENCE,
     ) -> None:

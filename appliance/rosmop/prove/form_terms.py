@@ -245,7 +245,7 @@ class Meaning:
 
     def _log(self, node: form.Log, state: State) -> None:
         """A line costs the most that it can."""
-        line = Line(node, "")
+        line = Line("", node)
         cost, words = integer(line.cost, 64), []
         for expression in line.values:
             value = self._value(expression, state)

@@ -36,12 +36,12 @@ def main(*_given: Any) -> None:
 
 def run_modules(*_given: Any) -> None:
     """The entry of a relay's stand-in: run modules, the second when the first has long been at work, and tell of it."""
-    from appliance.rosmop.machine import Machine, MachineTrap  # noqa: PLC0415  within the walls, as a relay loads it
+    from appliance.rosmop.machine import Machine, MachineTrap, translated  # noqa: PLC0415  within the walls, as a relay loads it
 
     told: dict[str, Any] = {"before": len(_executable()), "results": [], "traps": []}
     machines = []
     for _ in range(2):
-        one = Machine(DIVIDES, 1 << 24)
+        one = Machine(translated(DIVIDES, 1 << 24), 1 << 24)
         machines.append(one)
         one.reserve(1 << 24)
         one.memory[-1] = 1

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.rosmop import machine
-from appliance.rosmop.machine import PAGE, Machine, MachineError, MachineTrap
+from appliance.rosmop.machine import PAGE, Machine, MachineError, MachineTrap, translated
 from tests.support.examples import examples
 
 LIMIT = 4 * PAGE
@@ -33,9 +33,14 @@ TRAPS = {
 }
 
 
+def run(code: bytes, limit: int = LIMIT) -> Machine:
+    """A machine of this module."""
+    return Machine(translated(code, limit), limit)
+
+
 def made(text: str, limit: int = LIMIT, pages: str = "1") -> Machine:
     """A machine of these functions."""
-    return Machine(bytes(wasmtime.wat2wasm(f'(module (memory (export "memory") {pages}) {text})')), limit)
+    return run(bytes(wasmtime.wat2wasm(f'(module (memory (export "memory") {pages}) {text})')), limit)
 
 
 def trap_of(one: Machine, name: str | int, *arguments: int, fuel: int = FUEL) -> MachineTrap:
@@ -164,7 +169,7 @@ def test_the_limit_is_whole_pages_of_what_is_given(limit: int) -> None:
 def test_what_is_no_machine(code: str | bytes, reason: str) -> None:
     """It is refused with the reason."""
     with pytest.raises(MachineError, match=reason):
-        Machine(code if isinstance(code, bytes) else bytes(wasmtime.wat2wasm(code)), LIMIT)
+        run(code if isinstance(code, bytes) else bytes(wasmtime.wat2wasm(code)))
 
 
 def test_what_a_module_does_at_its_start_is_bounded_too() -> None:
@@ -228,7 +233,7 @@ def test_damaged_modules(changes: list[tuple[int, int]], length: int, argument: 
         code[at] = value
     other = made("", PAGE)
     with contextlib.suppress(MachineError, MachineTrap):
-        one = Machine(bytes(code[:length]), LIMIT)
+        one = run(bytes(code[:length]))
         for number in range(8):
             for arguments in ((), (argument,), (argument, 3), (argument, 3, argument)):
                 with contextlib.suppress(MachineError, MachineTrap, struct.error):
@@ -270,8 +275,9 @@ def test_many_machines_need_few_addresses() -> None:
     done = subprocess.run(
         [sys.executable, "-c", f"""
 import resource, wasmtime
-from appliance.rosmop.machine import Machine
+from appliance.rosmop.machine import Machine, translated
 code = bytes(wasmtime.wat2wasm('(module (memory (export "memory") 1) (func (export "f") unreachable))'))
+code = translated(code, 1 << 20)
 Machine(code, 1 << 20)
 had = int(open("/proc/self/statm").read().split()[0]) * {resource.getpagesize()}
 resource.setrlimit(resource.RLIMIT_AS, (had + (400 << 20), had + (400 << 20)))
@@ -292,8 +298,9 @@ def test_traps_come_without_signals() -> None:
     done = subprocess.run(
         [sys.executable, "-c", f"""
 import faulthandler, wasmtime
-from appliance.rosmop.machine import Machine, MachineTrap
-one = Machine(bytes(wasmtime.wat2wasm({f'(module (memory (export "memory") 1) {fails})'!r})), 1 << 16)
+from appliance.rosmop.machine import Machine, MachineTrap, translated
+code = bytes(wasmtime.wat2wasm({f'(module (memory (export "memory") 1) {fails})'!r}))
+one = Machine(translated(code, 1 << 16), 1 << 16)
 faulthandler.enable()
 for number in range(5):
     try:

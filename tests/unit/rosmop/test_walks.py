@@ -13,7 +13,8 @@ from appliance.rosmop import walks
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.execution import OnFault
 from appliance.rosmop.happened import Sender
-from appliance.rosmop.ir.feed import AREA, MAX_EFFECTS
+from appliance.rosmop.ir.abi import AREA
+from appliance.rosmop.ir.feed import MAX_EFFECTS
 from appliance.rosmop.ir.layout import LINES
 from appliance.rosmop.ir.places import MOST_TEXTS
 from appliance.rosmop.logics.interface import ClockedRun, FiniteRun

@@ -6,8 +6,8 @@ from random import Random
 import pytest
 
 from appliance.rosmop import walks
+from appliance.rosmop.ir.abi import MOST_KEPT
 from appliance.rosmop.ir.layout import LINES, MOST_MADE
-from appliance.rosmop.ir.texts import MOST_KEPT
 from appliance.rosmop.runtime.context import BUDGET, OUTPUT_COST
 from tests.unit.rosmop.random_specifications import Messages, definitions
 from tests.unit.rosmop.test_walks import STAMPED, Fed, event, plain

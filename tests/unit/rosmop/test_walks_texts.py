@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.rosmop import walks
-from appliance.rosmop.ir.texts import MOST_KEPT
+from appliance.rosmop.ir.abi import MOST_KEPT
 from tests.support.examples import examples
 from tests.unit.rosmop.test_walks import Fed, plain
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from appliance.rosmop import walks
 from appliance.rosmop.ir import layout
-from appliance.rosmop.ir.feed import module_of
-from appliance.rosmop.ir.layout import ROOM
+from appliance.rosmop.ir.abi import ROOM
+from appliance.rosmop.ir.feed import written
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.program import groups
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -429,7 +429,7 @@ def test_it_is_charged_as_in_the_interpreter(body: str) -> None:
     fed.check([stamped((1.0,) * 700, 1)], "/stamped")
     compiled = fed.monitors.compiled
     found = [group.component for group in groups(compiled.specifications)]
-    module = module_of(compiled.functions, found, Values(compiled.messages), compiled.stamped)
+    module = written(compiled.functions, found, Values(compiled.messages), compiled.stamped)
     ((context, address),) = module.budgets.items()
     fed.check([stamped((), 2)], "/stamped")
     assert fed.came == {"together": 2, "passed": 2}

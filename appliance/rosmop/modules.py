@@ -1,0 +1,18 @@
+"""The module of a set: written as WebAssembly and translated for this machine, by who has compiled the set."""
+
+from dataclasses import fields
+
+from appliance.rosmop.compiled import Compiled
+from appliance.rosmop.ir.abi import FeedModule
+from appliance.rosmop.ir.feed import written
+from appliance.rosmop.ir.values import Values
+from appliance.rosmop.machine import translated
+from appliance.rosmop.program import groups
+
+
+def module_of(compiled: Compiled) -> FeedModule:
+    """The module of all of these specifications, which `MonitorSet.take_module` takes."""
+    components = [group.component for group in groups(compiled.specifications)]
+    module = written(compiled.functions, components, Values(compiled.messages), compiled.stamped)
+    parts = {part.name: getattr(module, part.name) for part in fields(FeedModule)}
+    return FeedModule(**parts | {"code": translated(module.code, module.memory)})
