@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 from appliance.policy.compiler import compile_policy
 from appliance.policy.findings import Findings, PolicyError
 from appliance.policy.judgement import Known, judge
-from appliance.policy.model import Address, Category, Request
+from appliance.policy.keys import levels
+from appliance.policy.model import Address, Category, Request, Rule
 from appliance.policy.policy import Policy
 from appliance.policy.reader import Entry, SectionText, Word, read
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
@@ -113,29 +114,37 @@ def _sections(text: str) -> list[SectionText]:
 def _changed(policy: Policy, text: str, right: Right, word: str) -> tuple[str, str]:
     """The text with one line more or one word more, and that line."""
     request = right.request
-    decision = decide_right(policy, right)
-    key = request.resource
-    if policy.decide(request).allowed and not policy.decide(request).would_deny:
-        # What is refused is below the key: by a rule of its own there, or by the one for all that has none.
-        below = decision.rule is not None and _key_of(decision.rule.key, request).startswith(f"{key}/")
-        key = _key_of(decision.rule.key, request) if below and decision.rule is not None else f"{key}/**"
-    written = f"{request.category.value} {key}" if request.category in PARAMETERS else key
-    section = next(
-        (section for section in _sections(text) if section.name.text == BY_CATEGORY[request.category].name),
-        None,
-    )
+    rule, key = decide_right(policy, right).rule, request.resource
+    name = BY_CATEGORY[request.category].name
+    section = next((section for section in _sections(text) if section.name.text == name), None)
+    itself = policy.decide(request)
+    if itself.allowed and not itself.would_deny:
+        key = _below(request.resource, rule)  # what is refused is there
+        if section is not None and word in _holders(section, f"{request.category} {key}"):
+            # A pattern for other names as well (/*/max) refuses it still, until all that is below has a rule.
+            table = policy.tables[request.category]
+            above = table.tree.inherited(request.resource) or table.default
+            rule, key = above.rule if above is not None else None, _below(request.resource, None)
+        if key == _below(request.resource, None) and itself.rule not in (None, rule):
+            # The key /arm/** speaks of /arm as well: that keeps by a key of its own whom it has.
+            own = f"{request.category} {request.resource}"
+            if section is not None and _entry(section, own) is None:
+                rule, key = itself.rule, request.resource
+    elif key == "/":  # which is no key of a rule
+        key = "/**"
+    written = f"{request.category} {key}" if request.category in PARAMETERS else key
     entry = None if section is None else _entry(section, written)
     if entry is not None:
         return _with_word(text, entry, word)
-    holders = [] if section is None or decision.rule is None else _holders(section, decision.rule.key)
-    return _with_line(
-        text, section, BY_CATEGORY[request.category].name, f"{written} = {' '.join([*holders, word])}"
-    )
+    holders = [] if section is None or rule is None else _holders(section, rule.key)
+    return _with_line(text, section, name, f"{written} = {' '.join(dict.fromkeys([*holders, word]))}")
 
 
-def _key_of(key: str, request: Request) -> str:
-    """The key of a rule without the word that says what it is for (`read /x`)."""
-    return key.split(" ", 1)[-1] if request.category in PARAMETERS else key
+def _below(name: str, rule: Rule | None) -> str:
+    """What a rule (`write /*/max`) says of what is below a parameter: a key of its own there, or all that has none."""
+    of_rule = rule.key.split(" ", 1)[-1] if rule is not None else DEFAULT
+    own = of_rule[1:].split("/")[len(levels(name)) :] if of_rule != DEFAULT else []
+    return "/".join([name.rstrip("/"), *(own or ["**"])])
 
 
 def _entry(section: SectionText, key: str) -> Entry | None:
@@ -196,7 +205,7 @@ def asked(host: str, caller_id: str, category: str, resource: str, detail: Mappi
     category, _, needed = str(detail.get("needs", "")).partition(" ")
     # What the call was about held other parameters, or stood in its way: only the record knows.
     if category in PARAMETERS:
-        right = replace(request, category=Category(category), resource=needed.removesuffix("/**"))
+        right = replace(request, category=Category(category), resource=needed.removesuffix("/**") or "/")
         namespace = needed.endswith("/**")
         rights.append(Right(right, namespace=namespace, alone=not namespace))
     return Asked(request, rights)

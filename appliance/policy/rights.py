@@ -56,8 +56,9 @@ class Right(NamedTuple):
     alone: bool = False
 
     def __str__(self) -> str:
-        """`write /arm/**` for a namespace, `write /arm` for what is asked alone, `node /it`."""
-        return f"{self.request.category} {self.request.resource}{'/**' if self.namespace else ''}"
+        """`write /arm/**` for a namespace (`read /**` for all), `write /arm` for what is asked alone, `node /it`."""
+        name = self.request.resource
+        return f"{self.request.category} {name.rstrip('/') + '/**' if self.namespace else name}"
 
 
 def category_of(call: str) -> Category:

@@ -9,7 +9,7 @@ import pytest
 from appliance.policy.compiler import compile_policy
 from appliance.policy.grant import Asked, UngrantableError, asked, grant
 from appliance.policy.judgement import Known
-from appliance.policy.model import Category, Request
+from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, rights_of, rights_of_call
 from appliance.ros.parameter_tree import Tree
@@ -108,12 +108,20 @@ def test_a_call_about_a_parameter_needs_the_parameter_too() -> None:
     ]
 
 
-PARAMETERS = (
-    "[Nodes]\ndefault = *\n[Commands]\ndefault = *\n[Parameters]\n"
-    "read /arm = 10.0.0.9\nwrite /arm = 10.0.0.9\nread default = 10.0.0.1\nwrite default = 10.0.0.1\n"
-)
+FREE = "[Nodes]\ndefault = *\n[Commands]\ndefault = *\n[Parameters]\n"
+PARAMETERS = [
+    FREE + rules.replace(", ", "\n")
+    for rules in (
+        "read /arm = 10.0.0.9, write /arm = 10.0.0.9, read default = 10.0.0.1, write default = 10.0.0.1",
+        "read /arm/max = 10.0.0.1, write /arm/max = 10.0.0.1, read default = *, write default = *",
+        "read /*/max = 10.0.0.1, write /*/max = 10.0.0.1, read default = *, write default = *",
+        "read /*/max/** = 10.0.0.1, write /l*/** = 10.0.0.1, write /a* = 10.0.0.1, read default = *, write default = *",
+        "read /** = 10.0.0.1, write /** = 10.0.0.1, write /arm* = 10.0.0.9, read /leg/** = 10.0.0.9",
+    )
+]
 
 
+@pytest.mark.parametrize("text", PARAMETERS)
 @pytest.mark.parametrize(
     ("call", "key", "value", "tree"),
     [
@@ -122,30 +130,34 @@ PARAMETERS = (
         ("setParam", "/arm", 1, {"arm": {"max": 3}}),
         ("setParam", "/leg/max/x", 1, {"leg": {"max": 3}}),
         ("deleteParam", "/leg", None, {"leg": {"max": 3}}),
+        ("getParam", "/", None, {"leg": {"max": 3}}),
+        ("hasParam", "/", None, {"leg": {"max": 3}}),
     ],
 )
 def test_what_a_record_alone_knows_of_a_parameter_is_granted(
-    call: str, key: str, value: Value, tree: Tree
+    text: str, call: str, key: str, value: Value, tree: Tree
 ) -> None:
-    """That it held others, that its value does, that it stood in the way of another: refused once, granted for good."""
-    text = PARAMETERS
+    """That it held others, that its value does, that it stood in the way of another; and to nobody else."""
+
+    def answer(policy: Policy, host: object, key: str = key, tree: Tree = tree) -> Decision:
+        command = request(Category.COMMAND, call, host)
+        return decide(policy, rights_of_call(command, call, key, value=value, tree=tree))
+
+    before = compiled(text)
     for _ in range(3):
-        policy = compiled(text)
-        decision = decide(
-            policy, rights_of_call(request(Category.COMMAND, call), call, key, value=value, tree=tree)
-        )
+        decision = answer(compiled(text), HOST)
         if decision.allowed:
             break
-        found = grant(
-            text,
-            "p.ini",
-            KNOWN,
-            asked(str(HOST), "/it", "command", call, {"call": call, "key": key, "needs": decision.needs}),
-        )
+        detail = {"call": call, "key": key, "needs": decision.needs}
+        found = grant(text, "p.ini", KNOWN, asked(str(HOST), "/it", "command", call, detail))
         assert found.added, decision
         text = found.text
     assert decision.allowed
-    assert text != PARAMETERS
+    trees: list[Tree] = [{}, {"arm": {"max": 3}}, {"leg": {"max": {"x": 3}}}]
+    keys = ["/", "/arm", "/arm/max", "/arm/min", "/leg", "/leg/max", "/leg/max/x", "/leg/y", "/foot/max"]
+    for other, there, name in product((OTHER, ipaddress.ip_address("10.0.0.1")), trees, keys):
+        was, now = (answer(policy, other, name, there).allowed for policy in (before, compiled(text)))
+        assert now is was, (other, name, there, text)
 
 
 def test_a_text_keeps_how_its_lines_end() -> None:
