@@ -12,6 +12,7 @@ from appliance.channel.answers.graph import Topic, TopicMessage
 from appliance.cli import completion
 from appliance.cli.output import printable, refused, say, say_json, usage_error
 from appliance.cli.target import Appliance, speaks
+from appliance.ros.message_view import CUT
 
 _AT_ONCE = 20  # messages of one look
 _Topic = Annotated[str, typer.Argument(metavar="TOPIC", show_default=False, autocompletion=completion.topics)]
@@ -79,7 +80,7 @@ def _described(topic: Topic) -> Iterator[str]:
 
 
 def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
-    value = message.fields if field is None else _part(message.fields, field)
+    value = message.fields if field is None else part_of(message.fields, field)
     if as_json:
         say_json({**in_full(message), "fields": value})
         return
@@ -90,18 +91,29 @@ def _show(message: TopicMessage, field: str | None, *, as_json: bool) -> None:
         say(line)
 
 
-def _part(fields: Any, path: str) -> Any:
-    """A field of a field. Ends the program with 2 where there is none."""
+def part_of(fields: Any, path: str) -> Any:
+    """A field of a field, or the sign that it is left out (`… 704 more`). Ends the program with 2 if there is none."""
     value = fields
     for name in path.split("."):
         if isinstance(value, Mapping) and name in value:
             value = value[name]
         elif isinstance(value, list) and name.isdecimal() and int(name) < len(value):
             value = value[int(name)]
+        elif sign := _left_out(value, name):
+            return sign
         else:
             known = ", ".join(map(str, value)) if isinstance(value, Mapping) else "no fields"
             raise usage_error(f"there is no field {path}: {name} is not among {known}")
     return value
+
+
+def _left_out(value: Any, name: str) -> str:
+    """The sign that what is asked for may be there and is not shown; empty where there is none."""
+    if isinstance(value, Mapping):
+        return str(value.get(CUT, ""))
+    last = value[-1] if isinstance(value, list) and value else value
+    numbered = name.isdecimal() or last == CUT
+    return CUT + last.partition(CUT)[2] if isinstance(last, str) and CUT in last and numbered else ""
 
 
 def lines_of(value: Any, depth: int) -> Iterator[str]:

@@ -50,6 +50,8 @@ class _Reader:
             except (_EndError, _CutError) as end:
                 fields[field.name] = end.value if isinstance(end, _CutError) else CUT
                 fields |= {after.name: CUT for after in islice(following, MOST_FIELDS)}
+                if unnamed := sum(1 for _ in following):
+                    fields[CUT] = _more(unnamed)
                 raise _CutError(fields) from None
         return fields
 

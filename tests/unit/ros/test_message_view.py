@@ -95,6 +95,14 @@ def test_every_field_is_named_where_the_bytes_end() -> None:
     assert cut["intensities"] == cut["names"] == cut["data"] == cut["last"] == CUT
 
 
+def test_fields_that_are_too_many_to_name_are_counted() -> None:
+    """A message of a thousand fields says how many are not there."""
+    wide = Definitions.from_files({"a/Wide.msg": "".join(f"int8 f{number}\n" for number in range(1000))})
+    fields = read_fields(wide, "a/Wide", b"\0" * 1000)
+    assert fields is not None
+    assert fields[CUT] == f"{CUT} {1000 - (len(fields) - 1)} more"
+
+
 def test_what_a_stranger_counts_takes_no_time() -> None:
     """Elements of no size, by the thousand million, and elements of many sizes more than are read."""
     empty = read_fields(LONG, "a/Empties", struct.pack("<I", 2**32 - 1) + b"\7")

@@ -1,0 +1,38 @@
+"""`rosrv topic echo --field`: what a look left out is not told as not there."""
+
+import pytest
+import typer
+
+from appliance.cli.topic import part_of
+from appliance.ros.definitions import Definitions
+from appliance.ros.message_view import CUT, read_fields
+
+DEFINITIONS = Definitions.from_files(
+    {"a/Scan.msg": "float32[] ranges\nuint8[] data\nPose pose\nuint8 last\n", "a/Pose.msg": "float32 x\n"}
+)
+
+
+def scan(length: int) -> dict[str, object]:
+    """A message with 720 ranges and a picture of 921,600 bytes, of which so many bytes are there."""
+    whole = (720).to_bytes(4, "little") + b"\0" * 2880 + (921_600).to_bytes(4, "little") + b"\1" * 921_600
+    fields = read_fields(DEFINITIONS, "a/Scan", (whole + b"\0" * 4 + b"\7")[:length])
+    assert fields is not None
+    return fields
+
+
+def test_what_a_look_left_out_has_the_sign_of_it() -> None:
+    """An element that is not shown, a byte of a picture, a field after the end of the bytes."""
+    whole, cut = scan(1_000_000), scan(3000)
+    assert part_of(whole, "ranges.3") == 0
+    assert part_of(whole, "ranges.300") == f"{CUT} 704 more"
+    assert part_of(whole, "data").endswith(f"{CUT} 921568 more")
+    assert part_of(whole, "data.5000") == f"{CUT} 921568 more"
+    assert part_of(whole, "last") == 7
+    assert part_of(cut, "pose.x") == part_of(cut, "last") == CUT
+
+
+@pytest.mark.parametrize("path", ["nothing", "ranges.x", "pose.y", "last.x", "data.x"])
+def test_what_is_not_there_is_said(path: str) -> None:
+    """The message has no such field."""
+    with pytest.raises(typer.Exit):
+        part_of(scan(1_000_000), path)
