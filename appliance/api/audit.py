@@ -26,6 +26,7 @@ from appliance.api.roles import OPERATOR, VIEWER, Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
 from appliance.api.streams import Held, Streams, in_thread, peer_of, turn
+from appliance.api.unrecorded import unrecorded
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
 from appliance.audit.database import LogUnreadableError
 from appliance.audit.evidence import evidence, evidence_line
@@ -57,6 +58,11 @@ _PAGE = {
     "properties": {
         "records": {"type": "array", "items": _RECORD_REF},
         "cursor": {"type": ["string", "null"], "description": "of the next page; null: there is none"},
+        "notes": {
+            "type": "array",
+            "items": {"type": "string"},
+            "description": "only where there are any: an event or category that this version does not record",
+        },
     },
     "required": ["records", "cursor"],
     "additionalProperties": False,
@@ -324,7 +330,8 @@ def page_of(
             break
         count = _STREAM_PAGE  # what is not shown may be much: it is not looked through in small steps
     last = str(shown[limit - 1]["sequence"]) if len(shown) > limit else None
-    return {"records": shown[:limit], "cursor": last}
+    page: dict[str, Any] = {"records": shown[:limit], "cursor": last}
+    return page | {"notes": notes} if (notes := unrecorded(wanted)) else page
 
 
 def _shown(entries: Iterable[Entry], bearer: Bearer, text: str | None = None) -> list[dict[str, Any]]:

@@ -8,7 +8,7 @@ from typing import Annotated, Concatenate, ParamSpec
 
 import typer
 
-from appliance.audit.events import EVENTS
+from appliance.api.unrecorded import unrecorded
 from appliance.audit.moment import MomentError, parse_moment
 from appliance.audit.output import printable
 from appliance.audit.query import Filter
@@ -16,11 +16,7 @@ from appliance.audit.record import Severity
 from appliance.cli.audit.errors import Errors, tell
 from appliance.cli.spans import Since, Until
 from appliance.cli.target import Appliance
-from appliance.policy.model import Category
-from appliance.wrong_values import meant
 
-CATEGORIES = (*Category, "monitor", "parameter", "publication", "rest", "service", "subscription", "topic")
-"""What a record may be about: what the policy decides, and what else there is."""
 _P = ParamSpec("_P")
 
 
@@ -64,10 +60,7 @@ def _filter(
     end = None if until is None else parse_moment(until, now)
     if begin is not None and end is not None and begin > end:
         raise MomentError(f"--since {since} is later than --until {until}: nothing is between them")
-    for what, name, known in (("event", event, EVENTS), ("category", category, CATEGORIES)):
-        if name is not None and not set(name) & set("*?[") and name not in known:
-            tell(printable(f"this version records no {what} {name!r}{meant(name, known)}"))
-    return Filter(
+    found = Filter(
         decision=tuple(name for name, asked in wanted.items() if asked),
         since=begin,
         until=end,
@@ -81,6 +74,9 @@ def _filter(
         text=text,
         who=who,
     )
+    for note in unrecorded(found):
+        tell(printable(note))
+    return found
 
 
 def filtered(

@@ -38,6 +38,20 @@ def test_a_viewers_page_tells_nothing_of_what_is_withheld(make_log: MakeLog) -> 
     assert len(page_of(log.path, hidden_only, None, 1, reader, newest_first=True)["records"]) == 1
 
 
+def test_a_search_for_what_is_never_recorded_says_so(make_log: MakeLog) -> None:
+    """Beside the records, which an older version may have written; a search that has nothing to tell is as before."""
+    log = make_log()
+    settle(log)
+    slips = Filter(event="message droped", category="publsh")
+    page = page_of(log.path, slips, None, 1, bearer("v"), newest_first=True)
+    assert page["notes"] == [
+        "this version records no event 'message droped'; did you mean message dropped?",
+        "this version records no category 'publsh'; did you mean publish?",
+    ]
+    for known in (Filter(event="message dropped", category="publish"), Filter(event="droped*")):
+        assert "notes" not in page_of(log.path, known, None, 1, bearer("v"), newest_first=True)
+
+
 def test_a_monitors_history_tells_nothing_of_records_that_have_its_name_in_a_message(
     make_log: MakeLog,
 ) -> None:

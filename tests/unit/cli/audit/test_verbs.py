@@ -16,8 +16,8 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 import appliance
+from appliance.api.unrecorded import CATEGORIES
 from appliance.audit.log import AuditLog
-from appliance.cli.audit.filter import CATEGORIES
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Category
 from appliance.specifications.allocation import SERVICE, TOPIC

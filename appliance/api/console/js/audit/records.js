@@ -21,7 +21,7 @@ export function askedOf(/** @type {Record<string, string>} */ { looks, ...filter
 /** @param {Record<string, string>} filter @param {boolean} following */
 export function useRecords(filter, following) {
   const key = JSON.stringify(filter);
-  const [state, setState] = useState({ records: /** @type {any[] | null} */ (null), cursor: /** @type {string | null} */ (null), most: KEPT, error: /** @type {unknown} */ (null), loading: true });
+  const [state, setState] = useState({ records: /** @type {any[] | null} */ (null), cursor: /** @type {string | null} */ (null), notes: /** @type {string[]} */ ([]), most: KEPT, error: /** @type {unknown} */ (null), loading: true });
   const [standing, setStanding] = useState(/** @type {import("../events.js").Standing | null} */ (null));
   const [round, setRound] = useState(0);
   const first = useRef(true);
@@ -31,8 +31,8 @@ export function useRecords(filter, following) {
     setState((state) => ({ ...state, loading: true }));
     const timer = setTimeout(async () => {
       try {
-        const { records, cursor } = await get("/v1/audit", { ...askedOf(filter), limit: PAGE }, controller.signal);
-        setState({ records, cursor, most: KEPT, error: null, loading: false });
+        const { records, cursor, notes = [] } = await get("/v1/audit", { ...askedOf(filter), limit: PAGE }, controller.signal);
+        setState({ records, cursor, notes, most: KEPT, error: null, loading: false });
       } catch (error) {
         if (!controller.signal.aborted) setState((state) => ({ ...state, error, loading: false }));
       }

@@ -19,7 +19,7 @@ export function Audit() {
   const { rest: chosen, query } = useStore(place);
   const filter = filterOf(query);
   const [following, setFollowing] = useState(false);
-  const { records, cursor, error, loading, standing, older, again } = useRecords(filter, following);
+  const { records, cursor, notes, error, loading, standing, older, again } = useRecords(filter, following);
   useSteps(records, chosen, filter);
   return html`<div class="head"><h1>Audit</h1><span class="head-sub" role="status">${records === null ? "" : `${counted(records.length, "record")} shown${cursor ? ", more below" : ""}`}</span>
       <div class="head-actions">
@@ -31,7 +31,7 @@ export function Audit() {
     <div class=${`audit-grid${chosen ? " with-record" : ""}`}>
       <section class="panel" aria-label="Records" aria-busy=${String(loading)}>
         ${error ? html`<div class="panel-body"><${Failure} error=${error} retry=${again} /></div>` : null}
-        ${records === null ? (error ? null : html`<${Loading} rows=${10} />`) : !records.length ? html`<${Empty} icon="audit" title="No record matches">${Object.keys(filter).length ? "Take a filter away, or look further back." : "The log is empty; the appliance writes to it from its start on."}</${Empty}>`
+        ${records === null ? (error ? null : html`<${Loading} rows=${10} />`) : !records.length ? html`<${Empty} icon="audit" title="No record matches">${notes.length ? notes.join(" · ") : Object.keys(filter).length ? "Take a filter away, or look further back." : "The log is empty; the appliance writes to it from its start on."}</${Empty}>`
           : html`<${Timeline} records=${records} chosen=${chosen} filter=${filter} /><${RecordTable} records=${records} chosen=${chosen} filter=${filter} />${cursor ? html`<div class="panel-body"><button class="button" onClick=${older}>Older records</button></div>` : null}`}
       </section>
       ${chosen && html`<${RecordPanel} key=${chosen} id=${chosen} filter=${filter} />`}
