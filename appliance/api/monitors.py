@@ -32,7 +32,7 @@ class _Looking:
 
     def __init__(self, services: Services) -> None:
         self._services = services
-        self._compiler = Compiler()
+        self.compiler = Compiler()
         self.desk = Desk(services)
 
     async def state(self, bearer: Bearer, name: str) -> tuple[Monitors, MonitorState]:
@@ -46,11 +46,7 @@ class _Looking:
     async def compiled(self, loaded: Monitors, name: str) -> Any:
         """A monitor, compiled here."""
         async with self._services.judging:
-            return await asyncio.to_thread(self._compiler.monitor, loaded, name)
-
-    def warnings(self, file: str) -> Any:
-        """The lint of a file of what was compiled last."""
-        return self._compiler.warnings(file)
+            return await asyncio.to_thread(self.compiler.monitor, loaded, name)
 
 
 def unknown_monitor(name: str, loaded: Monitors) -> ProblemError:
@@ -94,7 +90,7 @@ def routes(services: Services) -> Routes:
             text=(loaded.files or {})[state.file],
             alphabet=events_of(found),
             properties=properties_of(found),
-            warnings=looking.warnings(state.file),
+            warnings=looking.compiler.warnings(state.file),
             uses=sorted(found.code.uses),
             hold=found.code.hold,
         )

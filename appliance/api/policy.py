@@ -1,6 +1,7 @@
 """`/v1/policy`: look at the policy in force and at those before it; why a request is decided as it is; the tests."""
 
 import asyncio
+from dataclasses import asdict
 from typing import Annotated, Literal
 
 import msgspec
@@ -17,7 +18,7 @@ from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.policy import PolicyInForce, RevisionText
 from appliance.policy.cases import CaseResult
 from appliance.policy.explain import Explanation
-from appliance.policy.model import Category, Rule
+from appliance.policy.model import Category
 
 _UNKNOWN: Responses = {404: {"description": "There is no such revision."}}
 _MOST_SHOWN = 1000
@@ -130,22 +131,20 @@ def _case(case: CaseResult) -> Case:
     )
 
 
-def _rule(rule: Rule) -> RuleText:
-    return RuleText(section=rule.section, key=rule.key, file=rule.file, line=rule.line)
-
-
 def _explained(found: Explanation) -> Explained:
     decision = found.decision
     return Explained(
         **found.request.fields(),
         decision=decision.word,
-        rule=_rule(decision.rule) if decision.rule else None,
+        rule=RuleText(**asdict(decision.rule)) if decision.rule else None,
         reason=decision.reason,
         told=found.told,
         through=list(found.through),
         limit=found.limit,
         lost=[
-            LostRule(rule=_rule(rule.rule), would="allow" if rule.grants else "deny", why=rule.why)
+            LostRule(
+                rule=RuleText(**asdict(rule.rule)), would="allow" if rule.grants else "deny", why=rule.why
+            )
             for rule in found.lost
         ],
         node=_explained(found.node) if found.node is not None else None,

@@ -382,7 +382,7 @@ def _make_mirror(base: Foundation) -> ParameterMirror:
         ParameterCharges(pool, base.store, base.store.parameter_owners()),
         depth_limit=base.settings.limits.nesting,
         note=base.store.note_parameter,
-        together=base.store.together,
+        together=base.store.database.together,
         since=base.store.parameter_changes(),
     )
 

@@ -3,7 +3,6 @@
 import asyncio
 
 import msgspec
-import structlog
 
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
@@ -11,7 +10,6 @@ from appliance.channel.answers.status import ForwardingState
 from appliance.channel.link import Link
 from appliance.config import Syslog
 
-_log = structlog.get_logger()
 _PATIENCE_SECONDS = 10.0  # a receiver that is started again is no event
 
 

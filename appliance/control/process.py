@@ -258,7 +258,7 @@ class _Control:
             parts.recordings,
             EvidenceOrders(self._audit, base.trail),
             durable=base.trail.durable,
-            require_room=base.store.require_room,
+            require_room=base.store.database.require_room,
         )
         self._rest = RestLink(
             administration,

@@ -178,11 +178,7 @@ class _Watch(CompiledProperty):
         self.taken: Counter[tuple[str, str]] = Counter()
         self._machine = machine
         self._specification = specification
-
-    @property
-    def timed(self) -> bool:
-        """The machine's."""
-        return self._machine.timed
+        self.timed = machine.timed
 
     def start(self, time_ns: int) -> Run:
         """A run of the machine that is watched."""

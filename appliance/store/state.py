@@ -1,7 +1,6 @@
 """The tables of control's state file: registry, parameters, policy revisions, tokens, hosts, settings."""
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -130,14 +129,6 @@ class StateStore:
         """Wait until everything saved so far is on the disk. Raises `StoreError` when it cannot be written."""
         await self.database.settled()
 
-    def require_room(self) -> None:
-        """Raises `StoreError` when what is ordered could not be kept: before anything is changed."""
-        self.database.require_room()
-
-    def together(self) -> AbstractContextManager[None]:
-        """What is saved inside outlasts the process when this has ended, by one write."""
-        return self.database.together()
-
     def close(self, seconds: float | None = None) -> None:
         """Write what is left, within so many seconds (None: however long it takes), and close."""
         self.database.close(seconds)
@@ -146,7 +137,7 @@ class StateStore:
 
     def save_incarnation(self, row: IncarnationRow) -> None:
         """Keep an incarnation, or its new `life`."""
-        with self.together():
+        with self.database.together():
             self.database.put("incarnation", *row[:-1])
             self.database.delete("relay_port", key=row.key)
             for relay, port in enumerate(row.more_relay_ports, start=1):
@@ -154,7 +145,7 @@ class StateStore:
 
     def forget_incarnation(self, key: str) -> None:
         """Drop an incarnation and its registrations."""
-        with self.together():
+        with self.database.together():
             for table in ("incarnation", "relay_port", "registration", "permission"):
                 self.database.delete(table, key=key)
 

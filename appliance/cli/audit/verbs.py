@@ -35,7 +35,6 @@ from appliance.cli.audit.output import (
 from appliance.cli.progress import progress
 from appliance.cli.target import Appliance, speaks
 
-_POLL_SECONDS = 0.2
 _CHECKPOINT_SECONDS = 5.0  # between two looks: one is made a minute, and a look over REST is itself recorded
 _TOLD_EVERY = 1000
 _Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJSON)")]

@@ -29,7 +29,6 @@ from appliance.supervisor.users import NUMERIC_IDS
 
 _SECONDS = 10.0
 _CHARON = Path("/usr/sbin/charon-systemd")
-_FILES = 4096
 
 
 def machine(settings: Settings, *, running: bool) -> Iterator[Found]:

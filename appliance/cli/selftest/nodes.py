@@ -112,7 +112,6 @@ class _Node:
 
     def __init__(self, host: str) -> None:
         self._messages = socket.create_server((host, 0), family=_family(host))
-        self._host = host
         port = self._messages.getsockname()[1]
 
         class Api(BaseHTTPRequestHandler):

@@ -28,7 +28,6 @@ class Guesses:
 
     def __init__(self, formula: Node, events: Sequence[str]) -> None:
         self._guessed: dict[Node, int] = {}
-        self._events = events
         for node in _within(formula):
             if node[0] in _DEFINED or node[0] in _BEFORE:
                 self._guessed.setdefault(node, len(self._guessed))

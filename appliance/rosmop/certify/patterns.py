@@ -15,7 +15,6 @@ from collections.abc import Sequence
 
 from appliance.rosmop.certify.text import Node, UnreadError, Words
 
-_TRUE: Node = ("true",)
 _FALSE: Node = ("false",)
 
 

@@ -380,6 +380,8 @@ class _Next(_Operator):
 class BoundedProperty(CompiledProperty):
     """A formula of mtl about the future, and perhaps the past."""
 
+    timed = True
+
     def __init__(self, source: Source, formula: Formula) -> None:
         super().__init__(source, VERDICTS)
         self.program = program = Program(formula, source.events)
@@ -398,11 +400,6 @@ class BoundedProperty(CompiledProperty):
             for number in self.later
         }
         self._failing = self._decided_late()
-
-    @property
-    def timed(self) -> bool:
-        """Always."""
-        return True
 
     def start(self, time_ns: int) -> Run:
         """A fresh run."""

@@ -98,35 +98,22 @@ class Arena:
             "sequence", tuple(flat), nullable=all(self._all[factor].nullable for factor in flat)
         )
 
-    def union(self, operands: list[int]) -> int:
-        """The traces of any operand."""
-        flat = self._flat("union", operands)
-        flat.discard(self.empty)
-        if self.anything in flat:
-            return self.anything
-        if len(flat) < 2:
-            return flat.pop() if flat else self.empty
-        return self._intern(
-            "union", tuple(sorted(flat)), nullable=any(self._all[part].nullable for part in flat)
-        )
-
-    def intersection(self, operands: list[int]) -> int:
-        """The traces of all operands."""
-        flat = self._flat("intersection", operands)
-        flat.discard(self.anything)
-        if self.empty in flat:
-            return self.empty
-        if len(flat) < 2:
-            return flat.pop() if flat else self.anything
-        nullable = all(self._all[part].nullable for part in flat)
-        return self._intern("intersection", tuple(sorted(flat)), nullable=nullable)
-
-    def _flat(self, kind: str, operands: list[int]) -> set[int]:
+    def join(self, kind: str, operands: list[int]) -> int:
+        """The traces of any operand (`union`), or of all of them (`intersection`)."""
+        neutral, absorbing, quantor = self.empty, self.anything, any
+        if kind == "intersection":
+            neutral, absorbing, quantor = self.anything, self.empty, all
         flat: set[int] = set()
         for operand in operands:
             expression = self._all[operand]
             flat.update(expression.parts if expression.kind == kind else (operand,))
-        return flat
+        flat.discard(neutral)
+        if absorbing in flat:
+            return absorbing
+        if len(flat) < 2:
+            return flat.pop() if flat else neutral
+        nullable = quantor(self._all[part].nullable for part in flat)
+        return self._intern(kind, tuple(sorted(flat)), nullable=nullable)
 
     def derivative(self, number: int, letter: int) -> int:
         """What may follow once ``letter`` has been read."""
@@ -155,7 +142,7 @@ class Arena:
                 derived.append(self.sequence([step, *parts[index + 1 :]]))
             if not self._all[part].nullable:
                 break
-        return self.intersection(derived) if kind == "intersection" else self.union(derived)
+        return self.join("union" if kind == "sequence" else kind, derived)
 
 
 def compile_ere(source: Source) -> FiniteProperty:
@@ -222,13 +209,13 @@ class _ExpressionReader:
         operands = [self._intersection(depth)]
         while self._tokens.accept("|"):
             operands.append(self._intersection(depth))
-        return self.arena.union(operands)
+        return self.arena.join("union", operands)
 
     def _intersection(self, depth: int) -> int:
         operands = [self._sequence(depth)]
         while self._tokens.accept("&"):
             operands.append(self._sequence(depth))
-        return self.arena.intersection(operands)
+        return self.arena.join("intersection", operands)
 
     def _sequence(self, depth: int) -> int:
         factors = [self._unary(depth)]

@@ -88,6 +88,9 @@ class Source:
 class CompiledProperty(ABC):
     """A property ready to run. ``categories`` are the names that may have handlers."""
 
+    timed = False
+    """Whether verdicts depend on the time of events (a run that is not timed never has a deadline)."""
+
     expiry = "deadline"
     """What the passing of a run's deadline is called in records (``timeout`` for machines)."""
 
@@ -109,11 +112,6 @@ class CompiledProperty(ABC):
         self.formula = source.text
         self.events = source.events
         self.categories: Categories = tuple(categories)
-
-    @property
-    def timed(self) -> bool:
-        """Whether verdicts depend on the time of events (a run that is not timed never has a deadline)."""
-        return False
 
     @abstractmethod
     def start(self, time_ns: int) -> Run:
@@ -156,10 +154,7 @@ class UntimedRun:
 
     __slots__ = ()
 
-    @property
-    def deadline(self) -> int | None:
-        """None: nothing is waited for."""
-        return None
+    deadline: int | None = None
 
     def expire(self) -> Categories:
         """Never right: there is no deadline."""
@@ -200,17 +195,13 @@ class ClockedProperty(CompiledProperty):
     the clock began. ``verdicts`` are the categories after an event that leads to a state, ``waits`` what it waits for.
     """
 
+    timed = True
     initial: int
     moves: Sequence[Sequence[Move]]
     late: Sequence[Sequence[Move]]
     within: int
     verdicts: Sequence[Categories]
     waits: Sequence[Wait | None]
-
-    @property
-    def timed(self) -> bool:
-        """Always."""
-        return True
 
     def start(self, time_ns: int) -> Run:
         """A run whose clock begins at ``time_ns``."""

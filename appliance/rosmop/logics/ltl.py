@@ -18,7 +18,6 @@ formula nor its negation gains or loses a trace. An event stands for all letters
 from appliance.rosmop.logics.automaton import TooManyStatesError, explore, letter_classes, spread
 from appliance.rosmop.logics.buchi import Automata, Sets, TooLargeError
 from appliance.rosmop.logics.formula import (
-    NOT,
     Formula,
     Level,
     Syntax,
@@ -28,19 +27,16 @@ from appliance.rosmop.logics.formula import (
     read_formula,
 )
 from appliance.rosmop.logics.interface import FiniteProperty, Source
+from appliance.rosmop.logics.ptltl import SYNTAX as PTLTL
 
 _LEVELS = boolean_levels([])
 SYNTAX = Syntax(
     unary={
-        **NOT,
+        **PTLTL.unary,
         "o": "next",
         "~o": "next",
         "[]": "always",
         "<>": "eventually",
-        "(*)": "previously",
-        "~(*)": "dual previously",
-        "[*]": "historically",
-        "<*>": "once",
     },
     levels=(
         *_LEVELS[:-1],

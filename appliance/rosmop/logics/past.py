@@ -435,11 +435,7 @@ class PastProperty(CompiledProperty):
     def __init__(self, source: Source, folded: Folded) -> None:
         super().__init__(source, VERDICTS)
         self._folded = folded
-
-    @property
-    def timed(self) -> bool:
-        """Whether the formula has time bounds."""
-        return any(self._folded.bounds)
+        self.timed = any(folded.bounds)
 
     def start(self, time_ns: int) -> Run:
         """A fresh run."""

@@ -85,14 +85,17 @@ class Pattern:
             return mode
         if event == self.closes:
             return self._closed(mode)
-        rule = {
-            "no": self._no,
-            "some": self._some,
-            "causes": self._causes,
-            "requires": self._requires,
-            "forbids": self._forbids,
-        }[self.kind]
-        return rule(mode, event, late)
+        first, second = event == self.first, event == self.second
+        violated = {
+            "no": second and not late,
+            "requires": first and (mode == "quiet" or late),
+            "forbids": second and mode == "stirred" and not late,
+        }
+        if violated.get(self.kind, False):
+            return "violated"
+        if first if self.kind in ("causes", "forbids") else second and self.kind != "no":
+            return "stirred"
+        return "quiet" if second and self.kind == "causes" else mode
 
     def restarts_clock(self, before: Mode, event: int, mode: Mode) -> bool:
         """Whether the bound counts anew: from the opening, the oldest event unanswered, or the latest one."""
@@ -110,27 +113,6 @@ class Pattern:
         if mode == _DUE.get(self.kind):
             return "violated"
         return "over" if self.opens is None else "waiting"
-
-    def _no(self, mode: Mode, event: int, late: bool) -> Mode:
-        return "violated" if event == self.second and not late else mode
-
-    def _some(self, mode: Mode, event: int, _late: bool) -> Mode:
-        return "stirred" if event == self.second else mode
-
-    def _causes(self, mode: Mode, event: int, _late: bool) -> Mode:
-        if event == self.first:
-            return "stirred"
-        return "quiet" if event == self.second else mode
-
-    def _requires(self, mode: Mode, event: int, late: bool) -> Mode:
-        if event == self.first and (mode == "quiet" or late):
-            return "violated"
-        return "stirred" if event == self.second else mode
-
-    def _forbids(self, mode: Mode, event: int, late: bool) -> Mode:
-        if event == self.second and mode == "stirred" and not late:
-            return "violated"
-        return "stirred" if event == self.first else mode
 
     def after_deadline(self, mode: Mode) -> Mode:
         """The next mode when the clock of the mode has run out."""

@@ -14,7 +14,7 @@ bound beyond which a ``begin`` is a fault of the specification. (Rosu, Chen and 
 
 from itertools import zip_longest
 
-from appliance.rosmop.logics.formula import NOT, Formula, Level, Syntax, boolean_levels, nodes, read_formula
+from appliance.rosmop.logics.formula import Formula, Level, Syntax, boolean_levels, nodes, read_formula
 from appliance.rosmop.logics.interface import (
     Categories,
     CompiledProperty,
@@ -34,7 +34,6 @@ BEGIN, END, CALL = "begin", "end", "call"
 
 SYNTAX = Syntax(
     unary={
-        **NOT,
         **PTLTL.unary,
         "(*a)": "abstract previously",
         "<*a>": "abstract once",

@@ -18,7 +18,6 @@ from appliance.rosmop.syntax.complaints import FORBIDDEN
 from appliance.rosmop.syntax.errors import SpecificationError
 
 _T = TypeVar("_T", bound=tree.Node)
-_Path = tuple[tree.PathStep, ...]
 
 
 class _Unsaid:
