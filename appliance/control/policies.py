@@ -127,6 +127,7 @@ class Policies:
         """
         revisions = self.store.revisions()
         last = revisions[0] if revisions else None
+        self.revision = last.revision if last is not None else 0  # what comes has a greater one
         if last is not None and (restarted or last.who != _DISK):
             try:
                 policy = self._judged(last.text, last.signature, last.file, self.known)
@@ -182,7 +183,7 @@ class Policies:
                 return Loaded(
                     before, before, [str(warning) for warning in self.current.warnings], 0, self.confirm_by
                 )
-            policy, signature = await self._prepared(lambda: given, f"revision {self._next_number()}", who)
+            policy, signature = await self._prepared(lambda: given, f"revision {self.revision + 1}", who)
             self.trial.announce(before, within)
             revoked = self._keep(policy, signature, who=who, note=request.note or "posted")
             return self._answer(policy, before, revoked, within)
@@ -200,13 +201,19 @@ class Policies:
     async def roll_back(self, request: admin.PolicyRollback, who: str) -> Loaded:
         """Bring a kept revision into force. Raises `PolicyRefusedError`, `RevisionChangedError`."""
         async with self._changing(request.expected):
-            return self.rollback(request.revision, who=who)
+            return await self.rollback(request.revision, who=who)
 
-    def rollback(self, revision: int | None, *, who: str) -> Loaded:
-        """Bring a kept revision into force (None: the one before this) at once. Raises `PolicyRefusedError`."""
+    async def rollback(self, revision: int | None, *, who: str) -> Loaded:
+        """Bring a kept revision into force (None: the one before this).
+
+        Raises `PolicyRefusedError`, and `RevisionChangedError` when another came into force while it was read.
+        """
         before = self.revision
+        rows = await asyncio.to_thread(self.store.revisions)
+        if self.revision != before:
+            raise RevisionChangedError(before, self.revision)
         try:
-            row = wanted(self.store.revisions(), revision, before)
+            row = wanted(rows, revision, before)
         except UnknownRevisionError as error:
             raise PolicyRefusedError([str(error)]) from error
         policy = self._judged(row.text, row.signature, row.file, self.known)
@@ -224,7 +231,7 @@ class Policies:
 
     async def revisions(self, _request: admin.PolicyRevisions) -> answers.PolicyRevisionList:
         """The kept revisions."""
-        rows = self.store.revisions()
+        rows = await asyncio.to_thread(self.store.revisions)
         return answers.PolicyRevisionList([answers.PolicyRevision(**self._described(row)) for row in rows])
 
     async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
@@ -316,11 +323,8 @@ class Policies:
         except PolicyError as error:
             raise PolicyRefusedError([str(finding) for finding in error.findings]) from error
 
-    def _next_number(self) -> int:
-        return max([self.revision, *(row.revision for row in self.store.revisions())]) + 1
-
     def _keep(self, policy: Policy, signature: str, *, who: str, note: str, by: str | None = None) -> int:
-        number = self._next_number()
+        number = self.revision + 1
         row = RevisionRow(number, policy.text, policy.file, time.time(), who, note, signature)
         self.store.save_revision(row)
         revoked = self._enforce(policy, row)
@@ -348,4 +352,4 @@ class Policies:
         )
 
     async def _go_back(self, revision: int) -> None:
-        self.rollback(revision, who="not confirmed in time")
+        await self.rollback(revision, who="not confirmed in time")

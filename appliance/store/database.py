@@ -88,7 +88,7 @@ class Database:
         self._thread.start()
 
     def query(self, sql: str, parameters: Parameters = ()) -> list[tuple[Any, ...]]:
-        """Read rows, with what was queued before; for start-up and rare look-ups, not for the hot path.
+        """Read rows, with what was queued before; for start-up, and else in a thread: it waits while the disk is slow.
 
         What cannot be written in `_CATCH_UP_SECONDS` is not among them, and is not waited for while the disk is full.
         """

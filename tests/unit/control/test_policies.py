@@ -5,13 +5,20 @@ import contextlib
 import ipaddress
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
-from appliance.channel.admin import PolicyConfirm, PolicyLoad, PolicyReload
+from appliance.channel.admin import (
+    PolicyConfirm,
+    PolicyLoad,
+    PolicyReload,
+    PolicyRevisions,
+    PolicyRollback,
+    PolicyWanted,
+)
 from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
 from appliance.policy import judgement
 from appliance.policy.model import Address, Category, Request
@@ -184,7 +191,7 @@ async def test_a_reload_that_another_change_overtakes_is_refused(
         await policies.store.settled()
         loading = asyncio.ensure_future(policies.reload(PolicyReload(), "operator"))
         await slow.until_begun()
-        policies.rollback(1, who="not confirmed in time")
+        await policies.rollback(1, who="not confirmed in time")
         slow.over.set()
         with pytest.raises(RevisionChangedError):
             await loading
@@ -236,11 +243,39 @@ async def test_a_change_to_be_confirmed_goes_back_though_control_dies_while_it_i
         assert policies.current.text == OPEN
 
 
-def unsigned(policies: Policies, change: Callable[[], object]) -> str:
+async def test_nothing_waits_for_the_disk_on_the_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the store is asked while nodes are served is asked in a thread: a slow disk keeps none of them waiting."""
+    with Appliance(tmp_path).started() as policies:
+        read, loop_thread, asked = policies.store.database.query, threading.get_ident(), []
+
+        def query(sql: str) -> list[tuple[Any, ...]]:
+            asked.append(threading.get_ident())
+            return read(sql)
+
+        monkeypatch.setattr(policies.store.database, "query", query)
+        assert (await policies.load(PolicyLoad(OTHER), "eve")).revision == 2
+        assert (await policies.roll_back(PolicyRollback(None), "eve")).revision == 3
+        assert (await policies.reload(PolicyReload(confirm_within=0.1), "operator")).revision == 4
+        await until(policies, 5)
+        assert [row.revision for row in (await policies.revisions(PolicyRevisions())).revisions] == [
+            5,
+            4,
+            3,
+            2,
+            1,
+        ]
+        assert (await policies.text(PolicyWanted(2))).text == OTHER
+        assert len(asked) >= 4
+        assert loop_thread not in asked
+
+
+async def unsigned(policies: Policies, change: Callable[[], Awaitable[object]]) -> str:
     """What a refused change says; the policy in force stays."""
     before = policies.revision, policies.current.text
     with pytest.raises(PolicyRefusedError) as refused:
-        change()
+        await change()
     assert (policies.revision, policies.current.text) == before
     return refused.value.findings[0]
 
@@ -263,10 +298,10 @@ async def test_where_the_site_signs_nothing_else_comes_into_force(tmp_path: Path
         for signature in ("", signed(OPEN), signed(OTHER, OTHER_KEY)):
             with pytest.raises(PolicyRefusedError):
                 await policies.load(PolicyLoad(OTHER, signature=signature), "eve")
-        assert "no signature" in unsigned(policies, lambda: policies.rollback(1, who="eve"))
+        assert "no signature" in await unsigned(policies, lambda: policies.rollback(1, who="eve"))
         assert policies.hosts_changed() == 0
         await policies.load(PolicyLoad(OTHER, signature=signed(OTHER)), "adam")
-        assert policies.rollback(2, who="eve").revision == 4
+        assert (await policies.rollback(2, who="eve")).revision == 4
     with appliance.started(restarted=True, site_keys=[LINE]) as policies:
         assert (policies.revision, policies.in_force.signature) == (4, signed(OPEN))
     with pytest.raises(PolicyRefusedError, match="this is revision 4, which eve brought into force"):
