@@ -2,14 +2,35 @@
 
 import contextlib
 import os
+import re
 import secrets
 import stat
 import sys
 from pathlib import Path
 
+_UNFINISHED = re.compile(r".+\.[0-9a-f]{8}\.new(-journal)?")
+"""What `name_to_make` gives; beside a database there is a journal."""
+
 
 class NotLastingError(OSError):
     """The file is replaced, and may be as it was before after a power cut: the disk did not say that it has it."""
+
+
+def name_to_make(path: Path) -> Path:
+    """Where a file is made that gets this name when it is whole: under one of its own, which nothing left has."""
+    return path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
+
+
+def remove_unfinished(folder: str, place: int) -> None:
+    """Take away what writers of a folder of `place` (a descriptor), and of those in it, were killed over.
+
+    None of them may be at work. What cannot be removed stays: it keeps nobody from writing.
+    """
+    with contextlib.suppress(OSError):
+        for _path, _folders, files, inside in os.fwalk(folder, follow_symlinks=False, dir_fd=place):
+            for name in filter(_UNFINISHED.fullmatch, files):
+                if stat.S_ISREG(os.stat(name, dir_fd=inside, follow_symlinks=False).st_mode):
+                    os.unlink(name, dir_fd=inside)
 
 
 def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | None = None) -> None:
@@ -18,7 +39,7 @@ def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | Non
     It is of `owner` (user and group), or of who writes it, before it has its name. Of several who write it at once it
     is one's, whole. Raises `NotLastingError` when it is replaced, but not surely on the disk.
     """
-    making = path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
+    making = name_to_make(path)
     try:
         descriptor = os.open(
             making, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600

@@ -13,6 +13,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from appliance.audit.chain import StoredColumns
+from appliance.whole_files import name_to_make
 
 APPLICATION_ID = 0x52565541  # "RVUA"
 LAYOUT_VERSION = 2
@@ -60,7 +61,7 @@ def create(path: Path, begun: int) -> None:
 
     Its group may read it (0640), and what SQLite puts beside it: who that is, if anybody, is for the folder to say.
     """
-    making = path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
+    making = name_to_make(path)
     descriptor = os.open(making, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o600)
     os.fchmod(descriptor, 0o640)
     os.close(descriptor)

@@ -24,6 +24,7 @@ from appliance.cli.target import Appliance, speaks
 from appliance.evidence import verify as verifier_module
 from appliance.evidence.bundle import VERIFIER, BundleError, Kept, Span, export
 from appliance.fingerprints import fingerprint
+from appliance.whole_files import name_to_make
 
 _SILENCE_SECONDS = 3600.0  # it is made twice before the first byte comes
 
@@ -56,7 +57,7 @@ def export_evidence(
             raise usage_error("give a recording, or --since (and --until)")
         now = time.time_ns()
         span = Span(parse_moment(since or "0s", now), parse_moment(until or "0s", now))
-        size, part = 0, output.with_name(f"{output.name}.part")
+        size, part = 0, name_to_make(output)
         if os.path.lexists(output):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(output))
         descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)

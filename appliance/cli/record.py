@@ -25,6 +25,7 @@ from appliance.cli.topic import lines_of
 from appliance.recorder.bag_reader import Place
 from appliance.recorder.mcap import as_mcap
 from appliance.recorder.timeline import MOST_COLUMNS, MOST_NEIGHBOURS, NEIGHBOURS, messages_around, timeline
+from appliance.whole_files import name_to_make
 
 if TYPE_CHECKING:
     from appliance.cli.rest.orders import RestWay
@@ -192,7 +193,7 @@ def fetch(
     target = out or Path(f"rosrv-{recording}.{'mcap' if mcap else 'bag'}")
     if os.path.lexists(target):
         raise usage_error(f"{target} is there already")
-    part = target.with_name(f"{target.name}.part")
+    part = name_to_make(target)
     try:
         os.close(_private(part))
     except OSError as error:
@@ -312,7 +313,7 @@ def _private(path: Path) -> int:
 
 def _convert(bag: Path, target: Path) -> None:
     """Write the bag as MCAP. Raises `OSError`; ends the program with 1 where a message type makes no sense."""
-    made = target.with_name(f"{target.name}.new")
+    made = name_to_make(target)
     with os.fdopen(_private(made), "wb") as file:
         try:
             file.writelines(as_mcap(bag))

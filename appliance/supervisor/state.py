@@ -15,13 +15,13 @@ import fcntl
 import os
 import socket
 import stat
-from collections.abc import Iterable
+from collections.abc import Collection
 from pathlib import Path
 
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import Role
 from appliance.supervisor.users import account_of
-from appliance.whole_files import write_whole
+from appliance.whole_files import remove_unfinished, write_whole
 
 ADMIN_SOCKET = "admin.sock"
 _LOCK = "lock"
@@ -77,8 +77,11 @@ class StateDirectory:
         """Where the children find the resolved configuration."""
         return self.path / "run" / "config.json"
 
-    def prepare(self, roles: Iterable[Role]) -> None:
-        """Give each role its part. Raises `StartError` where a part is somebody else's, or cannot be given away."""
+    def prepare(self, roles: Collection[Role]) -> None:
+        """Give each role its part, without what an earlier life was killed over.
+
+        Raises `StartError` where a part is somebody else's, or cannot be given away.
+        """
         try:
             self._give_parts(roles)
         except PermissionError as error:
@@ -86,8 +89,15 @@ class StateDirectory:
                 f"the parts of the state directory {self.path} cannot be given to the users of the processes: {error}; "
                 "a container needs CAP_CHOWN for that (cap_add in compose.yaml)"
             ) from error
+        # The lock is held and no process is started: nobody writes there.
+        place, mine = os.open(self.path, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC), os.geteuid()
+        for user, part in {(mine, "run"), *((account_of(role.user).uid, role.part) for role in roles)}:
+            os.seteuid(user)  # root may not look into what is others', in a container
+            remove_unfinished(part, place)
+            os.seteuid(mine)
+        os.close(place)
 
-    def _give_parts(self, roles: Iterable[Role]) -> None:
+    def _give_parts(self, roles: Collection[Role]) -> None:
         self._folder("run", os.geteuid(), os.getegid(), 0o755)
         for role in roles:
             account = account_of(role.user)

@@ -10,8 +10,15 @@ from pathlib import Path
 
 import pytest
 
+import appliance
 from appliance.cli.output import write_told
-from appliance.whole_files import NotLastingError, write_where_told, write_whole
+from appliance.whole_files import (
+    NotLastingError,
+    name_to_make,
+    remove_unfinished,
+    write_where_told,
+    write_whole,
+)
 from tests.support.requirements import need_root
 
 
@@ -92,6 +99,40 @@ def test_it_outlasts_the_machines_power(tmp_path: Path, monkeypatch: pytest.Monk
     (making, there), folder = synced
     assert re.fullmatch(r"key\.pem\.[0-9a-f]{8}\.new", making)
     assert (there, folder) == ([making], (tmp_path.name, ["key.pem"]))
+
+
+def test_no_writer_is_kept_from_its_file_by_what_another_left() -> None:
+    """A file in the making has a name of its own wherever one is made: no `FILE.part` that was left is in the way."""
+    sources = {path: path.read_text() for path in Path(appliance.__file__).parent.rglob("*.py")}
+    fixed = re.compile(r'with_name\(f"\{\w+\.name\}\.(new|part|tmp)"')
+    assert [path.name for path, text in sources.items() if fixed.search(text)] == []
+
+
+def test_what_a_killed_writer_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+    """In folders below, too: only files, only of names that writers make themselves; nothing behind a link."""
+    there, elsewhere = tmp_path / "state" / "control", tmp_path / "elsewhere"
+    for folder in (there, elsewhere):
+        folder.mkdir(parents=True)
+    left = name_to_make(there / "audit.db")
+    for file in (left, there / f"{left.name}-journal", name_to_make(there.parent / "key.pem")):
+        file.touch()
+    kept = [
+        there / name for name in ("audit.db", "x.new", "x.0123456g.new", ".01234567.new", "x.01234567.newer")
+    ]
+    kept += [name_to_make(elsewhere / "policy.ini"), name_to_make(there / "folder") / "file"]
+    kept[-1].parent.mkdir()
+    for file in kept:
+        file.touch()
+    (there / "link").symlink_to(elsewhere)
+    name_to_make(there / "link").symlink_to(kept[0])
+    links = 2
+    place = os.open(tmp_path, os.O_RDONLY)
+    remove_unfinished("state", place)
+    remove_unfinished("nothing", place)
+    os.close(place)
+    found = [path for path in tmp_path.rglob("*") if not path.is_dir() and not path.is_symlink()]
+    assert sorted(found) == sorted(kept)
+    assert sum(path.is_symlink() for path in there.iterdir()) == links
 
 
 def test_a_full_disk_is_told_with_the_file(tmp_path: Path) -> None:

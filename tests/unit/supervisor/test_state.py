@@ -11,6 +11,7 @@ from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import Role
 from appliance.supervisor.state import StateDirectory
 from appliance.supervisor.users import account_of
+from appliance.whole_files import name_to_make
 
 ROLES = (
     Role(name="control", user="rosrv", part="control"),
@@ -25,6 +26,21 @@ def test_parts_are_made_and_closed_to_others(tmp_path: Path) -> None:
     modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in state.path.iterdir()}
     assert modes == {"lock": 0o600, "run": 0o755, "control": 0o700, "rosmaster": 0o700}
     assert stat.S_IMODE(state.path.stat().st_mode) == 0o711
+    state.close()
+
+
+def test_what_a_killed_process_left_is_gone_at_the_next_start(tmp_path: Path) -> None:
+    """A file without its name yet, in the part of a role; the operator's own beside it stays."""
+    killed = StateDirectory(tmp_path)
+    killed.prepare(ROLES)
+    own = name_to_make(tmp_path / "kit.tgz")
+    left = [tmp_path / "control" / "audit.pub", tmp_path / "rosmaster" / "x", killed.config]
+    for file in (own, *map(name_to_make, left)):
+        file.touch()
+    killed.close()
+    state = StateDirectory(tmp_path)
+    state.prepare(ROLES)
+    assert [path for path in tmp_path.rglob("*.new") if path.is_file()] == [own]
     state.close()
 
 
