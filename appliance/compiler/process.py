@@ -23,6 +23,9 @@ _WORK_SECONDS = 60  # of processor time, for one question
 _IDLE_SECONDS = 60.0
 
 
+_Question = messages.ContentsWanted | messages.PartsWanted
+
+
 def main(lifeline_fd: int) -> None:
     """Read specifications until nobody asks, or the supervisor ends it."""
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
@@ -34,7 +37,7 @@ class Process:
 
     def __init__(self, lifeline: Channel) -> None:
         self._child = Child(lifeline, messages.CompilerLink, said=self._said)
-        self._asked: asyncio.Queue[messages.ContentsWanted] = asyncio.Queue()
+        self._asked: asyncio.Queue[_Question] = asyncio.Queue()
 
     async def run(self) -> None:
         """Work from start to end."""
@@ -51,22 +54,24 @@ class Process:
         self._child.close()
 
     def _said(self, message: Any) -> None:
-        if isinstance(message, messages.ContentsWanted):
+        if isinstance(message, _Question):
             self._asked.put_nowait(message)
 
 
-def answer(wanted: messages.ContentsWanted) -> messages.ContentsFound | messages.ContentsRefused:
-    """What is in these texts, or all that is wrong with them."""
+def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | messages.CompilationRefused:
+    """What is in these texts, or all that is wrong with them; or what relays run of them."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     ends = int(used.ru_utime + used.ru_stime) + _WORK_SECONDS
     resource.setrlimit(resource.RLIMIT_CPU, (ends, resource.RLIM_INFINITY))
     try:
         checking = late.load("appliance.specifications.checking")
+        if isinstance(wanted, messages.PartsWanted):
+            return messages.PartsMade(wanted.number, checking.parts(wanted.compiled, wanted.parts))
         return messages.ContentsFound(wanted.number, checking.contents(wanted.files, wanted.definitions))
     except SpecificationsRefusedError as error:
-        return messages.ContentsRefused(wanted.number, error.findings)
+        return messages.CompilationRefused(wanted.number, error.findings)
     except (MemoryError, SystemError):  # what Python 3.11 makes of some errors of the first kind
         text = f"they take more than the {_MEMORY >> 20} MiB of memory that there are to compile them"
     except Exception as error:  # noqa: BLE001  a defect of the compiler is a reason to refuse, no more
         text = f"a defect of rosrv, please report it: {type(error).__name__}: {error}"
-    return messages.ContentsRefused(wanted.number, [text])
+    return messages.CompilationRefused(wanted.number, [text])

@@ -4,11 +4,12 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.abi import FeedModule
 from appliance.rosmop.ir.interpreter import Interpreter
-from appliance.rosmop.ir.sites import Site
+from appliance.rosmop.ir.sites import Site, Symbols
 from appliance.rosmop.logics.interface import CompiledProperty
 from appliance.rosmop.positions import Finding, Position
-from appliance.rosmop.sharing import way_of
+from appliance.rosmop.sharing import sharing, way_of
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import Messages
@@ -141,6 +142,31 @@ class Compiled:
         contexts = {one.context: one.name for one in self.specifications}
         return Interpreter(self.functions, self.sites, self.types, contexts, self.messages)
 
+    def alone(self, names: Collection[str]) -> "Compiled":
+        """As `part`, without anything of the others: the same whatever else is in the set."""
+        part = self.part(names)
+        functions = {name: each for name, each in self.functions.items() if Symbols.owner(name) in names}
+        nodes = [node for function in functions.values() for node in form.nodes(function)]
+        sites = sorted({node.site for node in nodes if hasattr(node, "site")} - {-1})
+        numbers = {-1: -1} | {site: number for number, site in enumerate(sites)}
+        return replace(
+            part,
+            warnings=(),
+            functions={name: form.moved(function, numbers) for name, function in functions.items()},
+            sites=[self.sites[site] for site in sites],
+            types={name: kind for name, kind in self.types.items() if Symbols.owner(name) in names},
+        )
+
+    def groups(self, names: Collection[str]) -> list[set[str]]:
+        """Those that share variables, however indirectly, with one of these."""
+        uses = {one.name: one.uses for one in self.specifications}
+        return [group for group in sharing(uses) if not group.isdisjoint(names)]
+
+    def without(self, names: Collection[str]) -> "Compiled":
+        """All but these, and those that share variables with them."""
+        gone = {name for group in self.groups(names) for name in group}
+        return self.part({one.name for one in self.specifications} - gone)
+
     def part(self, names: Collection[str]) -> "Compiled":
         """These of the specifications only; all that share variables with one of them must be among them."""
         return replace(
@@ -164,3 +190,11 @@ class Compiled:
             if event.part is None
         ]
         return frozenset(event.topic for event in events if event.topic and self.is_stamped(event.type))
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What one process runs of a set: these specifications, and the module of those that are not on trial."""
+
+    compiled: Compiled
+    module: FeedModule

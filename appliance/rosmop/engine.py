@@ -35,7 +35,7 @@ from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.runtime.context import TRIAL_BUDGET, Context
 from appliance.rosmop.runtime.wire import Buffer, Message
-from appliance.rosmop.sharing import sharing, way_of
+from appliance.rosmop.sharing import way_of
 from appliance.rosmop.slices import LIMIT
 from appliance.rosmop.walks import Prepared, Walker, Walks, walks_of
 
@@ -177,10 +177,8 @@ class MonitorSet:
         slices: int = LIMIT,
     ) -> "MonitorSet":
         """The set of what was compiled; the rest as `load` says."""
-        uses = {specification.name: specification.uses for specification in compiled.specifications}
-        groups = [group for group in sharing(uses) if not group.isdisjoint(trials)]
         tried = []
-        for group in groups:
+        for group in compiled.groups(trials):
             trial = cls(compiled.part(group), on_fault, trial_patience, slices=slices)
             for monitor in trial._monitors:
                 monitor.context.most = TRIAL_BUDGET

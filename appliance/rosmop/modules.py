@@ -1,13 +1,20 @@
 """The module of a set: written as WebAssembly and translated for this machine, by who has compiled the set."""
 
+from collections.abc import Collection
 from dataclasses import fields
 
-from appliance.rosmop.compiled import Compiled
+from appliance.rosmop.compiled import Compiled, Part
 from appliance.rosmop.ir.abi import FeedModule
 from appliance.rosmop.ir.feed import written
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.machine import translated
 from appliance.rosmop.program import groups
+
+
+def part_of(compiled: Compiled, names: Collection[str], trials: Collection[str]) -> Part:
+    """What runs these specifications, of which some are on `trials`: the same whatever else is in the set."""
+    alone = compiled.alone(names)
+    return Part(alone, module_of(alone.without(trials)))
 
 
 def module_of(compiled: Compiled) -> FeedModule:

@@ -11,7 +11,8 @@ import msgspec
 
 from appliance.ros.definitions import Definitions
 from appliance.ros.message_text import MessageDefinition, ServiceDefinition
-from appliance.rosmop.compiled import Compiled
+from appliance.rosmop.compiled import Compiled, Part
+from appliance.rosmop.ir.abi import FeedModule
 from appliance.rosmop.logics.bounded import BoundedProperty
 from appliance.rosmop.logics.cfg import GrammarProperty
 from appliance.rosmop.logics.interface import CompiledProperty, FiniteProperty
@@ -65,6 +66,7 @@ def _made(kind: type, value: Any) -> Any:
     raise NotImplementedError(kind.__name__)
 
 
+_PARTS = msgspec.msgpack.Decoder(tuple[msgspec.Raw, FeedModule])
 _DECODER = msgspec.msgpack.Decoder(Compiled, dec_hook=_made)
 
 
@@ -90,3 +92,14 @@ def encoded(compiled: Compiled) -> bytes:
 def decoded(data: bytes) -> Compiled:
     """The set again. Raises `msgspec.ValidationError`."""
     return _DECODER.decode(data)
+
+
+def encoded_part(part: Part) -> bytes:
+    """What one process runs as bytes: of the same always the same."""
+    return msgspec.msgpack.encode((msgspec.Raw(encoded(part.compiled)), part.module))
+
+
+def decoded_part(data: bytes) -> Part:
+    """What one process runs. Raises `msgspec.ValidationError`."""
+    compiled, module = _PARTS.decode(data)
+    return Part(_DECODER.decode(compiled), module)

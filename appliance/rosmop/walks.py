@@ -141,13 +141,14 @@ class Home:
         self._contexts, self._values = interpreter.contexts, interpreter.variables
         self._running = running
         self._throttles = throttles
-        self._names = [*cells.variables]
+        variables = dict(sorted(cells.variables.items(), key=lambda item: item[1][0]))
+        self._names = [*variables]
         self._cells = struct.Struct(
-            "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in cells.variables.values())
+            "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in variables.values())
         )
         self._texts = [
             (place, cells.texts[address])
-            for place, (address, kind) in enumerate(cells.variables.values())
+            for place, (address, kind) in enumerate(variables.values())
             if isinstance(kind, kinds.String)
         ]
         self._vectors = [
@@ -293,9 +294,9 @@ class Walker:
         """For each event: what outcomes have as `events` where only it happens."""
         self.monitors = tuple(monitor.name for monitor in monitors)
         """For each event: the name of its monitor."""
-        self.drops = bool(feed.droppers)
+        self.drops = feed.drops
         """Whether messages may be dropped."""
-        self.changes = bool(feed.writers)
+        self.changes = feed.changes
         """Whether messages may be changed."""
         self.brief = feed.brief
         """Whether the time that a message takes is little enough not to be counted, but for that of its lines."""

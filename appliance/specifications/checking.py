@@ -1,15 +1,16 @@
 """Specifications compiled as a whole: in the process `compiler` for control, and where `files.check` is called."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 
-from appliance.channel.messages import Contents
+from appliance.channel.messages import Contents, PartNames
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.certify.properties import certificates_of
 from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.sent import encoded
+from appliance.rosmop.modules import part_of
+from appliance.rosmop.sent import decoded, encoded, encoded_part
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.specifications.files import SpecificationsRefusedError
 
@@ -51,6 +52,12 @@ def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
         certificates,
         encoded(monitors.compiled),
     )
+
+
+def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
+    """What each of these relays runs of a set (`Contents.compiled`)."""
+    whole = decoded(compiled)
+    return [encoded_part(part_of(whole, names.monitors, names.trials)) for names in wanted]
 
 
 @cache

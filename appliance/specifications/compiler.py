@@ -6,6 +6,7 @@ ends it, and is refused: the specifications in force stay.
 
 import asyncio
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
@@ -53,30 +54,37 @@ class SpecificationCompiler:
         if not sources.files:
             return Checked()
         require_bounded(sources)
+        answer = await self._asked(
+            lambda number: messages.ContentsWanted(number, sources.files, sources.definitions)
+        )
+        return checked(answer.contents, sources, site_keys)
+
+    async def parts(self, compiled: bytes, wanted: list[messages.PartNames]) -> list[bytes]:
+        """As `checking.parts`. Raises `SpecificationsRefusedError`, also when the compiler does not answer."""
+        answer: messages.PartsMade = await self._asked(
+            lambda number: messages.PartsWanted(number, compiled, wanted)
+        )
+        return answer.parts
+
+    async def _asked(self, question: Callable[[int], messages.Message]) -> Any:
+        """What it answers; another one is asked if it had just ended."""
         for _ in range(_TRIES):
             try:
-                return checked(await self._contents(sources), sources, site_keys)
+                self.call()
+                async with asyncio.timeout(_START_SECONDS):
+                    await self._there.wait()
+                answer = await self._link.ask(question, _WORK_SECONDS)
             except ChannelClosedError:
                 continue
+            except TimeoutError:
+                self._called = False
+                raise SpecificationsRefusedError(
+                    ["the compiler does not answer; try again, the log may say why"]
+                ) from None
+            if isinstance(answer, messages.CompilationRefused):
+                raise SpecificationsRefusedError(answer.findings)
+            return answer
         raise SpecificationsRefusedError([_ENDED])
 
-    async def _contents(self, sources: Sources) -> messages.Contents:
-        try:
-            self.call()
-            async with asyncio.timeout(_START_SECONDS):
-                await self._there.wait()
-            answer: messages.ContentsFound | messages.ContentsRefused = await self._link.ask(
-                lambda number: messages.ContentsWanted(number, sources.files, sources.definitions),
-                _WORK_SECONDS,
-            )
-        except TimeoutError:
-            self._called = False
-            raise SpecificationsRefusedError(
-                ["the compiler does not answer; try again, the log may say why"]
-            ) from None
-        if isinstance(answer, messages.ContentsRefused):
-            raise SpecificationsRefusedError(answer.findings)
-        return answer.contents
-
-    def _heard(self, message: messages.ContentsFound | messages.ContentsRefused) -> None:
+    def _heard(self, message: Any) -> None:
         self._link.answered(message.number, message)

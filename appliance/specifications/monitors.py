@@ -51,7 +51,7 @@ from appliance.specifications.revisions import (
     sources_of,
     text_of,
 )
-from appliance.specifications.rollout import TRIAL, Revision, Rollout, Switch
+from appliance.specifications.rollout import TRIAL, Parts, Revision, Rollout, Switch
 from appliance.specifications.switches import Switches, require_whole
 from appliance.store.revisions import Trial, UnknownRevisionError, wanted
 from appliance.store.state import MonitorRevisionRow, StateStore
@@ -104,6 +104,7 @@ class Monitors:
         told: Collection[Callable[[messages.MonitorEvent], None]],
         site_keys: Sequence[str],
         check: Check,
+        parts: Parts,
     ) -> None:
         self.folder = folder
         self._folder = SpecificationFolder(folder)
@@ -112,7 +113,9 @@ class Monitors:
         self._store = store
         self._trail = trail
         self.switches = Switches(enable)
-        self.rollout = Rollout(allocation, trail, on_fault, self.switches.states_of, relays, slices=slices)
+        self.rollout = Rollout(
+            allocation, trail, on_fault, self.switches.states_of, relays, slices=slices, parts=parts
+        )
         self._acts = 0  # switches and resumptions, ever
         self._one_change = asyncio.Lock()
         self._trial = Trial(store, "confirm monitors", self._go_back, (SpecificationsRefusedError,))
@@ -149,8 +152,8 @@ class Monitors:
                 self._trial.end()
                 if sources.files or last is not None:
                     self._keep(sources, checked, who=DISK, note="read at start")
-        now = Revision(self.revision, self.sources, self.checked)
-        self.rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
+        now = self._revision(self.revision, self.sources, self.checked)
+        await self.rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
         unknown = sorted(self.switches.named - self.checked.monitors.keys())
         if unknown and self.in_force.who == DISK and not restarted:
             raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
@@ -360,7 +363,7 @@ class Monitors:
         switches.said = before | others
         if retried:
             try:
-                await self.rollout.take(Revision(self.revision, self.sources, self.checked))
+                await self.rollout.take(self._revision(self.revision, self.sources, self.checked))
             except SpecificationsRefusedError:
                 switches.said = before
                 raise
@@ -427,6 +430,12 @@ class Monitors:
 
     # --- inside ---
 
+    def _revision(self, number: int, sources: Sources, checked: Checked) -> Revision:
+        """These, switched as they are now."""
+        states = self.switches.states_of(checked)
+        trials = frozenset(name for name, state in states.items() if state == TRIAL)
+        return Revision(number, sources, checked, trials)
+
     async def _kept_rows(self) -> list[MonitorRevisionRow]:
         await self._store.settled()
         return await asyncio.to_thread(self._store.monitor_revisions)
@@ -470,7 +479,7 @@ class Monitors:
             checked = await self._check(sources, self.site_keys)
             in_force = {name: True for name in checked.monitors if self.switches.enabled(name)}
             require_whole(self.switches.states_of(checked) | in_force, checked)
-            moved = await self.rollout.take(Revision(before + 1, sources, checked))
+            moved = await self.rollout.take(self._revision(before + 1, sources, checked))
         except SpecificationsRefusedError as error:
             self.switches.said = switched
             hint = [f"not of the folder, and kept: {', '.join(kept)} (prune removes them)"] if kept else []

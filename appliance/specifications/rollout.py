@@ -11,7 +11,7 @@ its topics.
 import asyncio
 import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -38,12 +38,19 @@ class Revision:
     number: int = 0
     sources: Sources = field(default_factory=Sources)
     checked: Checked = field(default_factory=Checked)
+    trials: frozenset[str] = frozenset()
+    """The monitors that are on trial."""
+
+
+Parts = Callable[[bytes, list[messages.PartNames]], Awaitable[list[bytes]]]
+"""What each of some relays runs of a set that was compiled. Raises `SpecificationsRefusedError`."""
 
 
 @dataclass(slots=True)
 class Rollout:
     """What the relays were told and what they said; `states(checked)` says of each monitor whether it is in force.
 
+    Relays are told what the compiler made for them alone (`parts`), before anything is said of it.
     `rows` has state and counters of the monitors, as far as their relays have told.
     """
 
@@ -53,8 +60,11 @@ class Rollout:
     states: Callable[[Checked], Mapping[str, Switch]]
     relays: Relays
     slices: int
+    parts: Parts
     rows: dict[str, messages.MonitorRow] = field(default_factory=dict)
     _now: Revision = field(default_factory=Revision)
+    # What relays run of what is in force, and of what is being tried.
+    _parts: dict[tuple[bytes, messages.PartNames], bytes] = field(default_factory=dict)
     _known: set[int] = field(default_factory=set)  # relays that had specifications before
     _fresh: set[int] = field(default_factory=set)  # relays that have not answered since they are there
     _coming: tuple[Revision, Plan] | None = None  # being tried
@@ -79,14 +89,18 @@ class Rollout:
         """The monitors that hold their topics."""
         return {name for names in self._held.values() for name in names}
 
-    def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
-        """These are in force. After a crash of control (`restarted`) the relays go on with what they have."""
+    async def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
+        """These are in force. After a crash of control (`restarted`) the relays go on with what they have.
+
+        Raises `SpecificationsRefusedError`.
+        """
         self._now = now
         if restarted:
             self._known = set(range(self.allocation.relays))
         carried = self.allocation.resources if restarted and self.allocation.restore(kept) else ()
         # what was kept may be of a change that control did not survive: then it is made to fit, as little as can be
         self.allocation.adopt(self.allocation.plan(now.checked, carried))
+        await self._make(now, self.allocation.of_file)
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
         """What a relay is told before anything else; one that follows another must hold what is to be held."""
@@ -151,6 +165,7 @@ class Rollout:
                 self._stop_waiting(relay)
 
     async def _try(self, coming: Revision, plan: Plan) -> None:
+        await self._make(coming, _of(plan))
         answers: dict[int, asyncio.Future[list[str]]] = {}
         self._coming = (coming, plan)
         for relay in range(self.allocation.relays):
@@ -194,6 +209,7 @@ class Rollout:
         self._now = coming
         self.relays.withdraw(plan.moves)
         self.allocation.adopt(plan)
+        self._forget()
         for relay in range(self.allocation.relays):
             statement = self._statement(coming, relay, self.allocation.of_file, plan.moved_files)
             if relay in plan.losing:
@@ -230,8 +246,26 @@ class Rollout:
         )
 
     def _restate(self) -> None:
+        self._forget()
         for relay in range(self.allocation.relays):
             self.relays.send(self._statement(self._now, relay, self.allocation.of_file), relay)
+
+    async def _make(self, revision: Revision, of_file: Callable[[str], int]) -> None:
+        """Have the compiler make what the relays run of these, as far as it is not there."""
+        compiled = revision.checked.compiled
+        wanted = {_names(revision, relay, of_file) for relay in range(self.allocation.relays)}
+        missing = [names for names in wanted if names.monitors and (compiled, names) not in self._parts]
+        made = await self.parts(compiled, missing) if missing else []
+        for names, part in zip(missing, made, strict=True):
+            self._parts[compiled, names] = part
+
+    def _forget(self) -> None:
+        """Keep what the relays run of what is in force."""
+        compiled, relays = self._now.checked.compiled, range(self.allocation.relays)
+        names = [_names(self._now, relay, self.allocation.of_file) for relay in relays]
+        self._parts = {
+            key: part for key, part in self._parts.items() if key[0] == compiled and key[1] in names
+        }
 
     def _statement(
         self,
@@ -243,18 +277,18 @@ class Rollout:
         restarted: bool = False,
         ahead: bool = False,
     ) -> messages.SpecificationsStated:
-        mine = {name for name, file in revision.checked.monitors.items() if of_file(file) == relay}
-        states = self.states(revision.checked)
+        states, files = self.states(revision.checked), revision.checked.monitors
+        names = _names(revision, relay, of_file)
         return messages.SpecificationsStated(
             revision.number,
-            revision.checked.compiled if mine else b"",
-            {name: states[name] is not False for name in revision.checked.monitors if name in mine},
+            self._parts[revision.checked.compiled, names] if names.monitors else b"",
+            {name: states[name] is not False for name in names.monitors},
             restarted,
             self.on_fault,
-            tuple(name for name, file in revision.checked.monitors.items() if name in mine and file in moved),
+            tuple(name for name in names.monitors if files[name] in moved),
             next(self._numbers),
             ahead,
-            tuple(name for name in revision.checked.monitors if name in mine and states[name] == TRIAL),
+            names.trials,
             self.slices,
         )
 
@@ -313,6 +347,12 @@ class Rollout:
         waiting = self._waiting.pop((relay, statement), None)
         if waiting is not None and not waiting.done():
             waiting.set_result(findings)
+
+
+def _names(revision: Revision, relay: int, of_file: Callable[[str], int]) -> messages.PartNames:
+    """The monitors that a relay has."""
+    mine = tuple(name for name, file in revision.checked.monitors.items() if of_file(file) == relay)
+    return messages.PartNames(mine, tuple(name for name in mine if name in revision.trials))
 
 
 def _of(plan: Plan) -> Callable[[str], int]:

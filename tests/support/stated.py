@@ -4,16 +4,23 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
-from appliance.channel.messages import SpecificationsStated
+from appliance.channel.messages import PartNames, SpecificationsStated
 from appliance.ros.definitions import Definitions
 from appliance.ros.standard import standard_definitions
 from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.sent import encoded
+from appliance.rosmop.modules import part_of
+from appliance.rosmop.sent import encoded_part
 from appliance.rosmop.syntax.errors import SpecificationError
+from appliance.specifications.checking import parts
 
 NOTHING_LIKE_IT = b"\xc1"
 
 _standard = cache(standard_definitions)
+
+
+async def parts_here(compiled: bytes, wanted: list[PartNames]) -> list[bytes]:
+    """What relays run, made in this process."""
+    return parts(compiled, wanted)
 
 
 def stated(
@@ -33,4 +40,5 @@ def stated(
     except SpecificationError:
         return SpecificationsStated(revision, NOTHING_LIKE_IT, dict(enabled), restarted, **more)
     switches = {monitor.name: enabled.get(monitor.name, True) for monitor in monitors.monitors}
-    return SpecificationsStated(revision, encoded(monitors.compiled), switches, restarted, **more)
+    part = part_of(monitors.compiled, list(switches), more.get("trials", ()))
+    return SpecificationsStated(revision, encoded_part(part), switches, restarted, **more)

@@ -10,7 +10,8 @@ class Contents(msgspec.Struct, frozen=True):
 
     `uses` are the other monitors whose variables a monitor uses, `published_by` the topics each file publishes.
     `types` has the message type of each topic, `texts` the full text of each such type. `certificates` says of each
-    property of a monitor whether its automaton was proved to be what is written. `compiled` is what relays run.
+    property of a monitor whether its automaton was proved to be what is written. Of `compiled` each relay runs its part
+    (`PartsWanted`).
     """
 
     monitors: dict[str, str] = {}
@@ -41,11 +42,33 @@ class ContentsFound(Message):
     contents: Contents
 
 
-class ContentsRefused(Message):
-    """They are not, and all that is wrong with them, as `file:line:column: error: text`."""
+class CompilationRefused(Message):
+    """They are not, and all that is wrong with them, as `file:line:column: error: text`; or of parts why not."""
 
     number: int
     findings: list[str]
 
 
-CompilerLink = ContentsWanted | ContentsFound | ContentsRefused
+class PartNames(msgspec.Struct, frozen=True, array_like=True):
+    """The monitors of one relay, in their order, and which of them are on trial."""
+
+    monitors: tuple[str, ...] = ()
+    trials: tuple[str, ...] = ()
+
+
+class PartsWanted(Message):
+    """Control asks for what each of several relays runs of a set that was compiled (`Contents.compiled`)."""
+
+    number: int
+    compiled: bytes
+    parts: list[PartNames]
+
+
+class PartsMade(Message):
+    """They are made (`rosmop/sent.py`), in the order of the question."""
+
+    number: int
+    parts: list[bytes]
+
+
+CompilerLink = ContentsWanted | ContentsFound | CompilationRefused | PartsWanted | PartsMade

@@ -278,7 +278,7 @@ class TrafficReported(Message):
 class SpecificationsStated(Message):
     """Control states the specifications in force: before anything is placed, and at every change.
 
-    `compiled` is the set of all specifications as the compiler made it (`rosmop/sent.py`; empty: there is none);
+    `part` is what the compiler made for this relay of its specifications (`rosmop/sent.py`; empty: it has none);
     `enabled` says of each monitor of this relay whether its events happen. `restarted`: a relay that has none yet
     takes the place of one that died, so monitors with the modifier `hold` block their topics. So do those in `moved`:
     they come from another relay, and begin here. `statement` is a number of its own for every statement, which the
@@ -288,7 +288,7 @@ class SpecificationsStated(Message):
     """
 
     revision: int
-    compiled: bytes
+    part: bytes
     enabled: dict[str, bool]
     restarted: bool
     on_fault: Literal["drop", "pass"] = "drop"

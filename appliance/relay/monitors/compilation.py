@@ -8,10 +8,11 @@ import msgspec
 from appliance.channel.messages import SpecificationsStated
 from appliance.relay.monitors.compiler import Result
 from appliance.ros.definitions import Definitions
-from appliance.rosmop.compiled import Compiled
+from appliance.rosmop.compiled import Compiled, Part
 from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.ir.abi import FeedModule
 from appliance.rosmop.machine import load
-from appliance.rosmop.sent import decoded
+from appliance.rosmop.sent import decoded_part
 from appliance.rosmop.types.messages import Messages
 
 _TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in one go
@@ -21,18 +22,18 @@ _TRIAL_TICKS_SECONDS = 0.02
 def compiled(message: SpecificationsStated) -> Result:
     """The set that these specifications make, or why there is none."""
     try:
-        whole = decoded(message.compiled) if message.compiled else _nothing()
+        part = decoded_part(message.part) if message.part else _NOTHING
     except msgspec.MsgspecError as error:
         return [f"what control states is no set of specifications: {error}"]
     monitors = MonitorSet.of(
-        whole.part(message.enabled),
+        part.compiled,
         message.on_fault,
         _patience,
         trials=message.trials,
         trial_patience=lambda: _patience(_TRIAL_TICKS_SECONDS),
         slices=message.slices,
     )
-    monitors.write_module()
+    monitors.take_module(part.module)
     return monitors
 
 
@@ -41,8 +42,10 @@ def prepare() -> None:
     load()
 
 
-def _nothing() -> Compiled:
-    return Compiled((), (), {}, (), {}, Messages(Definitions({})), ())
+_NOTHING = Part(
+    Compiled((), (), {}, (), {}, Messages(Definitions({})), ()),
+    FeedModule(b"", 0, 0, 0, {}, (), {}, (), 0, {}, {}, ()),
+)
 
 
 def _patience(seconds: float = _TICKS_SECONDS) -> Callable[[], bool]:

@@ -107,7 +107,7 @@ class Middle:
             if self._stated is not None and not self.blocked and _same(message, self._stated):
                 self._taken(message, [], frozenset())
                 return
-            if not message.compiled and (self._stated is None or self.blocked):
+            if not message.part and (self._stated is None or self.blocked):
                 self._stated, self.blocked = message, ""
                 self._taken(message, [], None)
                 return
@@ -390,8 +390,8 @@ def _replaced(before: MonitorSet | None, after: MonitorSet) -> list[Monitor]:
 
 
 def _same(one: SpecificationsStated, other: SpecificationsStated) -> bool:
-    return (one.compiled, one.enabled.keys(), one.on_fault, one.trials, one.slices) == (
-        other.compiled,
+    return (one.part, one.enabled.keys(), one.on_fault, one.trials, one.slices) == (
+        other.part,
         other.enabled.keys(),
         other.on_fault,
         other.trials,

@@ -88,6 +88,7 @@ def _compile_all(
 
 
 def _declare(shared: Shared, specification: tree.Specification) -> SpecificationNames:
+    shared.symbols.begin(specification.name)
     names = SpecificationNames(specification.name, shared.symbols.fresh("c"))
     shared.specifications.append(names)
     declare_parameters(shared, names, specification)
@@ -128,6 +129,7 @@ def _check_names(shared: Shared, specifications: Sequence[tree.Specification]) -
 def _compile(
     shared: Shared, names: SpecificationNames, file: tree.File, specification: tree.Specification
 ) -> SpecificationCode | None:
+    shared.symbols.begin(specification.name)
     _check_head(shared, specification)
     start = _noted(shared, partial(compile_start, shared, names, specification))
     for function in names.functions.values():

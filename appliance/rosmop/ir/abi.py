@@ -47,7 +47,7 @@ class Cells:
     """Where the sender of what is looked at stands (`Sender.source` from bit 32 on), what is told, and which are
     enabled: three i64 (see `feed.py`).
     """
-    noted: frozenset[str] = frozenset()
+    noted: Sequence[str] = ()
     exits: dict[int, int] = field(default_factory=dict)
     """Where it is kept how the states of a property were left (`why.Exits`, `why.ClockedSteps`), by its number."""
     clocks: dict[int, int] = field(default_factory=dict)
@@ -96,7 +96,7 @@ class Cells:
 
 @dataclass(frozen=True)
 class Feed:
-    """The walk for one topic: the name of its export, which events may drop or change, where events are counted.
+    """The walk for one topic: the name of its export, whether it may drop or change messages, where events are counted.
 
     `verdicts` have the place of an event, of its step of a property, and of the handler. `log` is where the log of
     patches begins, `undo` the addresses of variables and of what they held before the message that is left. `brief`:
@@ -105,8 +105,8 @@ class Feed:
     """
 
     name: str
-    droppers: frozenset[int]
-    writers: frozenset[int]
+    drops: bool
+    changes: bool
     verdicts: Sequence[tuple[int, int, int]]
     counters: int
     log: int

@@ -105,7 +105,7 @@ def written(
         variables = (*component.variables, *component.noted)
         room = component.properties + len(variables)
         base, source, until = writer.take(8 * room), writer.take(32), writer.take(8)
-        cells.append(Cells(base, component.properties, source, frozenset(component.noted), until=until))
+        cells.append(Cells(base, component.properties, source, component.noted, until=until))
         shared |= dict.fromkeys(variables, cells[-1])
     effects = writer.take(16 * (MAX_EFFECTS + 2))
     feeds: dict[str, Feed] = {}
@@ -198,10 +198,9 @@ def _set(local: int, value: bytes) -> bytes:
 def _noting(place: int, written: Sequence[Written]) -> Feed:
     """What is said about what notes keys."""
     functions = [one.number for one in written]
-    nothing: frozenset[int] = frozenset()
     return Feed(
-        f"keys {place}", nothing, nothing, (), counters=0, log=0, undo=(), brief=False, functions=functions,
-        says=False, settle="", publishes=(),
+        f"keys {place}", drops=False, changes=False, verdicts=(), counters=0, log=0, undo=(), brief=False,
+        functions=functions, says=False, settle="", publishes=(),
     )  # fmt: skip
 
 
@@ -294,8 +293,8 @@ class _Walk:
         """What is said about it."""
         return Feed(
             name,
-            frozenset(number for number in range(len(self._events)) if self._drops(number)),
-            frozenset(number for number, written in enumerate(self._written) if written.writes),
+            any(map(self._drops, range(len(self._events)))),
+            any(written.writes for written in self._written),
             self.verdicts,
             self._counters,
             self._log,

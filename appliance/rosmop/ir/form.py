@@ -661,6 +661,16 @@ def nodes(root: object) -> Iterator[object]:
             waiting += [getattr(node, name) for name in node.__struct_fields__]
 
 
+def moved(root: Any, sites: Mapping[int, int]) -> Any:
+    """A part of the form with other numbers for its sites."""
+    if isinstance(root, tuple):
+        return tuple(moved(part, sites) for part in root)
+    if not isinstance(root, Node):
+        return root
+    parts = ((name, getattr(root, name)) for name in root.__struct_fields__)
+    return type(root)(*(sites[part] if name == "site" else moved(part, sites) for name, part in parts))
+
+
 def acts(root: Expression) -> bool:
     """Whether to evaluate it changes anything, or is seen from outside."""
     return any(

@@ -1,5 +1,6 @@
 """Places in the text of specifications, by which faults and decisions are told, and how values are shown there."""
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -33,16 +34,29 @@ class Site:
 
 
 class Symbols:
-    """The names that are made for the variables and functions of a set while it is compiled, and its sites."""
+    """The names that are made for the variables and functions of a set while it is compiled, and its sites.
+
+    The names of a specification are the same whatever else is in the set.
+    """
 
     def __init__(self) -> None:
         self.sites: list[Site] = []
-        self._names = 0
+        self._names: Counter[str] = Counter()
+        self._owner = ""
+
+    def begin(self, specification: str) -> None:
+        """The names that follow are of this specification."""
+        self._owner = specification
 
     def fresh(self, prefix: str) -> str:
         """A name that nothing else has."""
-        self._names += 1
-        return f"{prefix}{self._names}"
+        self._names[self._owner] += 1
+        return f"{prefix}{self._names[self._owner]} {self._owner}"
+
+    @staticmethod
+    def owner(name: str) -> str:
+        """The specification that a name was made for."""
+        return name.partition(" ")[2]
 
     def site(self, site: Site) -> int:
         """The number of a site."""

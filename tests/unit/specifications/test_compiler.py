@@ -58,7 +58,7 @@ def finds(channel: Channel, wanted: messages.ContentsWanted) -> None:
 
 def refuses(channel: Channel, wanted: messages.ContentsWanted) -> None:
     """It is wrong."""
-    channel.send(messages.ContentsRefused(wanted.number, ["a.rv:1:1: error: no"]))
+    channel.send(messages.CompilationRefused(wanted.number, ["a.rv:1:1: error: no"]))
 
 
 def dies(channel: Channel, _wanted: messages.ContentsWanted) -> None:

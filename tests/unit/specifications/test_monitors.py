@@ -18,6 +18,7 @@ from appliance.specifications.monitors import Monitors, MonitorsChangedError, Un
 from appliance.store.state import StateStore
 from tests.support.audit import HeardTrail
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
+from tests.support.stated import parts_here
 
 A = "a() { int shared; event said() /chatter std_msgs/String '{}' { } }"
 B = "hold b() { event said() /other std_msgs/String '{}' { } }"
@@ -70,6 +71,7 @@ class Desk:
             told=[],
             site_keys=site_keys,
             check=here,
+            parts=parts_here,
         )
         await relay.monitors.start(restarted=restarted)
         return relay.monitors

@@ -14,6 +14,7 @@ from appliance.specifications.allocation import TOPIC, Allocation, Move, Resourc
 from appliance.specifications.files import Sources, SpecificationsRefusedError, check
 from appliance.specifications.rollout import Revision, Rollout
 from tests.support.audit import HeardTrail
+from tests.support.stated import parts_here
 
 pytestmark = pytest.mark.anyio
 
@@ -53,6 +54,7 @@ class Fleet:
             lambda checked: dict.fromkeys(checked.monitors, True),
             self,
             slices=1000,
+            parts=parts_here,
         )
         self.story: list[tuple[Any, ...]] = []
         self.stated: list[tuple[int, messages.SpecificationsStated]] = []
@@ -103,7 +105,7 @@ class World:
         self.fleet = Fleet(self.trail)
         self.rollout = self.fleet.rollout
         self.files = {"a": spec("a", "/a") + spec("a2", "/a"), "b": spec("b", "/b")}
-        self.rollout.start(revision(1, **self.files), restarted=False, kept="")
+        asyncio.run(self.rollout.start(revision(1, **self.files), restarted=False, kept=""))
         self.fleet.carried = {(TOPIC, "/a"), (TOPIC, "/b")}
 
 
@@ -299,7 +301,7 @@ async def test_a_crash_of_control_changes_nothing(world: World, tmp_path: Path) 
     log = AuditLog(tmp_path / "other.db")
     trail = AuditTrail(log, strict=False, deny_when_failed=False)
     after = Fleet(trail).rollout
-    after.start(revision(1, **files), restarted=True, kept=kept[-1])
+    await after.start(revision(1, **files), restarted=True, kept=kept[-1])
     assert {name: after.relay_of(name) for name in files} == here
     assert after.statement(0).restarted is True
     log.close()
@@ -317,6 +319,6 @@ async def test_a_crash_of_control_in_the_middle_of_a_change_leaves_no_topic_with
     allocation.adopt(allocation.plan(before.checked))
     allocation.adopt(allocation.plan(revision(2).checked))
     after = Fleet(world.trail).rollout
-    after.start(before, restarted=True, kept=kept[-1])
+    await after.start(before, restarted=True, kept=kept[-1])
     for number, name in enumerate(names):
         assert after.relay_of(f"x{number}") == after.allocation.of(TOPIC, name)

@@ -12,7 +12,8 @@ from appliance.channel.messages import SpecificationsStated
 from appliance.relay.monitors.compiler import Compiler
 monitors = Compiler.compile(SpecificationsStated(1, bytes.fromhex(sys.argv[1]), {"m": True}, False))
 assert monitors.monitors, monitors
-compiler = ("lark", "appliance.rosmop.syntax", "appliance.rosmop.compile.")
+ir = tuple(f"appliance.rosmop.ir.{name}" for name in ("feed", "module", "layout", "wasm"))
+compiler = ("lark", "appliance.rosmop.syntax", "appliance.rosmop.compile.", "appliance.rosmop.modules", *ir)
 assert not [name for name in sys.modules if name.startswith(compiler)]
 gc.collect()
 print(len(gc.get_objects()))
@@ -21,7 +22,7 @@ print(len(gc.get_objects()))
 
 def test_the_garbage_collector_looks_at_the_specifications_and_not_at_what_compiles_them() -> None:
     """Parser, definitions and libraries stay: a hundred thousand objects, through which it would hold up messages."""
-    data = stated(1, [("m.rv", TEXT)]).compiled
+    data = stated(1, [("m.rv", TEXT)]).part
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, data.hex()], capture_output=True, text=True, check=True
     )
