@@ -30,8 +30,7 @@ def declare_variables(shared: Shared, names: SpecificationNames, specification: 
                 shared.findings += error.findings
                 names.misdeclared.add(declarator.name)
                 continue
-            names.variables[declarator.name] = variable
-            shared.types[variable.code] = variable.type
+            shared.declare(names, variable)
 
 
 def _shared_variable(

@@ -113,6 +113,10 @@ class Shared:
         self.specifications: list[SpecificationNames] = []
         self.types: dict[str, Type] = {}
         """Those of variables, by their names in the form."""
+        self.owners: dict[str, list[SpecificationNames]] = {}
+        """The specifications that have a variable of a name."""
+        self.unsliced: set[str] = set()
+        """The variables of which slices have none of their own, by their names in the form."""
         self.findings: list[Finding] = []
         self.publications: list[Publication] = []
         self.partial = False
@@ -122,11 +126,19 @@ class Shared:
         """Add a function."""
         self.functions[function.name] = function
 
+    def declare(self, names: SpecificationNames, variable: Variable) -> None:
+        """Add a variable of a specification."""
+        names.variables[variable.name] = variable
+        self.types[variable.code] = variable.type
+        self.owners.setdefault(variable.name, []).append(names)
+        if not variable.sliced:
+            self.unsliced.add(variable.code)
+
     def foreign(
         self, own: SpecificationNames, name: str, position: Position
     ) -> tuple[Variable | None, str | None]:
         """A variable of another specification, and which that is."""
-        owners = [other for other in self.specifications if other is not own and name in other.variables]
+        owners = [other for other in self.owners.get(name, ()) if other is not own]
         if len(owners) > 1:
             both = " and ".join(other.name for other in owners[:2])
             raise SpecificationError.at(

@@ -42,8 +42,8 @@ def declare_parameters(shared: Shared, names: SpecificationNames, specification:
         variable = Variable(
             parameter.name, kind, code, parameter.position, shared=True, constant=True, sliced=True
         )
-        names.variables[parameter.name] = names.parameters[parameter.name] = variable
-        shared.types[code] = kind
+        names.parameters[parameter.name] = variable
+        shared.declare(names, variable)
     if len(specification.parameters) > MOST_PARAMETERS:
         text = f"a specification has at most {MOST_PARAMETERS} parameters"
         shared.findings.append(Finding(specification.parameters[-1].position, "error", text))
@@ -93,13 +93,7 @@ def creates(specification: tree.Specification, event: tree.Event) -> bool:
 
 def acts(function: form.Function, shared: Shared) -> bool:
     """Whether the action of an event does more than to change the slice's own variables."""
-    others = {
-        variable.code
-        for specification in shared.specifications
-        for variable in specification.variables.values()
-        if not variable.sliced
-    }
-    if not others.isdisjoint(function.shared):
+    if not shared.unsliced.isdisjoint(function.shared):
         return True
     return any(
         isinstance(node, _ACTS) or (isinstance(node, form.WriteBack) and bool(node.writes))

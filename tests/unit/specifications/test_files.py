@@ -34,7 +34,7 @@ def test_a_folder_is_read_with_its_definitions(tmp_path: Path) -> None:
         (Sources({"b.rv": OWN}), "own_msgs/Trigger"),
         (Sources({"a.rv": SPEC}, {"own_msgs/Trigger.msg": "no such type"}), "own_msgs/Trigger.msg"),
         (Sources({"a.rv": SPEC + " " * (1 << 20)}), "a.rv: longer than"),
-        (Sources({"a.rv": SPEC}, {"own_msgs/T.msg": "#" * (9 << 20)}), "longer than 8388608"),
+        (Sources({"a.rv": SPEC}, {"own_msgs/T.msg": "#" * (4 << 20)}), "longer than 3145728"),
         (Sources({"a.rv": SPEC, "c.rv": SPEC}), "there is another specification"),
     ],
 )
