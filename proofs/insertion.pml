@@ -308,7 +308,7 @@ inline monitors_changed() {
 }
 
 /* A set of monitors takes the place of the one before, between two messages.
-   = appliance/relay/monitors/middle.py Middle.compiled */
+   = appliance/relay/monitors/middle.py Middle.loaded */
 inline swap(revision, how) {
     has = revision;
     blocked = false;
@@ -376,7 +376,7 @@ inline carry_out() {
     to_relay?message, number, flags;
     if
     /* = appliance/relay/monitors/middle.py Middle.state
-       = appliance/relay/monitors/compiler.py Compiler.later */
+       = appliance/relay/monitors/loader.py Loader.later */
     :: message == spec ->
         if
         :: AS_BEFORE -> SAY(taken, number, flags)
@@ -682,7 +682,7 @@ end:
     :: atomic {
         up && HOLDS_NOTHING_BACK && len(to_relay) > 0 -> carry_out()
        }
-    /* = appliance/relay/monitors/compiler.py Compiler._ready */
+    /* = appliance/relay/monitors/loader.py Loader._ready */
     :: atomic {
         up && len(compiling) > 0 -> compiling?number, flags;
         if

@@ -6,6 +6,8 @@ Theory of operation:
   copied), the same on every machine. Memory is bounded by a limit. What goes beyond is a `MachineTrap`.
 - The addresses of the whole limit are reserved at the start and the memory grows in place: a view of it is never
   wrong, an older one is only shorter. A view keeps the memory when the machine is closed.
+- A module becomes code of this machine (`translated`) in one process, and runs (`Machine`) in others, which compile
+  nothing.
 - The library of the package `wasmtime` is called by its C functions (0.4 µs a call, 20 by its Python) under Python's
   lock: no other thread is ever within a machine. Its Python could not be loaded in the relay: it has functions that
   C calls, for which libffi wants memory that is writable and executable at once. So a module has no imports, either.
@@ -230,8 +232,6 @@ def load() -> ctypes.PyDLL:
     folder = f"linux-{os.uname().machine}"
     file = str(Path(package.origin).with_name(folder) / "_libwasmtime.so")
     library = ctypes.PyDLL(file)
-    # The one that takes long: a module is compiled beside whatever else goes on.
-    library.__dict__["wasmtime_module_new"] = ctypes.CDLL(file).wasmtime_module_new
     for name, (result, *given) in _C.items():
         function = getattr(library, name)
         function.restype, function.argtypes = result, given

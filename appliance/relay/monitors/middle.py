@@ -29,8 +29,8 @@ from appliance.channel.messages import (
     SpecificationsTaken,
 )
 from appliance.relay.loop import Loop, Timer
-from appliance.relay.monitors.compiler import Compiler, Result
 from appliance.relay.monitors.lane import LONGEST, TOO_LONG, Lane, dropped
+from appliance.relay.monitors.loader import Loader, Result
 from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.observer import Observer, refusal
@@ -87,7 +87,7 @@ class Middle:
         """For the walks of requests and replies until there is another `sight`: at most a second."""
         self._timer: Timer | None = None
         self._due: int | None = None
-        self._compiler = Compiler(loop, self.compiled)
+        self._loader = Loader(loop, self.loaded)
         self.observations = Observations(loop, reporter, self._rows)
         self._changed = changed
         self.senders = Senders()
@@ -101,9 +101,9 @@ class Middle:
     # --- what control states ---
 
     def state(self, message: SpecificationsStated) -> None:
-        """Take these specifications, at once or when they are compiled; the same as before keep their state."""
+        """Take these specifications, at once or when they are loaded; the same as before keep their state."""
         self._switches = dict(message.enabled)
-        if not self._compiler.busy:
+        if not self._loader.busy:
             if self._stated is not None and not self.blocked and _same(message, self._stated):
                 self._taken(message, [], frozenset())
                 return
@@ -113,10 +113,10 @@ class Middle:
                 return
         if message.ahead or (self._stated is None and not self.blocked):
             self._awaited = message
-        self._compiler.later(message)
+        self._loader.later(message)
 
-    def compiled(self, message: SpecificationsStated, result: Result) -> None:
-        """Put a set that was compiled into force, or refuse it, and tell control."""
+    def loaded(self, message: SpecificationsStated, result: Result) -> None:
+        """Put a set that was loaded into force, or refuse it, and tell control."""
         if message is self._awaited:
             self._awaited = None
         self.look_again()
@@ -191,7 +191,7 @@ class Middle:
 
     @property
     def preparing(self) -> bool:
-        """Whether specifications are compiled that must be in force before anything else is carried out."""
+        """Whether specifications are loaded that must be in force before anything else is carried out."""
         return self._awaited is not None
 
     def stands(self, topic: str) -> bool:
@@ -268,7 +268,7 @@ class Middle:
 
     def close(self) -> None:
         """The relay ends."""
-        self._compiler.close()
+        self._loader.close()
         self.trials.close()
         if self._timer is not None:
             self._timer.cancel()

@@ -117,6 +117,16 @@ def world(tmp_path: Path) -> Iterator[World]:
     world.log.close()
 
 
+async def test_a_relay_whose_specifications_are_the_same_is_given_the_same(world: World) -> None:
+    """Whatever comes to the other one: it goes on with what it has."""
+    other = world.rollout.relay_of("b")
+    before = {relay: world.rollout.statement(relay).part for relay in range(2)}
+    await world.rollout.take(revision(2, **world.files, c=spec("c", "/a")))
+    after = {relay: world.rollout.statement(relay).part for relay in range(2)}
+    assert after[other] == before[other]
+    assert after[1 - other] != before[1 - other]
+
+
 async def test_each_relay_is_told_its_own(world: World) -> None:
     """And of a change, before anything comes into force. What a relay is told first goes ahead of all else."""
     assert world.rollout.statement(0).ahead

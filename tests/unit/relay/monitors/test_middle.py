@@ -24,8 +24,8 @@ from appliance.channel.messages import (
     UpstreamWanted,
 )
 from appliance.relay.connections.frames import Batch
-from appliance.relay.monitors.compiler import Compiler
 from appliance.relay.monitors.lane import TOO_LONG
+from appliance.relay.monitors.loader import Loader
 from appliance.relay.monitors.places import Place
 from appliance.ros.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
 from appliance.rosmop.engine import MonitorSet
@@ -203,13 +203,13 @@ def test_the_first_specifications_hold_up_nothing_but_what_is_to_be_carried(
 ) -> None:
     """However long they take to compile: the loop serves on (its supervisor), and nothing goes past the monitors."""
     compiled = threading.Event()
-    compile_now = Compiler.compile
+    load_now = Loader.load
 
-    def compile_late(message: SpecificationsStated) -> Any:
+    def load_late(message: SpecificationsStated) -> Any:
         compiled.wait()
-        return compile_now(message)
+        return load_now(message)
 
-    monkeypatch.setattr(Compiler, "compile", staticmethod(compile_late))
+    monkeypatch.setattr(Loader, "load", staticmethod(load_late))
     late = GUARD.replace("/chatter", "/late")
     world.state(stated(1, [("0.rv", late)], {}, {}, True, statement=7))
     world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
@@ -252,13 +252,13 @@ def test_what_a_new_control_begins_with_is_in_force_before_it_places_anything(
     """It may have another revision than the relay, after a crash in the middle of a change; or one that is refused."""
     world.load(GUARD)
     compiled = threading.Event()
-    compile_now = Compiler.compile
+    load_now = Loader.load
 
-    def compile_late(message: SpecificationsStated) -> Any:
+    def load_late(message: SpecificationsStated) -> Any:
         compiled.wait()
-        return compile_now(message)
+        return load_now(message)
 
-    monkeypatch.setattr(Compiler, "compile", staticmethod(compile_late))
+    monkeypatch.setattr(Loader, "load", staticmethod(load_late))
     world.state(stated(2, [("0.rv", text)], {}, {}, True, ahead=True))
     world.state(PublicationPlaced("k", "/late", "std_msgs/String"))
     assert ("k", "/late") not in world.engine.topics

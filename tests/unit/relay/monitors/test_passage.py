@@ -82,7 +82,7 @@ class Monitored:
         self.set = MonitorSet.load(texts, known, on_fault, trials=trials)
         if together:
             self.set.write_module()
-        self.middle.compiled(stated(1, [], {}, {}, restarted=restarted), self.set)
+        self.middle.loaded(stated(1, [], {}, {}, restarted=restarted), self.set)
 
     def close(self) -> None:
         """End."""

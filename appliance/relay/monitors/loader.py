@@ -1,4 +1,4 @@
-"""Specifications become monitors beside the loop, so that messages go on while a large set is compiled.
+"""What the compiler made becomes monitors beside the loop, so that messages go on while a large set is loaded.
 
 One statement at a time, in the order they came; `done` is called by the loop.
 """
@@ -17,14 +17,14 @@ from appliance.relay.loop import READ, Loop
 if TYPE_CHECKING:
     from appliance.rosmop.engine import MonitorSet
 
-_SWITCH_SECONDS = 0.0005  # the loop waits so long at most for the compiler
+_SWITCH_SECONDS = 0.0005  # the loop waits so long at most for the thread that loads
 
 Result = Union["MonitorSet", list[str]]
 """The monitors, or what is wrong with the specifications."""
 
 
-class Compiler:
-    """Compiles statements; `done(statement, result)` hears of each."""
+class Loader:
+    """Loads what is stated; `done(statement, result)` hears of each."""
 
     def __init__(self, loop: Loop, done: Callable[[SpecificationsStated, Result], None]) -> None:
         self._loop = loop
@@ -35,18 +35,18 @@ class Compiler:
         self._wake = -1
 
     def later(self, message: SpecificationsStated) -> None:
-        """Compile while the loop goes on."""
+        """Load it while the loop goes on."""
         self._waiting.append(message)
         if self._thread is None:
             self._begin()
 
     @property
     def busy(self) -> bool:
-        """Whether something is being compiled, or waits for it."""
+        """Whether something is being loaded, or waits for it."""
         return self._thread is not None or bool(self._waiting)
 
     def close(self) -> None:
-        """Wait for the one that is being compiled; its result is nobody's."""
+        """Wait for the one that is being loaded; its result is nobody's."""
         self._waiting.clear()
         if self._thread is not None:
             self._thread.join()
@@ -63,7 +63,7 @@ class Compiler:
         self._thread.start()
 
     def _work(self, message: SpecificationsStated, wake: int) -> None:
-        self._result = self.compile(message)
+        self._result = self.load(message)
         os.eventfd_write(wake, 1)
 
     def _ready(self, _events: int) -> None:
@@ -77,10 +77,12 @@ class Compiler:
             self._begin()
 
     @staticmethod
-    def compile(message: SpecificationsStated) -> Result:
+    def load(message: SpecificationsStated) -> Result:
         """The set that these specifications make, or what is wrong with them."""
         try:  # it is loaded late, for that takes half a second of a small machine
-            result: Result = late.load("appliance.relay.monitors.compilation", "prepare").compiled(message)
-        except Exception as error:  # noqa: BLE001  a defect of the compiler is a reason to refuse, no more
+            result: Result = late.load("appliance.relay.monitors.monitor_sets", "prepare").monitor_set(
+                message
+            )
+        except Exception as error:  # noqa: BLE001  a defect is a reason to refuse, no more
             return [f"a defect of rosrv, please report it: {type(error).__name__}: {error}"]
         return result

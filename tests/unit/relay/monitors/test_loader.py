@@ -9,8 +9,8 @@ TEXT = "m() { event e(bool x) /t std_msgs/Bool '{data:x}' { } }"
 PROGRAM = """
 import gc, sys
 from appliance.channel.messages import SpecificationsStated
-from appliance.relay.monitors.compiler import Compiler
-monitors = Compiler.compile(SpecificationsStated(1, bytes.fromhex(sys.argv[1]), {"m": True}, False))
+from appliance.relay.monitors.loader import Loader
+monitors = Loader.load(SpecificationsStated(1, bytes.fromhex(sys.argv[1]), {"m": True}, False))
 assert monitors.monitors, monitors
 ir = tuple(f"appliance.rosmop.ir.{name}" for name in ("feed", "module", "layout", "wasm"))
 compiler = ("lark", "appliance.rosmop.syntax", "appliance.rosmop.compile.", "appliance.rosmop.modules", *ir)

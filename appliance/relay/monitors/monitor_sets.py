@@ -1,4 +1,4 @@
-"""Monitors of what the compiler has compiled: what `Compiler` does, beside the loop."""
+"""Monitors of what the compiler made: what `Loader` does, beside the loop."""
 
 import time
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from collections.abc import Callable
 import msgspec
 
 from appliance.channel.messages import SpecificationsStated
-from appliance.relay.monitors.compiler import Result
+from appliance.relay.monitors.loader import Result
 from appliance.ros.definitions import Definitions
 from appliance.rosmop.compiled import Compiled, Part
 from appliance.rosmop.engine import MonitorSet
@@ -19,7 +19,7 @@ _TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in o
 _TRIAL_TICKS_SECONDS = 0.02
 
 
-def compiled(message: SpecificationsStated) -> Result:
+def monitor_set(message: SpecificationsStated) -> Result:
     """The set that these specifications make, or why there is none."""
     try:
         part = decoded_part(message.part) if message.part else _NOTHING
