@@ -28,6 +28,7 @@ _RECEIVE_SIZE = 262_144
 _MAX_DESCRIPTORS = 64
 _TOGETHER = 65_536  # bytes of frames that are written at once
 _MAX_UNCLAIMED = 65_536
+SOON_SECONDS = 0.005  # what is sent soon waits for company: a wakeup costs more than what it reads
 _MAX_READS = 64  # in one go, so that an end that never stops writing leaves time for others
 
 
@@ -71,7 +72,8 @@ class Channel:
     def send(self, message: Message, descriptors: tuple[int, ...] = (), *, soon: bool = False) -> None:
         """Queue a message and write what the socket takes; descriptors are duplicated, the caller keeps his.
 
-        `soon`: of an attached channel it is written at the end of the loop's turn, with all that is sent until then.
+        `soon`: of an attached channel it is written in `SOON_SECONDS`, with all that is sent until then, or before the
+        next that is not.
         """
         if len(descriptors) != message.descriptors:
             raise ValueError(f"{type(message).__name__} travels with {message.descriptors} descriptors")
@@ -87,7 +89,7 @@ class Channel:
         elif not soon:
             self._flush_attached()
         elif len(self._outgoing) == 1:  # else it is to be written already
-            self._loop.call_soon(self._flush_attached)
+            self._loop.call_later(SOON_SECONDS, self._flush_attached)
 
     def flush(self) -> None:
         """Write what the socket takes now. Raises `ChannelClosedError` when the other end is gone."""
@@ -214,7 +216,7 @@ class Channel:
             self._loop.remove_writer(self.fileno())
 
     def _flush_attached(self) -> None:
-        if not self._outgoing:  # all was written, or the channel closed, before the turn ended
+        if not self._outgoing:  # all was written, or the channel closed, meanwhile
             return
         try:
             self.flush()

@@ -35,8 +35,9 @@ from appliance.store.state import PermissionRow
 class RelayPost(Link):
     """The link to relay `index`. What is sent while nobody is there is stated afresh when somebody is.
 
-    What it is sent `soon` goes with the rest of that turn of the loop, or before the next thing that is not: nobody
-    connects to what a relay carries without a grant, which is told at once.
+    What it is sent `soon` goes some milliseconds later with all that comes until then (a node that starts registers
+    ten topics in that time), or before the next thing that is not: nobody connects to what a relay carries without a
+    grant, which is told at once, as are revoked grants, and `orders` are asked after all of it.
     """
 
     def __init__(self, index: int, heard: Callable[[Any], None], lost: Callable[[str], None]) -> None:
