@@ -14,6 +14,8 @@ from appliance.rosmop.sent import decoded, encoded, encoded_part
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.specifications.files import SpecificationsRefusedError
 
+_LONGEST = 32 << 20  # bytes: half of what a channel takes
+
 
 def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
     """What is in these files, with these definitions. Raises `SpecificationsRefusedError` with all that is wrong."""
@@ -50,14 +52,22 @@ def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
         {monitor.name: monitor.code.uses for monitor in monitors.monitors},
         {name: monitors.published_by(name) for name in files},
         certificates,
-        encoded(monitors.compiled),
+        _bounded(encoded(monitors.compiled)),
     )
 
 
 def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
-    """What each of these relays runs of a set (`Contents.compiled`)."""
+    """What each of these relays runs of a set (`Contents.compiled`). Raises `SpecificationsRefusedError`."""
     whole = decoded(compiled)
-    return [encoded_part(part_of(whole, names.monitors, names.trials)) for names in wanted]
+    return [_bounded(encoded_part(part_of(whole, names.monitors, names.trials))) for names in wanted]
+
+
+def _bounded(data: bytes) -> bytes:
+    """What travels to control and to relays. Raises `SpecificationsRefusedError`."""
+    if len(data) > _LONGEST:
+        text = f"compiled, they take {len(data) >> 20} MiB; {_LONGEST >> 20} are allowed: load fewer of them"
+        raise SpecificationsRefusedError([text])
+    return data
 
 
 @cache

@@ -12,6 +12,7 @@ import pytest
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.compiler import process
+from appliance.rosmop.sent import decoded_part
 from appliance.specifications.files import Sources, SpecificationsRefusedError, check, checked
 
 GOOD = """a() {
@@ -29,7 +30,7 @@ HUNGRY = "s() { event e() /a std_msgs/Bool '{}' { " + "int x; x = 1 + 2 * 3; " *
 pytestmark = pytest.mark.anyio
 
 
-async def conversation(*wanted: messages.ContentsWanted) -> list[Any]:
+async def conversation(*wanted: messages.Message) -> list[Any]:
     """What a compiler answers that is asked this; it has ended by itself when this returns."""
     lifeline, its_lifeline = socket.socketpair()
     ours, theirs = socket.socketpair()
@@ -76,6 +77,33 @@ async def test_a_defect_of_the_compiler_is_an_answer(monkeypatch: pytest.MonkeyP
     assert [answer.findings for answer in await conversation(wanted, wanted)] == [
         ["a defect of rosrv, please report it: ZeroDivisionError: integer division or modulo by zero"]
     ] * 2
+
+
+async def test_it_makes_what_relays_run_of_what_it_has_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each its own, in the order of the question."""
+    monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
+    monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
+    text = GOOD + GOOD.replace("a()", "c()").replace("b()", "d()").replace("shared", "another")
+    compiled = check(Sources({"a.rv": text}, DEFINITIONS), ()).compiled
+    names = [messages.PartNames(("c", "d")), messages.PartNames(("a", "b"), ("a",))]
+    (made,) = await conversation(messages.PartsWanted(3, compiled, names))
+    found = [[one.name for one in decoded_part(part).compiled.specifications] for part in made.parts]
+    assert (made.number, found) == (3, [["c", "d"], ["a", "b"]])
+
+
+async def test_what_is_too_large_to_travel_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The whole set, and what one relay runs of it: no link breaks of them."""
+    monkeypatch.setattr(process, "_IDLE_SECONDS", 0.2)
+    monkeypatch.setattr(resource, "setrlimit", lambda *_limit: None)
+    compiled = check(Sources({"a.rv": GOOD}, DEFINITIONS), ()).compiled
+    monkeypatch.setattr("appliance.specifications.checking._LONGEST", 1000)
+    answers = await conversation(
+        messages.ContentsWanted(1, {"a.rv": GOOD}, DEFINITIONS),
+        messages.PartsWanted(2, compiled, [messages.PartNames(("a", "b"))]),
+    )
+    assert [answer.number for answer in answers] == [1, 2]
+    for answer in answers:
+        assert answer.findings == ["compiled, they take 0 MiB; 0 are allowed: load fewer of them"]
 
 
 @pytest.mark.parametrize(("memory", "seconds"), [(8 << 20, 4), (1 << 30, 1)], ids=["memory", "time"])
