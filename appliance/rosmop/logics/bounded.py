@@ -13,15 +13,14 @@ while that is open; a cell tells its *users* when it is decided. Cells are made 
   a step costs the same however many wait.
 - `until` and `since` over parts that are open themselves keep *rows*, one for each event that matters. What is certain
   is what comes out alike whether all that is open were to fail or to hold (both operators only gain when a part comes
-  to hold); so it is computed twice, over all rows, when a part is decided that was open.
+  to hold). When a part is decided that was open, `until` looks at the rows that this may decide, `since` at all.
 
 A run waits for at most `MOST_OPEN` events; a step beyond that is a fault, and its event is not seen.
 """
 
 from abc import ABC, abstractmethod
-from bisect import bisect_right
+from bisect import bisect_left, insort
 from collections import deque
-from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass
 
@@ -137,9 +136,9 @@ class _Operator(ABC):
     def settle(self) -> None:  # noqa: B027  two have open operands, and something to decide then
         """Decide what can be, now that operands are decided."""
 
-    def hear(self, value: bool) -> None:
-        """An operand that was open has this value; `settle` is called for all such together."""
-        del value
+    def hear(self, cell: Cell) -> None:
+        """An operand that was open has a value; `settle` is called for all such together."""
+        del cell
 
     def pass_by(self, time: int) -> None:
         """There will be no event any more up to this time."""
@@ -180,6 +179,11 @@ def _wanted(row: _Row) -> bool:
     return row.cell is not None and row.cell.wanted
 
 
+_Mark = tuple[int, int]
+"""The time and the place of an event."""
+_Marks = tuple[list[_Mark], ...]
+
+
 class _Rows(_Operator):
     """An operator that keeps what its operands are worth."""
 
@@ -205,90 +209,150 @@ class _Rows(_Operator):
 class _OpenUntil(_Rows):
     """`until` over what may be open. All time up to `passed` is over.
 
-    `hopes` are the rows at which the right operand may still come. As long as it has come at no row, and the left one
-    has failed at none (`noted`), a row is decided only when its time is over and nothing in it may come any more.
+    `pending` are the rows that are not decided. For the others of them there is where the right operand holds (`holds`)
+    or may (`hopes`), and where the left one fails (`fails`) or may (`doubts`), as times and places in order. Whatever
+    becomes known concerns those pending rows only for which it was the first or the last of its kind: they are found by
+    their times, so a step costs the same however many wait, unless it decides them.
     """
 
     def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
         super().__init__(run, number, instruction)
         self.passed = -FOREVER
-        self.hopes: deque[_Row] = deque()
-        self.noted = False
+        self.pending: list[tuple[int, int, _Row]] = []
+        self.holds: list[_Mark] = []
+        self.hopes: list[_Mark] = []
+        self.fails: list[_Mark] = []
+        self.doubts: list[_Mark] = []
+        self.waits: dict[Cell, list[tuple[_Mark, bool]]] = {}
+        self.heard: list[Cell] = []
 
     def take(self, now: int) -> None:
         if not self.rows:
             return
         row = self.keep(now)
-        if isinstance(row.right, Cell):
-            self.hopes.append(row)
-        if row.right is True or row.left is False:
-            self.noted = True
-            self.run.changed.add(self)
+        mark = row.time, row.place
+        if row.cell is not None:
+            self.pending.append((*mark, row))
+        for value, of_right, waiting in ((row.left, False, self.doubts), (row.right, True, self.hopes)):
+            if isinstance(value, Cell):
+                self.waits.setdefault(value, []).append((mark, of_right))
+                waiting.append(mark)
+        if row.right is True:
+            self._know_right(mark, True)
+        if row.left is False:
+            self._know_left(mark, False)
+        self._forget()
 
-    def hear(self, value: bool) -> None:
-        self.noted |= value or self.left in self.run.later
+    def hear(self, cell: Cell) -> None:
+        self.heard.append(cell)
 
     def settle(self) -> None:
-        if self.noted:
-            least, most = self._values(hopeful=False), self._values(hopeful=True)
-            for row in reversed(self.rows):
-                sure, possible = next(least), next(most)
-                if sure is possible:
-                    self.run.decide(row.cell, sure)
+        heard, self.heard = self.heard, []
+        for cell in heard:
+            for mark, of_right in self.waits.pop(cell, ()):
+                waiting = self.hopes if of_right else self.doubts
+                del waiting[bisect_left(waiting, mark)]
+                (self._know_right if of_right else self._know_left)(mark, bool(cell.value))
+        self._forget()
+
+    def _know_right(self, mark: _Mark, holds: bool) -> None:
+        time, place = mark
+        begins = [(time - self.high, 0), _behind(_last((self.fails,), mark))]
+        ends = [(time - self.low + 1, 0), (time, place + 1)]
+        if holds:
+            insort(self.holds, mark)
+            begins.append(_behind(_last((self.doubts,), mark)))
         else:
-            self._close()
-        while self.rows and not _wanted(self.rows[0]):
-            self.drop()
-        if self.noted:
-            self.noted = any(
-                _supposed(row.right, hopeful=False) or not _supposed(row.left, hopeful=True)
-                for row in self.rows
+            begins.append(_behind(_last((self.holds, self.hopes), mark), self.low))
+            following, fail = _first((self.holds, self.hopes), mark), _first((self.fails,), mark)
+            if following is not None and (fail is None or following <= fail):
+                ends.append((following[0] - self.high, 0))
+            elif fail is None:
+                ends.append((self.passed - self.high + 1, 0))
+        self._look(begins, ends)
+
+    def _know_left(self, mark: _Mark, holds: bool) -> None:
+        time, place = mark
+        if not holds:
+            insort(self.fails, mark)
+            come = _last((self.holds, self.hopes), (time, place + 1))
+            self._look([_behind(_last((self.fails,), mark)), _behind(come, self.low)], [(time, place + 1)])
+            return
+        until = _first((self.fails, self.doubts), mark) or (FOREVER, 0)
+        good = _first((self.holds,), (time, place + 1))
+        best = _last((self.holds,), (until[0], until[1] + 1))
+        if good is not None and best is not None and good <= best:
+            begins = [(good[0] - self.high, 0), _behind(_last((self.fails, self.doubts), mark))]
+            self._look(begins, [(best[0] - self.low + 1, 0), (time, place + 1)])
+
+    def _look(self, begins: list[_Mark], ends: list[_Mark]) -> None:
+        """Decide what can be of the pending rows from the last of these beginnings to the first of these ends."""
+        begin = bisect_left(self.pending, max(begins))
+        end = max(begin, bisect_left(self.pending, min(ends)))
+        self.pending[begin:end] = [entry for entry in self.pending[begin:end] if not self._decided(entry[2])]
+
+    def _decided(self, row: _Row) -> bool:
+        if _wanted(row):
+            sure = self._value(row, (self.holds,), (self.fails, self.doubts))
+            onward = (
+                row.time + self.high > self.passed and _first((self.fails,), (row.time, row.place)) is None
             )
+            possible = onward or self._value(row, (self.holds, self.hopes), (self.fails,))
+            if sure is not possible:
+                return False
+            self.run.decide(row.cell, sure)
+        return True
 
-    def _close(self) -> None:
-        """Decide the rows whose time is over, where nothing may come any more."""
-        while self.hopes and _known(self.hopes[0].right or False) is not None:
-            self.hopes.popleft()
-        for row in self.rows:
-            if row.time + self.high > self.passed:
-                break
-            if not any(self._may_come(row, hope) for hope in self.hopes):
-                self.run.decide(row.cell, False)
+    def _value(self, row: _Row, goods: _Marks, bads: _Marks) -> bool:
+        """Whether one of these is in the row's time before the first of those, or with it."""
+        good = _first(goods, (row.time + self.low, row.place))
+        if good is None or good[0] > row.time + self.high:
+            return False
+        bad = _first(bads, (row.time, row.place))
+        return bad is None or good <= bad
 
-    def _may_come(self, row: _Row, hope: _Row) -> bool:
-        inside = self.low <= hope.time - row.time <= self.high and hope.place >= row.place
-        return inside and _known(hope.right or False) is None
-
-    def _values(self, *, hopeful: bool) -> Iterator[bool]:
-        """What it is worth from the newest row to the oldest if all that is open were to hold, or to fail."""
-        # The times at which the right operand holds, negated, as far as the left one reaches.
-        goods: list[int] = []
-        onward = hopeful
-        for row in reversed(self.rows):
-            left, right = (_supposed(value, hopeful=hopeful) for value in (row.left, row.right))
-            if not left:
-                goods.clear()
-                onward = False
-            if right:
-                goods.append(-row.time)
-            first = bisect_right(goods, -(row.time + self.low)) - 1
-            found = first >= 0 and -goods[first] <= row.time + self.high
-            yield found or (onward and row.time + self.high > self.passed)
+    def _forget(self) -> None:
+        """Keep no row that nobody waits for, nor one before it."""
+        while self.rows and not _wanted(self.rows[0]):
+            row = self.drop()
+            for value in (row.left, row.right):
+                if isinstance(value, Cell) and value in self.waits:
+                    self.waits[value] = [wait for wait in self.waits[value] if wait[0][1] > row.place]
+                    if not self.waits[value]:
+                        del self.waits[value]
+        kept = self.rows[0].place if self.rows else self.run.place + 1
+        for marks in (self.holds, self.hopes, self.fails, self.doubts, self.pending):
+            while marks and marks[0][1] < kept:
+                del marks[0]
 
     def pass_by(self, time: int) -> None:
-        self.passed = time
-        self.settle()
+        before, self.passed = self.passed, time
+        self._look([(before - self.high + 1, 0)], [(time - self.high + 1, 0)])
+        self._forget()
 
     @property
     def deadline(self) -> int | None:
-        return next(
-            (
-                row.time + self.high
-                for row in self.rows
-                if row.time + self.high > self.passed and _wanted(row)
-            ),
-            None,
-        )
+        following = bisect_left(self.pending, (self.passed - self.high + 1, 0))
+        while following < len(self.pending) and not _wanted(self.pending[following][2]):
+            del self.pending[following]
+        return self.pending[following][0] + self.high if following < len(self.pending) else None
+
+
+def _first(kinds: _Marks, mark: _Mark) -> _Mark | None:
+    """The first of these that is not before a mark."""
+    found = ((marks, bisect_left(marks, mark)) for marks in kinds)
+    return min((marks[index] for marks, index in found if index < len(marks)), default=None)
+
+
+def _last(kinds: _Marks, mark: _Mark) -> _Mark | None:
+    """The last of these that is before a mark."""
+    found = ((marks, bisect_left(marks, mark)) for marks in kinds)
+    return max((marks[index - 1] for marks, index in found if index), default=None)
+
+
+def _behind(mark: _Mark | None, low: int = 0) -> _Mark:
+    """Where the rows begin for which a mark is too early."""
+    return (-FOREVER, 0) if mark is None else (mark[0] - low, mark[1] + 1)
 
 
 def _supposed(value: Value | None, *, hopeful: bool) -> bool:
@@ -563,7 +627,7 @@ class BoundedRun:
             self._told[cell.value] = cell.tells
         for user in cell.users:
             if not isinstance(user, Cell):
-                user.hear(cell.value)
+                user.hear(cell)
                 self.changed.add(user)
             elif user.wanted:  # another user may have decided it a moment ago
                 value = user.hear(cell.value)

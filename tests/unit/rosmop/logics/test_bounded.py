@@ -2,8 +2,11 @@
 
 import importlib
 import sys
+from collections.abc import Callable
 from itertools import combinations_with_replacement, product
 from random import Random
+from types import FrameType
+from typing import Any
 
 import pytest
 
@@ -273,6 +276,41 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
         assert run.expire() == ("violation",)
     assert run.step(1, 3 * 10**9) == ("validation",)
     assert run.step(0, 3 * 10**9) == ()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "always[0,2s] (a => eventually[0,1s] b)",
+        "eventually[0,2s] (a and eventually[0,1s] b)",
+        "(a => eventually[0,1s] b) until[0,2s] c",
+        "(next[0,1s] a) until[1s,2s] eventually[0,1s] c",
+    ],
+)
+@pytest.mark.parametrize("events", ["a", "ab", "b"])
+def test_a_step_costs_the_same_however_many_wait(text: str, events: str) -> None:
+    """What comes to be known of one event decides others without a look at all of them."""
+
+    def lines_run(each_second: int) -> float:
+        run, counted = compiled("mtl", text).start(0), 0
+
+        def trace(frame: FrameType, event: str, _argument: object) -> Callable[..., Any] | None:
+            nonlocal counted
+            counted += event == "line"
+            return trace if frame.f_code.co_filename == bounded.__file__ else None
+
+        before = sys.gettrace()
+        for number in range(4 * each_second):
+            if number == 3 * each_second:
+                sys.settrace(trace)
+            time = number * 10**9 // each_second
+            while (deadline := run.deadline) is not None and deadline < time:
+                run.expire()
+            run.step(ABC.index(events[number % len(events)]), time)
+        sys.settrace(before)
+        return counted / each_second
+
+    assert lines_run(400) < 1.2 * lines_run(100) + 10
 
 
 def test_enforceable() -> None:
