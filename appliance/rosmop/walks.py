@@ -20,13 +20,10 @@ from appliance.rosmop.compiled import Compiled
 from appliance.rosmop.happened import SEQ, Sender
 from appliance.rosmop.ir.abi import (
     AREA,
-    BEYOND,
     LEFT,
     LOUD,
-    MOST_KEPT,
     POSITION,
     REST,
-    ROOM,
     SOONER,
     SURE,
     TOLD,
@@ -36,16 +33,16 @@ from appliance.rosmop.ir.abi import (
     FeedModule,
 )
 from appliance.rosmop.ir.interpreter import Interpreter
-from appliance.rosmop.ir.kept import KeptMessage
+from appliance.rosmop.ir.kept import KeptMessage, element_code, entered, left
 from appliance.rosmop.ir.output import HEAD
 from appliance.rosmop.ir.output import Key as Noted
-from appliance.rosmop.ir.values import Values, struct_code, struct_size
+from appliance.rosmop.ir.values import Values, struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
 from appliance.rosmop.outcomes import Outcome, Verdict
 from appliance.rosmop.program import groups
 from appliance.rosmop.runtime.context import Context, LogLine, Published
-from appliance.rosmop.runtime.wire import Buffer, moments, numbers, put_moments, put_numbers
+from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.slices import Key, Slice, Slices
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
@@ -146,14 +143,11 @@ class Home:
         self._cells = struct.Struct(
             "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in variables.values())
         )
-        self._texts = [
-            (place, cells.texts[address])
+        buffers = {cells.variables[name][0]: buffer for name, buffer in cells.vectors.items()} | cells.texts
+        self._spans = [
+            (place, buffers[address], element_code(kind))
             for place, (address, kind) in enumerate(variables.values())
-            if isinstance(kind, kinds.String)
-        ]
-        self._vectors = [
-            (self._names.index(name), buffer, _element_code(cells.variables[name][1]))
-            for name, buffer in cells.vectors.items()
+            if isinstance(kind, kinds.String | kinds.Vector)
         ]
         self._records = {
             name: KeptMessage(
@@ -184,13 +178,11 @@ class Home:
         values = [self._values[name] for name in self._names]
         if self._generation:
             _LENGTH.pack_into(self._memory, self._generation, 0)
-        for place, buffer in self._texts:
-            values[place] = self._entered(values[place], buffer)
-        for place, buffer, code in self._vectors:
-            values[place] = self._entered_vector(values[place], buffer, code)
+        for place, buffer, code in self._spans:
+            values[place] = entered(self._memory, values[place], buffer, code)
         self._cells.pack_into(self._memory, self._base, *states, *values)
         for name, kept in self._records.items():
-            kept.enter(self._memory, self._values[name], self._entered)
+            kept.enter(self._memory, self._values[name])
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
         for running, address in self._clocks:
@@ -199,28 +191,6 @@ class Home:
         due = self._due(anew=False)
         _TIME.pack_into(self._memory, self._until, _NEVER if due is None else min(due - 1, _NEVER))
         self._inside = True
-
-    def _entered(self, text: bytes, buffer: int) -> int:
-        """Where a string is now, and how long it is (from bit 32 on)."""
-        if len(text) > MOST_KEPT:
-            return BEYOND << 32
-        self._memory[buffer : buffer + len(text)] = text
-        return buffer | len(text) << 32
-
-    def _entered_vector(self, elements: list[Any], buffer: int, code: str) -> int:
-        """The same of a vector, with the number of its elements."""
-        if len(elements) * struct_size(code) > ROOM:
-            return BEYOND << 32
-        packed = bytearray()
-        try:
-            if len(code) == 2:
-                put_moments(elements, code[0], packed)
-            else:
-                put_numbers(elements, code, packed)
-        except struct.error:
-            return BEYOND << 32  # a time that no message can have
-        self._memory[buffer : buffer + len(packed)] = packed
-        return buffer | len(elements) << 32
 
     def hasten(self) -> None:
         """A deadline is earlier than what was due."""
@@ -243,19 +213,9 @@ class Home:
             run: Any = running.run
             run.since, run.now = _CLOCK.unpack_from(self._memory, address)
         found = dict(zip(self._names, values[len(self._running) :], strict=True))
-        for place, _ in self._texts:
+        for place, _, code in self._spans:
             name = self._names[place]
-            at, size = found[name] & _ADDRESS, found[name] >> 32
-            found[name] = self._values[name] if size == BEYOND else bytes(self._memory[at : at + size])
-        for place, _, code in self._vectors:
-            name = self._names[place]
-            at, count = found[name] & _ADDRESS, found[name] >> 32
-            if count == BEYOND:
-                found[name] = self._values[name]
-            elif len(code) == 2:
-                found[name] = moments(self._memory, at, count, code[0])[0]
-            else:
-                found[name] = numbers(self._memory, at, count, code, struct_size(code))[0]
+            found[name] = left(self._memory, found[name], code, self._values[name])
         for name, kept in self._records.items():
             found[name] = kept.left(self._memory, self._values[name])
         self._values.update(found)
@@ -271,12 +231,6 @@ def _cell(kind: Type) -> str:
         return "i4x" if kind.signed else "I4x"
     code = struct_code(kind) or ""
     return "q" if len(code) == 2 else "f4x" if code == "f" else code
-
-
-def _element_code(kind: Type) -> str:
-    """The `struct` code of the elements of a vector that is kept."""
-    assert isinstance(kind, kinds.Vector)  # noqa: S101  a variable that has a place for elements
-    return struct_code(kind.element) or ""
 
 
 class Walker:

@@ -348,6 +348,7 @@ class _Walk:
 
     def code(self) -> bytes:
         """The function."""
+        self._heap = self._writer.heap() if self._writer.has_heap else 0
         here = _get(_AT) + b"\xad" + load(I32, EFFECT) + constant(I32, self._effects) + _SUB
         here += constant(I32, 4) + b"\x76\xad" + constant(I64, 32) + _SHL64 + _OR64
         if self.verdicts:
@@ -358,6 +359,7 @@ class _Walk:
             store(I64, NOW, _get(_NOW)),
             store(I32, EFFECT, constant(I32, self._effects)),
             store(I32, SAID, constant(I32, self._writer.said)) if self._says else b"",
+            store(I32, self._heap, constant(I32, self._heap + 8)) if self._heap else b"",
             _set(_TOLD, load(I64, self._cells.source + 8)),
             _set(_ENABLED, load(I64, self._cells.source + 16)),
             *(_set(local, load(I32, self._state(number))) for number, local in self._states.items()),
@@ -396,6 +398,7 @@ class _Walk:
         """Nothing has happened to the frame at hand: the runtime stops, if it does, at calls and where loops begin."""
         code = store(I32, POSITION, _get(_AT)) + store(I32, UNDO, constant(I32, self._log))
         code += store(I32, SURE, load(I32, SAID)) if self._says else b""
+        code += store(I32, self._heap + 4, load(I32, self._heap)) if self._heap else b""
         return code + b"".join(store(I64, kept, load(I64, address)) for address, kept in self._undo)
 
     def _frame(self) -> bytes:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.abi import FIRST, ROOM, Cells
 from appliance.rosmop.ir.output import Key, Line, Publication
-from appliance.rosmop.ir.values import Values, struct_code, struct_size
+from appliance.rosmop.ir.values import Values, is_array, struct_code, struct_size
 from appliance.rosmop.ir.wasm import F32, F64, I32, I64
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
@@ -15,6 +15,9 @@ LINES = 64 << 10
 
 MOST_MADE = 1024
 """Bytes of a message that is made or kept here, without what its strings have."""
+
+HEAP = 512 << 10
+"""Bytes for the elements of arrays of any length in messages that are made or kept while a read is walked over."""
 
 MAX_ROOMS = 16 << 20
 """Bytes that all vectors of a set may take."""
@@ -56,6 +59,8 @@ class Layout:
         """Where bytes stand from the beginning."""
         self.strings: set[bytes] = set()
         """Those of them that are strings."""
+        self.arrays_at: dict[int, int] = {}
+        """The bytes of an element of the arrays of any length that are kept, by where each is noted."""
         self.rooms: list[range] = []
         """Where vectors stand."""
         self.lines: list[Line | Publication] = []
@@ -65,7 +70,7 @@ class Layout:
         self.places: list[range] = []
         """Where messages stand that are made or kept here, and whether what is published is only counted."""
         self._used = FIRST
-        self._spare = 0
+        self._spare = self._heap = 0
         self.said = self.take(LINES)
         """Where lines stand."""
 
@@ -104,25 +109,25 @@ class Layout:
         """The same of one that is made here, where a string is 8 bytes: where it is and how long."""
         if isinstance(kind, kinds.Record):
             return sum(map(self.extent, self._values.fields(kind)))
-        return 8 if isinstance(kind, kinds.String) else self.size(kind)
+        return 8 if isinstance(kind, kinds.String) or is_array(kind) else self.size(kind)
 
     def leaves(self, kind: Type, at: int = 0) -> Iterator[tuple[int, Type]]:
-        """The numbers, times and strings of one that is made here, and where each stands."""
+        """The numbers, times, strings and arrays of any length of one that is made here, and where each stands."""
         parts = self._values.fields(kind) if isinstance(kind, kinds.Record) else ()
         if isinstance(kind, kinds.Vector):
             parts = [kind.element] * (kind.length or 0)
-        elif not isinstance(kind, kinds.Record):
+        if is_array(kind) or not isinstance(kind, kinds.Record | kinds.Vector):
             yield at, kind
         for part in parts:
             yield from self.leaves(part, at)
             at += self.extent(part)
 
     def arrays(self, kind: Type) -> Iterator[int]:
-        """The bytes that a copy is charged for: those of each array in a message."""
+        """The bytes that a copy is charged for: those of each array of fixed length in a message."""
         parts = self._values.fields(kind) if isinstance(kind, kinds.Record) else ()
-        if isinstance(kind, kinds.Vector):
-            yield (kind.length or 0) * self._values.width(kind.element)
-            parts = [kind.element] * (kind.length or 0)
+        if isinstance(kind, kinds.Vector) and kind.length is not None:
+            yield kind.length * self._values.width(kind.element)
+            parts = [kind.element] * kind.length
         for part in parts:
             yield from self.arrays(part)
 
@@ -142,10 +147,12 @@ class Layout:
             if not isinstance(kind, kinds.Record):
                 raise NotScalarError(str(kind))
             begin = self.made(kind)
+            inner = {begin + at: leaf for at, leaf in self.leaves(kind) if not struct_code(leaf)}
+            places = {at: self.room(2 * ROOM) for at, leaf in inner.items() if is_array(leaf)}
+            self.arrays_at |= {at: self.element(inner[at])[1] for at in places}
+            cells.texts |= places
             cells.records[name] = (begin, kind)
-            cells.inner[name] = [
-                begin + at for at, leaf in self.leaves(kind) if isinstance(leaf, kinds.String)
-            ]
+            cells.inner[name] = [*inner]
             cells.sizes[name] = len(self.places[-1])
             cells.known[name] = self.take(8)
             self.places.append(range(cells.known[name], cells.known[name] + 8))
@@ -196,6 +203,18 @@ class Layout:
         """The address of memory for a vector that nothing is kept in."""
         self._spare = self._spare or self.room(ROOM)
         return self._spare
+
+    def heap(self) -> int:
+        """Where it stands (i32) where what is next has room for elements of arrays, and (behind it) from where on
+        elements may change; then come `HEAP` bytes for them.
+        """
+        self._heap = self._heap or self.room(8 + HEAP)
+        return self._heap
+
+    @property
+    def has_heap(self) -> bool:
+        """Whether anything has asked for it."""
+        return self._heap > 0
 
     def constant(self, raw: bytes) -> int:
         """Where these bytes stand from the beginning."""

@@ -2,8 +2,8 @@
 
 Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
 has a fixed size (`places.py`); strings are kept (`texts.py`), vectors of numbers and times are kept, made and changed
-(`vectors.py`); messages without arrays of any length are made, published and kept
-(`records.py`).
+(`vectors.py`); messages are made, published and kept (`records.py`), also with arrays of any length of numbers or
+times (`arrays.py`).
 
 `Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
 
@@ -12,9 +12,10 @@ has a fixed size (`places.py`); strings are kept (`texts.py`), vectors of number
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
   it is taken back. Within what it calls it is a trap. Beyond are strings that are made or changed, vectors of anything
   but numbers and times, of more than `ROOM` bytes, arrays of the message that become longer or shorter, messages by
-  reference, messages (and `MESSAGE`) of more than `MOST_MADE` bytes or with what is beyond, what is published with a
-  string of more than `MOST_KEPT`, or first of its kind of a second, recursion, `sin` and its like. An event of which
-  no message can come past such a place has no module: `NotScalarError` names what is beyond.
+  reference, messages (and `MESSAGE`) with arrays of strings or messages, of more than `MOST_MADE` bytes or with what is
+  beyond, what is published with a string of more than `MOST_KEPT`, or first of its kind of a second, recursion, `sin`
+  and its like. An event of which no message can come past such a place has no module: `NotScalarError` names what is
+  beyond.
 - A line of output, and a message that is published, is noted behind those before, where `SAID` points, and the message
   at hand stands at `POSITION` (`output.py`).
 - Before a field is written, what stood there is noted in the log (address, size, bytes; 16 bytes each) that `UNDO`

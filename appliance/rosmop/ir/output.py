@@ -6,7 +6,8 @@ it can: text is not made before it is paid for.
 
 What a message binds of parameters (`Key`) is noted as a line is, with a number among those of the keys.
 
-A message that is published has behind number and frame its fields as they are sent, of strings address and length.
+A message that is published has behind number and frame its fields as they are sent, of strings and arrays of any
+length where they are and how long.
 """
 
 import struct
@@ -111,12 +112,14 @@ class Line(_Noted):
 
 
 class Publication(msgspec.Struct, tag=True, array_like=True, dict=True):
-    """A message that is published; `room` and `texts`: the bytes of what is noted of it, and where its strings are."""
+    """A message that is published; `room` and `texts`: the bytes of what is noted of it, and where its strings and
+    arrays of any length are, each with the bytes of an element.
+    """
 
     context: str
     node: form.Publish
     room: int
-    texts: Sequence[int]
+    texts: Sequence[tuple[int, int]]
 
     def __post_init__(self) -> None:
         self.cost = OUTPUT_COST + self.room
@@ -130,9 +133,9 @@ class Publication(msgspec.Struct, tag=True, array_like=True, dict=True):
             return Published(monitor, node.topic, node.kind.name, data, node.site)
         done = begin
         pieces: list[bytes | memoryview] = []
-        for text in self.texts:
-            where, size = _TEXT.unpack_from(memory, begin + text)
-            pieces += (memory[done : begin + text], _LENGTH.pack(size), memory[where : where + size])
+        for text, size in self.texts:
+            where, count = _TEXT.unpack_from(memory, begin + text)
+            pieces += (memory[done : begin + text], _LENGTH.pack(count), memory[where : where + count * size])
             done = begin + text + _TEXT.size
         pieces.append(memory[done : begin + self.room])
         return Published(monitor, node.topic, node.kind.name, b"".join(pieces), node.site)

@@ -1,7 +1,8 @@
 """Messages that are made or kept: fields that are put into them, copies, and what is published of them.
 
-Each has its own part of the memory and stands there as it is sent, but of a string stands its address and length; so
-what has arrays of any length is beyond. Strings of one that is kept are as `texts.py` has them.
+Each has its own part of the memory and stands there as it is sent, but of a string stands its address and length; of
+an array of any length where its elements are and how many (`arrays.py`): those of strings or messages are beyond.
+Strings of one that is kept are as `texts.py` has them.
 
 Whatever is put there has one encoding only: what has several in the message that it comes from (a truth, a time with
 too many nanoseconds) is written anew, and a message that puts a NaN there is left. So what is published is copied.
@@ -12,21 +13,22 @@ from functools import partial
 from typing import Any
 
 from appliance.rosmop.ir import form
-from appliance.rosmop.ir.abi import BEYOND, MOST_KEPT, POSITION, SAID
-from appliance.rosmop.ir.layout import LINES, MOST_MADE, NotScalarError, machine_type
+from appliance.rosmop.ir.abi import BEYOND, MOST_KEPT, POSITION, ROOM, SAID
+from appliance.rosmop.ir.arrays import Arrays
+from appliance.rosmop.ir.layout import HEAP, LINES, MOST_MADE, NotScalarError, machine_type
 from appliance.rosmop.ir.output import HEAD, Key, Line, Publication
 from appliance.rosmop.ir.places import loaded, root, root_of
-from appliance.rosmop.ir.values import struct_code, struct_size
-from appliance.rosmop.ir.vectors import Vectors
+from appliance.rosmop.ir.values import is_array, struct_code, struct_size
+from appliance.rosmop.ir.vectors import OF_VECTORS
 from appliance.rosmop.ir.wasm import COMPARE, F32, F64, I32, I64, MOVES, STORE, constant, unsigned
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
-_CHANGING = ("a_slot", "a_put")
-"""Functions that put something into a message, or into an array of fixed length in one."""
+_CHANGING = ("a_slot", *OF_VECTORS)
+"""Functions that put something into a message, or into an array in one."""
 
 
-class Records(Vectors):
+class Records(Arrays):
     """Writes what makes messages. `_assigned_fields` are those that `Whole` has, by the names of what is pending."""
 
     _assigned_fields: dict[str, Sequence[form.Write]]
@@ -76,15 +78,22 @@ class Records(Vectors):
         return super()._place(node)
 
     def _elements(self, node: form.Expression) -> tuple[bytes, bytes, bytes]:
+        if isinstance(node, form.Copy) and isinstance(node.value, form.Item) and is_array(node.type):
+            return self._of_array(node)
         if isinstance(node, form.Copy) and self._is_message(node.value):
             raise NotScalarError("a copy of an array in a message that is made")  # as above
-        if not isinstance(node, form.Item) or not isinstance(node.type, kinds.String):
+        if not isinstance(node, form.Item) or not (
+            isinstance(node.type, kinds.String) or is_array(node.type)
+        ):
             return super()._elements(node)
         first, place = self._place(node.base)
         name, at = f"text {len(self._locals)}", self._layout.offset(node.base.type, node.number)
         begin, length = (self._get(name) + b"\x28\x00" + unsigned(at + more) for more in (0, 4))
         unknown = length + constant(I32, BEYOND) + b"\x46"
         code = first + place + self._set(name) + self._when(unknown, self._elsewhere)
+        if is_array(node.type):
+            first, begin, length = self._noted(begin + length + b"\xad")
+            return code + first, begin, length
         return code, begin, length + b"\xad"
 
     def _if_known(self, name: str) -> bytes:
@@ -109,9 +118,9 @@ class Records(Vectors):
 
     def _changes_message(self, node: form.Expression) -> bool:
         """Whether it puts something into a message that is made or kept here."""
-        if not isinstance(node, form.Call) or node.function not in _CHANGING:
+        if not isinstance(node, form.Call) or node.function not in ("a_slot", "a_put"):
             return False
-        return self._is_message(node.arguments[0])
+        return self._is_message(node.arguments[0]) and not is_array(node.arguments[0].type)
 
     def _is_message(self, node: form.Expression) -> bool:
         """Whether it is in a message that is made or kept here."""
@@ -145,6 +154,10 @@ class Records(Vectors):
         self, place: bytes, offset: int, kind: Type, value: form.Expression, *, kept: bool
     ) -> bytes:
         """Put a value of this type so many bytes behind a place; `kept`: in a variable of the set."""
+        if is_array(kind):
+            if value.type != kind:
+                raise NotScalarError(str(value.type))
+            return self._give_array(place, offset, value, kept=kept)
         if isinstance(kind, kinds.Record | kinds.Vector):
             return self._put_whole(place, offset, kind, value, kept=kept)
         if isinstance(kind, kinds.String):
@@ -188,7 +201,7 @@ class Records(Vectors):
                 + unsigned(offset + at)
                 for at, some in _pieces(size)
             )
-        code, own = b"", self._is_own(root_of(value))
+        code, own = b"", self._is_own(root_of(value)) or bool(self._spans(kind))
         if isinstance(value, form.Copy):
             value = value.value
             code = b"".join(self._allocated(constant(I64, made)) for made in self._layout.arrays(kind))
@@ -196,11 +209,24 @@ class Records(Vectors):
             raise NotScalarError("two names of one message")
         source = f"source {len(self._locals)}"
         code += b"".join(self._place(value)) + self._set(source)
-        for at, leaf in self._layout.leaves(kind):
-            if kept and isinstance(leaf, kinds.String):
-                long = self._get(source) + b"\x28\x00" + unsigned(at + 4) + constant(I32, MOST_KEPT) + b"\x4b"
-                code += self._when(long, self._elsewhere)
+        arrays = {at for at, leaf in self._layout.leaves(kind) if is_array(leaf)}
+        for at, size in self._spans(kind):
+            count = self._get(source) + b"\x35\x00" + unsigned(at + 4)
+            most = ROOM // size if at in arrays else MOST_KEPT
+            if kept:
+                code += self._when(count + constant(I64, most) + b"\x56", self._elsewhere)
+            if at in arrays:
+                code += self._allocated(count + constant(I64, size) + b"\x7e")
+        code += self._stay() if arrays else b""
         return code + self._copy_of(place, offset, kind, source, own=own)
+
+    def _spans(self, kind: Type) -> list[tuple[int, int]]:
+        """Where it is noted in a message where strings and arrays of any length are, and the bytes of an element."""
+        return [
+            (at, self._layout.element(leaf)[1])
+            for at, leaf in self._layout.leaves(kind)
+            if not struct_code(leaf)
+        ]
 
     def _copy_of(self, place: bytes, offset: int, kind: Type, source: str, *, own: bool) -> bytes:
         """Copy what stands where a local variable says; `own`: it is such a message itself."""
@@ -231,6 +257,10 @@ class Records(Vectors):
                 code += self._put_text_at(place, offset + to, at, name, kept=kept)
                 at = form.Spot(name, 0)
                 continue
+            if is_array(leaf):
+                code += self._put_array_at(place, offset + to, at, name, leaf, kept=kept)
+                at = form.Spot(name, 0)
+                continue
             size = self._layout.size(leaf)
             base = self._get("at") + (b"" if at.base is None else self._get(at.base, I64) + b"\xa7\x6a")
             code += self._within(at, size)
@@ -238,16 +268,18 @@ class Records(Vectors):
             at = at.plus(size)
         for write in self._assigned_fields[node.pending]:
             kind: Type = node.type
-            to = offset
+            to, where = offset, place
             for number in write.path:
                 if not isinstance(number, int):
                     raise NotScalarError("a part of a time that was assigned")
                 if isinstance(kind, kinds.Record):
                     kind, to = self._layout.field(kind, number), to + self._layout.offset(kind, number)
                 else:
+                    if is_array(kind):
+                        to, where = 0, where + b"\x28\x00" + unsigned(to)
                     kind, size = self._layout.element(kind)
                     to += number * size
-            put = partial(self._put_value, place, to, kind, write.value, kept=kept)
+            put = partial(self._put_value, where, to, kind, write.value, kept=kept)
             code += self._when(self._get(write.flag), put)
         return code
 
@@ -283,19 +315,21 @@ class Records(Vectors):
         size = self._layout.extent(kind)
         if size > MOST_MADE:
             raise NotScalarError(f"{kind} of {size} bytes")
-        texts = [at for at, leaf in self._layout.leaves(kind) if isinstance(leaf, kinds.String)]
+        texts = self._spans(kind)
+        arrays = {at for at, leaf in self._layout.leaves(kind) if is_array(leaf)}
         publication = Publication(self._context, node, size, texts)
         counted = self._cell(0x29, self._layout.publication(self._context, node.topic))
         self._publishes.add((self._context, node.topic))
         code = self._when(counted + b"\x50", self._elsewhere)
         code += b"".join(self._place(node.value)) + self._set(source)
         cost = constant(I64, publication.cost)
-        for at in texts:
+        for at, size in texts:
             length = self._get(source) + b"\x35\x00" + unsigned(at + 4)
-            long = length + constant(I64, MOST_KEPT) + b"\x56"
-            code, cost = code + self._when(long, self._elsewhere), cost + length + b"\x7c"
-        code += self._noted_line(publication, cost)
-        own = isinstance(node.value, form.Whole) or self._is_own(root_of(node.value))
+            long = length + constant(I64, HEAP // size if at in arrays else MOST_KEPT) + b"\x56"
+            code += self._when(long, self._elsewhere)
+            cost += length + constant(I64, size) + b"\x7e\x7c"
+        code += self._noted_line(publication, cost) + (self._stay() if arrays else b"")
+        own = isinstance(node.value, form.Whole) or self._is_own(root_of(node.value)) or bool(texts)
         return code + self._copy_of(self._get("line"), HEAD.size, kind, source, own=own)
 
 

@@ -13,6 +13,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import TypeGuard
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.abi import ROOM
@@ -50,9 +51,10 @@ _COPY, _FILL = b"\xfc\x0a\x00\x00", b"\xfc\x0b\x00"
 
 
 @dataclass(frozen=True)
-class _Room:
+class Room:
     """A vector that may change: its variable, the elements and their size, where it has room, and where the variable
-    stands (None: it is a local one).
+    stands (None: it is a local one). An array in a message is noted where a local variable, its `slot`, says, and may
+    have `room` bytes (`arrays.py`).
     """
 
     name: str
@@ -60,11 +62,13 @@ class _Room:
     size: int
     begin: int
     cell: int | None
+    slot: str = ""
+    room: int = ROOM
 
     @property
     def most(self) -> bytes:
         """How many elements have room."""
-        return constant(I64, ROOM // self.size)
+        return constant(I64, self.room // self.size)
 
 
 class Vectors(Texts):
@@ -83,7 +87,7 @@ class Vectors(Texts):
     def _after(self, node: form.Sequence) -> tuple[bytes, bytes, bytes]:
         """The same of one behind what is evaluated before."""
 
-    def _room(self, node: form.Read | form.Assign) -> _Room:
+    def _room(self, node: form.Read | form.Assign) -> Room:
         kind, cells = node.type, self._layout.shared.get(node.name)
         size = self._size_of(kind)
         assert isinstance(kind, kinds.Vector)  # noqa: S101  it has a size
@@ -91,12 +95,12 @@ class Vectors(Texts):
             if node.name not in cells.vectors:
                 cells.vectors[node.name] = self._layout.room(2 * ROOM + 8)
             at = self._layout.variable(node.name, kind)
-            return _Room(node.name, kind.element, size, cells.vectors[node.name], at)
+            return Room(node.name, kind.element, size, cells.vectors[node.name], at)
         if node.name not in self._made:
             raise NotScalarError(f"{kind} of a message")
         if node.name not in self._rooms:
             self._rooms[node.name] = self._layout.room(ROOM)
-        return _Room(node.name, kind.element, size, self._rooms[node.name], None)
+        return Room(node.name, kind.element, size, self._rooms[node.name], None)
 
     def _size_of(self, kind: Type) -> int:
         """The bytes of an element of a vector that is kept or made. Raises `NotScalarError` of another."""
@@ -104,28 +108,38 @@ class Vectors(Texts):
             raise NotScalarError(str(kind))
         return struct_size(struct_code(kind.element) or "")
 
-    def _place_in(self, room: _Room) -> bytes:
+    @abstractmethod
+    def _array(self, node: form.Expression) -> tuple[Room, bytes]:
+        """An array in a message that is made or kept, and what comes first. Raises `NotScalarError` of any other."""
+
+    def _place_in(self, room: Room) -> bytes:
+        if room.slot:
+            return self._get(room.slot) + b"\x28\x00\x00"
         return self._get(f"place of {room.name}") if room.cell is None else self._cell(0x28, room.cell)
 
-    def _count_in(self, room: _Room) -> bytes:
+    def _count_in(self, room: Room) -> bytes:
+        if room.slot:
+            return self._get(room.slot) + b"\x35\x00\x04"
         return (
             self._get(f"count of {room.name}", I64) if room.cell is None else self._cell(0x35, room.cell + 4)
         )
 
-    def _counted(self, room: _Room, count: bytes) -> bytes:
+    def _counted(self, room: Room, count: bytes) -> bytes:
         """There are so many elements now."""
         self._assigned.add(room.name)
+        if room.slot:
+            return self._get(room.slot) + count + _WRAP + b"\x36\x00\x04"
         if room.cell is None:
             return count + self._set(f"count of {room.name}", I64)
         return self._cell(0x36, room.cell + 4, count + _WRAP)
 
-    def _known(self, room: _Room) -> bytes:
+    def _known(self, room: Room) -> bytes:
         """The message is left where the vector is not here."""
-        if room.cell is None:
+        if room.cell is None and not room.slot:
             return b""
         return self._when(self._count_in(room) + room.most + _OVER, self._elsewhere)
 
-    def _fresh(self, room: _Room, copied: bytes = b"") -> bytes:
+    def _fresh(self, room: Room, copied: bytes = b"") -> bytes:
         """What it was before this message is kept; `copied` brings the elements to where it is from now on."""
         self._assigned.add(room.name)
         if room.cell is None:
@@ -137,8 +151,8 @@ class Vectors(Texts):
         moved = other + self._set("fresh") + copied + self._cell(0x36, room.cell, self._get("fresh"))
         return self._when(is_old, lambda: moved)
 
-    def _changing(self, room: _Room) -> bytes:
-        """The elements may be written."""
+    def _changing(self, room: Room, needed: bytes | None = None) -> bytes:  # noqa: ARG002  of arrays in messages
+        """The elements may be written, so many as are `needed`, if more than there are."""
         size = self._bytes(room, self._count_in(room))
         if room.name not in self._begun:
             return self._fresh(room, self._get("fresh") + self._place_in(room) + size + _COPY)
@@ -146,18 +160,18 @@ class Vectors(Texts):
         code += constant(I32, room.begin) + self._place_in(room) + size + _COPY + self._fresh(room)
         return self._when(self._is_elsewhere(room), lambda: code)
 
-    def _is_elsewhere(self, room: _Room) -> bytes:
+    def _is_elsewhere(self, room: Room) -> bytes:
         """Whether a local vector has not come to its place yet."""
         return self._get(f"own {room.name}") + b"\x45"
 
-    def _bytes(self, room: _Room, count: bytes) -> bytes:
+    def _bytes(self, room: Room, count: bytes) -> bytes:
         return count + _WRAP + constant(I32, room.size) + b"\x6c"
 
-    def _behind(self, room: _Room, count: bytes) -> bytes:
+    def _behind(self, room: Room, count: bytes) -> bytes:
         """The address behind so many elements."""
         return self._place_in(room) + self._bytes(room, count) + b"\x6a"
 
-    def _stored(self, room: _Room, address: bytes, value: bytes) -> bytes:
+    def _stored(self, room: Room, address: bytes, value: bytes) -> bytes:
         code = b""
         if len(struct_code(room.element) or "") == 2:
             code, value = self._parts_of(room.element, value)
@@ -178,9 +192,9 @@ class Vectors(Texts):
             code = self._assigned_vector(node)
             first, place, count = self._elements(form.Read(node.type, node.name))
             return code + first, place, count
-        if isinstance(node, form.Zero | form.Vector | form.Invoke | form.Conditional):
+        if isinstance(node, form.Zero | form.Vector | form.Invoke | form.Conditional) or _is_filled(node):
             name = f"made {len(self._locals)}"
-            room = _Room(name, node.type.element, self._size_of(node.type), self._layout.room(ROOM), None)
+            room = Room(name, node.type.element, self._size_of(node.type), self._layout.room(ROOM), None)
             return self._copied(room, node), self._place_in(room), self._count_in(room)
         if not isinstance(node, form.Read) or not (
             node.name in self._layout.shared or node.name in self._made
@@ -222,11 +236,11 @@ class Vectors(Texts):
         code += place + self._set(f"place of {node.name}")
         return code + count + self._set(f"count of {node.name}", I64)
 
-    def _copied(self, room: _Room, value: form.Expression) -> bytes:
+    def _copied(self, room: Room, value: form.Expression) -> bytes:
         """Give a vector other elements."""
         if isinstance(value, form.Zero | form.Vector):
             return self._listed(room, value)
-        if isinstance(value, form.Call) and value.function in ("l_filled", "e_fill"):
+        if _is_filled(value):
             return self._filled(room, value)
         if isinstance(value, form.Invoke):
             first, place, count = self._handed_back(value)
@@ -243,7 +257,7 @@ class Vectors(Texts):
         code += self._place_in(room) + place + self._bytes(room, count) + _COPY
         return code + self._counted(room, count)
 
-    def _listed(self, room: _Room, value: form.Zero | form.Vector) -> bytes:
+    def _listed(self, room: Room, value: form.Zero | form.Vector) -> bytes:
         items: Sequence[form.Expression] = value.items if isinstance(value, form.Vector) else ()
         assert isinstance(value.type, kinds.Vector)  # noqa: S101  as its variable
         zeros = value.zeros if isinstance(value, form.Vector) else value.type.length or 0
@@ -262,7 +276,7 @@ class Vectors(Texts):
             code += self._behind(room, constant(I64, len(items))) + rest
         return code + self._counted(room, constant(I64, len(items) + zeros))
 
-    def _filled(self, room: _Room, value: form.Call) -> bytes:
+    def _filled(self, room: Room, value: form.Call) -> bytes:
         """`std::vector<T>(count)`, `std::vector<T>(count, value)`."""
         code, count = self._given(value.arguments[0])
         first, one = self._given(value.arguments[1]) if value.function == "e_fill" else (b"", b"")
@@ -280,12 +294,11 @@ class Vectors(Texts):
 
     # Changed
 
-    def _opened(self, node: form.Call) -> tuple[_Room, bytes, list[bytes]]:
+    def _opened(self, node: form.Call) -> tuple[Room, bytes, list[bytes]]:
         """The vector that a function changes, what comes first, and what gets each number that it is given."""
         values, *others = node.arguments
-        if not isinstance(values, form.Read):
-            raise NotScalarError(str(values.type))
-        room, code, given = self._room(values), b"", []
+        room, code = (self._room(values), b"") if isinstance(values, form.Read) else self._array(values)
+        given = []
         with self._apart(values):
             for other in others:
                 if isinstance(other, form.OfType) or (
@@ -300,7 +313,8 @@ class Vectors(Texts):
     def _append(self, node: form.Call) -> bytes:
         room, code, (value, _) = self._opened(node)
         count = self._count_in(room)
-        code += self._when(count + room.most + _AT_LEAST, self._elsewhere) + self._changing(room)
+        code += self._when(count + room.most + _AT_LEAST, self._elsewhere)
+        code += self._changing(room, count + constant(I64, 1) + _ADD)
         code += self._stored(room, self._behind(room, count), value)
         return code + self._counted(room, count + constant(I64, 1) + _ADD) + constant(I32, 0)
 
@@ -322,7 +336,7 @@ class Vectors(Texts):
         def longer() -> bytes:
             code = self._when(size + room.most + _OVER, self._elsewhere)
             code += self._allocated(more + constant(I64, room.size) + b"\x7e")
-            code += self._spend(more + constant(I64, 4) + b"\x80") + self._changing(room)
+            code += self._spend(more + constant(I64, 4) + b"\x80") + self._changing(room, size)
             return code + self._behind(room, count) + constant(I32, 0) + self._bytes(room, more) + _FILL
 
         code += self._when(size + count + _OVER, longer)
@@ -348,7 +362,8 @@ class Vectors(Texts):
         count = self._count_in(room)
         code += self._within_span(at, count, count)
         code += self._when(count + room.most + _AT_LEAST, self._elsewhere)
-        code += self._spend(count + constant(I64, 64) + b"\x80") + self._changing(room)
+        code += self._spend(count + constant(I64, 64) + b"\x80")
+        code += self._changing(room, count + constant(I64, 1) + _ADD)
         code += self._behind(room, at + constant(I64, 1) + _ADD) + self._behind(room, at)
         code += self._bytes(room, count + at + _SUB) + _COPY
         code += self._stored(room, self._behind(room, at), value)
@@ -358,6 +373,8 @@ class Vectors(Texts):
         room, code, (first, last) = self._opened(node)
         many = last + first + _SUB
         code += self._within_span(first, last, self._count_in(room))
+        if room.room > ROOM:
+            code += self._when(many + constant(I64, ROOM // room.size) + _OVER, self._elsewhere)
         code += self._spend(many + constant(I64, 64) + many + b"\x79" + _SUB + b"\x7e") + self._changing(room)
         self._brief = False
         call = self._routine(2, sorting, room.element, self._layout.spare())
@@ -397,7 +414,12 @@ OF_VECTORS: Mapping[str, Callable[[Vectors, form.Call], bytes]] = MappingProxyTy
 """What writes each function that changes a vector."""
 
 
-def _function(made: Sequence[bytes], *code: bytes) -> bytes:
+def _is_filled(node: form.Expression) -> TypeGuard[form.Call]:
+    """Whether it is `std::vector<T>(count)` or `std::vector<T>(count, value)`."""
+    return isinstance(node, form.Call) and node.function in ("l_filled", "e_fill")
+
+
+def function(made: Sequence[bytes], *code: bytes) -> bytes:
     """A function with so many local variables of types."""
     whole = row(made) + b"".join(code) + END
     return unsigned(len(whole)) + whole
@@ -459,7 +481,7 @@ def sorting(element: Type, room: int) -> bytes:
     rest = out + to + high + to + _MINUS + _COPY + on(8, high + to + _MINUS)
     pair = _put(4, bounded(low)) + _put(5, bounded(middle)) + _put(6, low) + _put(7, middle)
     pass_over = turns(low + end + _SAME, pair, merged, rest, _put(3, high))
-    return _function(
+    return function(
         [unsigned(7) + bytes((I32,)), unsigned(1) + bytes((machine,))],
         _put(6, first) + known if machine in (F32, F64) else b"",
         _put(2, one),
@@ -480,7 +502,7 @@ def reversing(size: int) -> bytes:
     swapped = _put(2, first + bytes((load, 0, 0))) + _moved(size, first, end)
     swapped += end + _here(2) + bytes((store, 0, 0))
     turn = _put(1, end + one + _MINUS) + swapped + _put(0, first + one + _PLUS)
-    return _function([unsigned(1) + bytes((machine,))], turns(first + end + b"\x4f", turn), constant(I32, 0))
+    return function([unsigned(1) + bytes((machine,))], turns(first + end + b"\x4f", turn), constant(I32, 0))
 
 
 def alike(element: Type) -> bytes:
@@ -488,7 +510,7 @@ def alike(element: Type) -> bytes:
     machine, size = machine_type(element), constant(I32, struct_size(struct_code(element) or ""))
     at, end, to = map(_here, range(3))
     differs = loaded(at, 0, element) + loaded(to, 0, element) + bytes((COMPARE[machine]["!="],))
-    return _function(
+    return function(
         [],
         turns(
             at + end + _SAME,

@@ -23,7 +23,7 @@ from appliance.rosmop.compiled import Compiled
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.abi import AREA
 from appliance.rosmop.ir.feed import WrittenModule, written
-from appliance.rosmop.ir.values import Values, struct_code, struct_size
+from appliance.rosmop.ir.values import Values, is_array, struct_code, struct_size
 from appliance.rosmop.program import groups
 from appliance.rosmop.prove.decoding import functions_of
 from appliance.rosmop.prove.form_terms import Meaning, wrapped
@@ -245,9 +245,9 @@ class Validation:
         return Beginning(message, size, now, variables, budgets, throttles), cells, made, known
 
     def _parts(self, kind: Type, at: int = 0) -> Iterator[tuple[int, int]]:
-        """Where each number and string of a message that is kept stands in it, and its bytes."""
-        if not isinstance(kind, kinds.Record | kinds.Vector):
-            yield at, 8 if isinstance(kind, kinds.String) else struct_size(struct_code(kind) or "")
+        """Where each number, string and array of any length of a message that is kept stands in it, and its bytes."""
+        if is_array(kind) or not isinstance(kind, kinds.Record | kinds.Vector):
+            yield at, struct_size(struct_code(kind) or "") or 8
             return
         end = at
         for field in (

@@ -14,10 +14,15 @@ _OF_PLAIN = (
 _OF_STAMPED = (
     "string frame\ntime when\nfloat64 x\nint16 count\nfloat64[] values\nuint8 kind\nstring[] names\n"
 )
+_OF_ROW = (
+    "uint32 seq\nstring name\nfloat64[] values\nint16 count\nfloat32[] few\nuint8[] bytes\nbool[] bits\n"
+    "time[] times\nduration[] gaps\nfloat64[3] three\nint64[] whole\nfloat64 x\n"
+)
 OWN = Definitions.from_files(
     {
         "own/Plain.msg": _OF_PLAIN,
         "own/Stamped.msg": _OF_STAMPED,
+        "own/Row.msg": _OF_ROW,
         "own/Serve.srv": f"{_OF_PLAIN}---\n{_OF_STAMPED}",
     }
 )
