@@ -1,8 +1,8 @@
 """What can be said of a property before it runs: handlers that never run, and verdicts that are always the
 same.
 
-Only what is certain is told. Of a grammar that needs a stack, and of a past formula with time bounds,
-nothing is told.
+Only what is certain is told. Of a grammar that needs a stack, of a formula with several time bounds, and of one about
+the future with bounds, nothing is told.
 """
 
 from collections import deque
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from appliance.rosmop.logics.interface import Categories, CompiledProperty, FiniteProperty
+from appliance.rosmop.logics.past import ClockedPast
 from appliance.rosmop.logics.pattern import TimedPattern
 from appliance.rosmop.logics.tfsm import TimedMachine
 
@@ -100,7 +101,30 @@ def graph_of(compiled: CompiledProperty) -> Graph | None:
         return _machine_graph(compiled)
     if isinstance(compiled, TimedPattern):
         return _pattern_graph(compiled)
+    if isinstance(compiled, ClockedPast):
+        return _past_graph(compiled)
     return None
+
+
+def _past_graph(compiled: ClockedPast) -> Graph:
+    """Each state before the time bound has passed since the clock began, and each after that."""
+    size = len(compiled.moves)
+    late = [
+        [
+            (name, target if anew else size + target)
+            for name, (target, anew) in zip(compiled.events, row, strict=True)
+        ]
+        for row in compiled.late
+    ]
+    early = (
+        (
+            *(((name,), target) for name, (target, _anew) in zip(compiled.events, row, strict=True)),
+            *(((TIME, name), target) for name, target in after),
+        )
+        for row, after in zip(compiled.moves, late, strict=True)
+    )
+    after = (tuple(((name,), target) for name, target in row) for row in late)
+    return Graph(compiled.initial, (*early, *after), (*compiled.verdicts, *compiled.verdicts))
 
 
 def _machine_graph(compiled: TimedMachine) -> Graph:

@@ -1,10 +1,15 @@
 """What is said of a property before it runs, and its picture."""
 
+from itertools import accumulate, product
+
 import pytest
 
 from appliance.rosmop.logics.dot import to_dot
 from appliance.rosmop.logics.lint import TIME, Fact, analyse, shortest_trace_to
+from appliance.rosmop.logics.past import ClockedPast
 from tests.unit.rosmop.logics.driving import compiled, seeded, told, traces
+from tests.unit.rosmop.logics.temporal import draw
+from tests.unit.rosmop.logics.test_mtl import ARITY, PRINTER, TEMPORAL, bounded
 
 
 def kinds(logic: str, formula: str, handled: tuple[str, ...]) -> list[tuple[str, str]]:
@@ -45,6 +50,14 @@ def kinds(logic: str, formula: str, handled: tuple[str, ...]) -> list[tuple[str,
         ("pattern", "globally: some a within 1s", ("violation",), []),
         ("pattern", "globally: a requires b within 1s", ("validation",), [("never runs", "validation")]),
         ("mtl", "a => once[0,1s] b", ("violation",), []),
+        ("mtl", "once[0,1s] a or !once[0,1s] a", (), [("never violated", "violation")]),
+        ("mtl", "previously once[0,1s] a", (), [("violated at once", "violation")]),
+        (
+            "mtl",
+            "a and !a and once[0,1s] b",
+            ("validation",),
+            [("never runs", "validation"), ("violated at once", "violation")],
+        ),
         ("cfg", "S -> a S b | epsilon", ("fail",), []),
     ],
 )
@@ -81,6 +94,38 @@ def test_shortest_traces_are_shortest() -> None:
             if shown is not None and found is not None:
                 assert len(shown) == len(found)
                 assert told(monitor, shown)[-1] == (category,)
+
+
+def test_of_a_time_bound_on_the_past_the_shortest_trace_leads_there() -> None:
+    """By the definition, with the time that it says has passed; where there is none no trace does."""
+    random, clocked, none = seeded(18), 0, 0
+    while clocked < 200:
+        tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 3)
+        monitor = compiled("mtl", PRINTER.show(tree, random))
+        if not isinstance(monitor, ClockedPast):
+            continue
+        clocked += 1
+        for category in monitor.categories:
+            shown = shortest_trace_to(monitor, category)
+            if shown is not None:
+                run, now = monitor.start(0), 0
+                said: tuple[str, ...] = ()
+                for word in shown:
+                    if word == TIME:
+                        now += 10**9
+                    else:
+                        said = run.step(monitor.events.index(word), now)
+                assert said == (category,), (monitor.formula, shown)
+            none += shown is None
+            for trace in traces("abc", 3) if shown is None else ():
+                for times in product((0, 1, 5), repeat=len(trace)):
+                    run = monitor.start(0)
+                    told_of = [
+                        run.step("abc".index(event), at)
+                        for event, at in zip(trace, accumulate(times), strict=True)
+                    ]
+                    assert (category,) not in told_of, (monitor.formula, trace, times)
+    assert none
 
 
 def test_time_is_part_of_a_trace() -> None:
