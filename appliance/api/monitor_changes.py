@@ -4,7 +4,6 @@ Loading and removing is for admins, switching and going back to the folder for o
 `If-Match` with the ETag of `GET /v1/monitors`; a text with an error changes nothing.
 """
 
-import asyncio
 from typing import Annotated
 
 from fastapi import Query
@@ -13,7 +12,7 @@ from pydantic import StringConstraints
 
 from appliance.api.access import Bearer
 from appliance.api.control import ControlLink
-from appliance.api.monitor_judgement import findings_of, judge, refusal
+from appliance.api.monitor_judgement import findings_of, refusal
 from appliance.api.monitor_models import NewSpecifications, NewText, Replaced, Switch, SwitchMany
 from appliance.api.monitors import UNKNOWN, OneName, unknown_monitor
 from appliance.api.policy_changes import Confirm, DryRun
@@ -68,8 +67,11 @@ def _add_texts(router: Routes, services: Services) -> None:
         """
         _may_load(bearer, dry_run=dry_run)
         expected = _expected(if_match, dry_run=dry_run)
+        if dry_run:
+            tried = admin.MonitorTry(new.files, new.definitions, new.signatures, expected)
+            return await _tried(services, tried, bearer)
         order = admin.MonitorLoad(**asdict(new), expected=expected, confirm_within=confirm_within)
-        return await (_tried(services, order, bearer) if dry_run else _replaced(control, order, bearer))
+        return await _replaced(control, order, bearer)
 
     @router.put("/{name}", responses=_CHANGES | UNKNOWN)
     async def replace_monitor(
@@ -94,7 +96,7 @@ def _add_texts(router: Routes, services: Services) -> None:
             return await _replaced(control, order, bearer)
         file = await _file_of(control, name, bearer)
         signatures = {**new.signatures, file: new.signature}
-        tried = admin.MonitorLoad({file: new.text}, new.definitions, new.note, expected, None, signatures)
+        tried = admin.MonitorTry({file: new.text}, new.definitions, signatures, expected)
         return await _tried(services, tried, bearer)
 
 
@@ -167,14 +169,11 @@ def _add_switches(router: Routes, control: ControlLink) -> None:
         return await _switched(control, to.names, to, _expected(if_match), bearer)
 
 
-async def _tried(services: Services, order: admin.MonitorLoad, bearer: Bearer) -> Tagged[Replaced]:
+async def _tried(services: Services, order: admin.MonitorTry, bearer: Bearer) -> Tagged[Replaced]:
     """A dry run."""
-    loaded = await ask(services.control, admin.MonitorsWanted(texts=True), bearer)
-    if order.expected not in (None, loaded.tag):
-        text = f"the monitors are at {loaded.tag}, not at {order.expected}: look at them first"
-        raise _stale(text, loaded.tag)
     async with services.judging:
-        return tagged(await asyncio.to_thread(judge, loaded, order))
+        done = await _ordered(services.control, order, bearer)
+    return tagged(Replaced(**asdict(done) | {"warnings": findings_of(done.warnings)}, loaded=False))
 
 
 async def _replaced(

@@ -1,4 +1,4 @@
-"""What specifications are and what new ones would do, found out here without asking RVMaster.
+"""What the specifications in force are, found out here of their texts, and findings as structures.
 
 Everything is a pure function of texts; it runs in a thread. The compiler is imported when it is first needed: an
 api that nobody asks about monitors starts without it.
@@ -9,9 +9,8 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-from appliance.api.monitor_models import EventShown, PropertyShown, Replaced
+from appliance.api.monitor_models import EventShown, PropertyShown
 from appliance.api.problems import Finding, ProblemError
-from appliance.channel.admin import MonitorLoad
 from appliance.channel.answers.monitors import Monitors
 
 if TYPE_CHECKING:
@@ -19,31 +18,6 @@ if TYPE_CHECKING:
     from appliance.rosmop.monitor import Monitor
 
 _PLACE = re.compile(r"(?s)(.*?):([0-9]+):([0-9]+): (error|warning): (.*)")
-
-
-def judge(before: Monitors, order: MonitorLoad) -> Replaced:
-    """What loading these would do to what is in force. Raises `ProblemError` with every finding."""
-    from appliance.specifications.files import Sources, SpecificationsRefusedError, check  # noqa: PLC0415  the compiler: see the head
-
-    present = Sources(before.files or {}, before.definitions or {}, before.signatures or {})
-    following = present.with_files(Sources(order.files, order.definitions, order.signatures))
-    try:
-        checked = check(following, before.site_keys)
-    except SpecificationsRefusedError as error:
-        raise refusal(
-            f"refused; revision {before.revision} of the specifications stays in force", error.findings
-        ) from error
-    added, changed, removed = following.difference(present)
-    return Replaced(
-        loaded=False,
-        revision=before.revision,
-        tag=before.tag,
-        added=added,
-        changed=changed,
-        removed=removed,
-        warnings=findings_of(list(checked.warnings)),
-        monitors=list(checked.monitors),
-    )
 
 
 def findings_of(texts: list[str]) -> list[Finding]:

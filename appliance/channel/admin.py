@@ -207,6 +207,16 @@ class MonitorLoad(AdminRequest[monitors.Replaced], frozen=True, tag="monitor loa
     signatures: dict[str, str] = {}
 
 
+@rest("operator")
+class MonitorTry(WaitingRequest[monitors.Tried], frozen=True, tag="monitor try"):
+    """What loading these would do (see `MonitorLoad`): they are compiled, and nothing changes."""
+
+    files: dict[str, str]
+    definitions: dict[str, str] = {}
+    signatures: dict[str, str] = {}
+    expected: str | None = None
+
+
 @rest("admin", "PUT", "/v1/monitors/{name}", _WITHIN)
 class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor replace"):
     """Put a text in the place of the file that the monitor `name` stands in, or of the file of this name.

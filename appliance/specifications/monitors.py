@@ -118,6 +118,7 @@ class Monitors:
         )
         self._acts = 0  # switches and resumptions, ever
         self._one_change = asyncio.Lock()
+        self._one_attempt = asyncio.Lock()
         self._trial = Trial(store, "confirm monitors", self._go_back, (SpecificationsRefusedError,))
         self.in_force = NOTHING  # until `start`
         self.sources = Sources()
@@ -235,6 +236,17 @@ class Monitors:
             if self.in_force.who != DISK and sources == self.sources:  # the same texts twice are one revision
                 return self._replaced(self.revision, ([], [], []))
             return await self._change(sources, who, who, request.note or "loaded", request.confirm_within)
+
+    async def attempt(self, request: admin.MonitorTry) -> answers.Tried:
+        """What a load would do; one after the other. Raises as `load`."""
+        async with self._one_attempt:
+            if request.expected not in (None, self.tag):
+                raise MonitorsChangedError(request.expected or "", self.tag)
+            present, revision, tag = self.sources, self.revision, self.tag
+            following = present.with_files(Sources(request.files, request.definitions, request.signatures))
+            checked = await self._check(following, self.site_keys)
+            files = following.difference(present)
+            return answers.Tried(revision, tag, *files, [*checked.warnings], [*checked.monitors])
 
     async def replace(self, request: admin.MonitorReplace, who: str) -> Replaced:
         """Put a text in the place of a monitor's file. Raises `UnknownMonitorError`, and as `load`."""

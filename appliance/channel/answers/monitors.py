@@ -98,6 +98,18 @@ class Monitors(msgspec.Struct, frozen=True):
     signatures: Annotated[dict[str, str] | None, told("with `texts=1`: the site's, by the same names")] = None
 
 
+class Tried(msgspec.Struct, frozen=True):
+    """What a load would do, to the revision in force; `warnings` are lines, `monitors` those that there would be."""
+
+    revision: int
+    tag: str
+    added: list[str]
+    changed: list[str]
+    removed: list[str]
+    warnings: list[str]
+    monitors: list[str]
+
+
 class Replaced(msgspec.Struct, frozen=True):
     """What a change of the specifications did; `replaced` is the revision before, `warnings` are lines.
 

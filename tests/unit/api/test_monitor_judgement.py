@@ -1,4 +1,4 @@
-"""Tests of `appliance.api.monitor_judgement`: what specifications are and would do, without an appliance."""
+"""Tests of `appliance.api.monitor_judgement`: what specifications are, without an appliance."""
 
 import pytest
 
@@ -6,36 +6,15 @@ from appliance.api.monitor_judgement import (
     Compiler,
     events_of,
     findings_of,
-    judge,
     picture_of,
     properties_of,
     refusal,
 )
-from appliance.api.problems import ProblemError
-from appliance.channel.admin import MonitorLoad
 from appliance.channel.answers.monitors import Monitors
 from tests.support.answers import example
 
 A = "a() { int n; event said() /chatter std_msgs/String '{}' { } ere: said said @match { } }"
 TICK = "b() { event t() every 500ms { } event asked(bool on) service /set std_srvs/SetBool request '{data:on}' { } }"
-IN_FORCE = example(Monitors, revision=7, files={"a.rv": A}, definitions={})
-
-
-def test_a_draft_says_what_it_would_change() -> None:
-    """Files that are added and changed, the monitors there would be; what is the same is not named."""
-    draft = judge(IN_FORCE, MonitorLoad({"a.rv": A + " ", "b.rv": TICK}))
-    assert (draft.added, draft.changed, draft.removed, draft.monitors) == (["b.rv"], ["a.rv"], [], ["a", "b"])
-    assert judge(IN_FORCE, MonitorLoad({"a.rv": A})).changed == []
-
-
-def test_a_draft_that_is_wrong_is_refused_with_its_place() -> None:
-    """The problem has every finding as a structure, and as lines of its detail."""
-    with pytest.raises(ProblemError) as refused:
-        judge(IN_FORCE, MonitorLoad({"c.rv": "c() {\n  event e() /x nobody/Knows '{}' { }\n}"}))
-    problem = refused.value
-    assert (problem.status, problem.kind, problem.line) == (422, "specifications-refused", 2)
-    assert problem.detail.splitlines()[0] == "refused; revision 7 of the specifications stays in force"
-    assert problem.detail.splitlines()[1].startswith("c.rv:2:")
 
 
 def test_findings_without_a_place_stay_words() -> None:

@@ -7,10 +7,10 @@ from appliance.channel.admin import CHANGES, OPERATIONS, operation_of
 def test_what_changes_something_is_for_operators_and_admins() -> None:
     """Each change is for one of both, or has messages written that only investigators may fetch.
 
-    What both may do and changes nothing is the list of tokens, a kit, a look.
+    What both may do and changes nothing is the list of tokens, a kit, a look, a try of specifications.
     """
     listed = {one.request for one in OPERATIONS if one.role in ("operator", "admin")}
-    assert listed - CHANGES == {admin.TokenList, admin.HostKit, admin.TopicLook}
+    assert listed - CHANGES == {admin.TokenList, admin.HostKit, admin.TopicLook, admin.MonitorTry}
     assert CHANGES - listed == {admin.RecordingOfMemory}
 
 

@@ -163,6 +163,21 @@ async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: De
     assert compiled[0] == compiled[2] != compiled[1], "the same of the same texts, whoever compiled them"
 
 
+async def test_a_try_says_what_a_load_would_do_and_changes_nothing(desk: Desk) -> None:
+    """Files that are added and changed, the monitors there would be; it is refused as the load would be."""
+    monitors = await desk.monitors()
+    before, sent = monitors.tag, len(desk.sent)
+    (text,) = monitors.sources.files.values()
+    tried = await monitors.attempt(admin.MonitorTry({"a.rv": text + " ", "b.rv": B}, expected=before))
+    assert (tried.added, tried.changed, tried.removed, tried.monitors) == (["b.rv"], ["a.rv"], [], ["a", "b"])
+    assert (await monitors.attempt(admin.MonitorTry({"a.rv": text}))).changed == []
+    with pytest.raises(SpecificationsRefusedError, match=r"c\.rv:1:20: error"):
+        await monitors.attempt(admin.MonitorTry({"c.rv": "c() { event e() /x nobody/Knows '{}' { } }"}))
+    with pytest.raises(MonitorsChangedError):
+        await monitors.attempt(admin.MonitorTry({"b.rv": B}, expected="9.9"))
+    assert (monitors.tag, len(desk.sent)) == (before, sent)
+
+
 async def test_a_reload_takes_nothing_away_that_the_folder_did_not_bring(desk: Desk) -> None:
     """What the folder does not have stays in force, over restarts, too, until somebody says that it is to go."""
     monitors = await desk.monitors()
