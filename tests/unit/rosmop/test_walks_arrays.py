@@ -159,7 +159,7 @@ def test_what_has_several_encodings_is_published_in_the_engines() -> None:
     usual = row((1.0, 2.0), few=(1.0, 2.0), times=(1, 999_999_999))
     at = usual.index(struct.pack("<2f", 1.0, 2.0))
     strange = [usual[:at] + struct.pack("<I", bits) + usual[at + 4 :] for bits in FLOATS]
-    strange += [row(doubles), row((1.0,), bits=b"\x02\x01\xff"), row((1.0,), times=(1, 10**9, 5, 2**32 - 1))]
+    strange += [row(doubles), row((1.0,), bits=b"\x02\x01\xff"), row((1.0,), times=(1, 10**9))]
     for body in strange:
         fed.check([usual, body, usual, body], "/row")
     assert fed.came["published together"] > 16
@@ -254,3 +254,17 @@ def test_an_array_costs_what_it_costs_in_the_engine() -> None:
         fed.check([row(values, 1), row(values, times), row(values, 1)], "/row")
     assert fed.came["fault"] > 0
     assert fed.came["together"] > 6
+
+
+def test_two_arrays_that_grow_in_turn() -> None:
+    """Neither is written over the other, however often they move."""
+    fed = Fed(
+        of_rows(
+            "own::Row m; for (int i = 0; i < x; i++) { m.values.push_back(i); m.whole.push_back(-i);"
+            " last.values.push_back(i); last.whole.push_back(2 * i); } PUBLISH(/a, own/Row, m);"
+            " PUBLISH(/a, own/Row, last); if (last.values.size() > 300) { last.values.clear(); }"
+        )
+    )
+    for time in range(3):
+        fed.check([row((), count) for count in (3, 20, 100, 7)], "/row", time)
+    assert fed.came["together"] == 3
