@@ -15,7 +15,7 @@ from appliance.rosmop.ir.abi import ROOM
 from appliance.rosmop.ir.layout import HEAP
 from tests.support.examples import examples
 from tests.unit.rosmop.random_specifications import definitions
-from tests.unit.rosmop.test_walks import Fed, plain
+from tests.unit.rosmop.test_walks import Fed, frames, plain
 
 SOME = settings(max_examples=examples(60), suppress_health_check=list(HealthCheck))
 NUMBERS = (0.0, -0.0, 1.5, -7.25, 300.0, 1e30)
@@ -268,3 +268,22 @@ def test_two_arrays_that_grow_in_turn() -> None:
     for time in range(3):
         fed.check([row((), count) for count in (3, 20, 100, 7)], "/row", time)
     assert fed.came["together"] == 3
+
+
+def test_what_is_kept_outlives_the_walk() -> None:
+    """Of as much as a variable has room for; what is longer is left, as the next walk writes where it stood."""
+    fed = Fed(of_rows("if (x == 1) { last = MESSAGE; } if (x == 2) { PUBLISH(/a, own/Row, MESSAGE); }"))
+    walker, area = fed.walker("/row"), fed.monitors.area
+    assert area is not None
+    for size in (ROOM // 8, ROOM // 8 + 1):
+        kept, other = row([3.0] * size, 1), row([4.0] * 4000, 2)
+        prepared = walker.prepare(loud=False, told=(), published=(True,))
+        for body in (kept, other):
+            given = frames([body])
+            area[: len(given)] = given
+            walked = walker.walk(area[: len(given)], 0, 0, [], 1, prepared)
+            if walked is not None and not walked.position:
+                assert size > ROOM // 8
+                fed.monitors.process("/row", body, 1)
+            fed.interpreter.process("/row", bytearray(body), 1)
+        fed.check([row((), 0)], "/row")
