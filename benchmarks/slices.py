@@ -2,7 +2,8 @@
 
 The same property without parameters and with one, at 10,000 live slices that are visited in turn; the memory of 100,000
 slices; an event that concerns all of them, and one that brings a verdict of each; how fast ids that nobody has seen are
-taken, and refused beyond the bound. Microseconds of processor time, the least of the rounds.
+taken, and refused beyond the bound; the same `fsm` with a condition, and with an action that changes what slices share.
+Microseconds of processor time, the least of the rounds.
 """
 
 import struct
@@ -29,6 +30,10 @@ SPECIFICATION = """goals(%s) {
     %s
 }
 """
+MORE = {
+    "a condition": "when (id.size() > 3 && told < 9) { }",
+    "an action": "{ told = told + 1; if (told < 0) { return; } }",
+}
 ALL = SPECIFICATION % ("std::string id", "ere: goal stop stop @match { }")
 
 
@@ -105,6 +110,10 @@ def main() -> None:
             f"{name}: {plain:.2f} µs without parameters, {sliced:.2f} µs with {LIVE} slices: {sliced / plain:.2f} x;"
             f" {walked:.2f} µs of 64 together"
         )
+    for name, does in MORE.items():
+        text = SPECIFICATION.replace("'{data:id}' { }", f"'{{data:id}}' {does}", 1)
+        text = text.replace("{\n", "{ static long told = 0;\n", 1) % ("std::string id", PROPERTIES["fsm"])
+        print(f"fsm with {name}: {visited(text, few):.2f} µs, {together(text, few):.2f} µs of 64 together")
     loaded, before = monitors(ALL), resident()
     begun = microseconds(lambda: [loaded.process("/goal", one, 1) for one in many[:MANY]], MANY, 1)
     print(f"{MANY} slices: {resident() - before:.0f} MB, {begun:.2f} µs for each that begins")

@@ -174,8 +174,9 @@ class Execution:
 
         key = (True,) if found is True else tuple(found)
         self._bound = Bound(step.index, step.event.binds, key, message.time, self._sender, step.event.creates)
-        happened = step.monitor.slices.step(step.index, key)  # type: ignore[union-attr]  # who has a key has slices
-        if happened is not None:
+        slices = step.monitor.slices
+        assert slices is not None  # noqa: S101  who has a key has slices
+        if step.event.plain and (happened := slices.step(step.index, key)) is not None:
             if happened:
                 step.monitor.trail.append(self._bound)
                 outcome.events = (*outcome.events, step.name)

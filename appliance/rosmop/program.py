@@ -57,7 +57,7 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
             if event.way is not None:
                 topics.setdefault(event.way, []).append((number, index))
     rows = []
-    # Python has the slices of parametric specifications.
+    # Python has the slices of parametric specifications, and steps them.
     keyed = {
         topic: events
         for topic, events in topics.items()
@@ -67,6 +67,9 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
         topic: events
         for topic, events in topics.items()
         if all(specifications[number].slicing is None for number, _ in events)
+        or (
+            topic in keyed and not all(specifications[number].events[index].plain for number, index in events)
+        )
     }
     for topic, events in topics.items():
         met = list(dict.fromkeys(number for number, _ in events))
@@ -93,12 +96,12 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
 
 
 def _keyed(specifications: Sequence[SpecificationCode], number: int, index: int) -> bool:
-    """Whether an event binds all parameters, and nothing comes of it but states of automata."""
+    """Whether an event binds all parameters, and no slice has more than states of automata from it."""
     specification = specifications[number]
     event, slicing = specification.events[index], specification.slicing
     return (
         slicing is not None
-        and event.plain
+        and (event.plain or event.apart)
         and len(event.binds) == len(slicing.parameters)
         and all(isinstance(declared.property, FiniteProperty) for declared in specification.properties)
     )
@@ -120,7 +123,8 @@ def _event(
     place: int,
 ) -> form.Event:
     advances = []
-    for property_index, code in enumerate(specifications[number].properties):
+    stepped = specifications[number].properties if specifications[number].slicing is None else ()
+    for property_index, code in enumerate(stepped):
         compiled, handlers = code.property, set(code.order)
         if isinstance(compiled, FiniteProperty):
             automaton = compiled.automaton

@@ -118,7 +118,7 @@ class Slices:
         idles = self._idles or [-1] * len(finite)
         self._calm = [
             [*map(_calm, finite, repeat(number), lost, idles)]
-            if every and event.plain and _domain(event) == self._all
+            if every and (event.plain or event.apart) and _domain(event) == self._all
             else None
             for number, event in enumerate(events)
         ]
@@ -149,7 +149,7 @@ class Slices:
     # What an event belongs to
 
     def step(self, event: int, key: Key) -> bool | None:
-        """Let an event happen in the one slice that it binds all parameters of, if nothing comes of it but states.
+        """Step the one slice that an event binds all parameters of, if nothing comes of it but states.
 
         Whether it has happened (not where the slice is over); None: there is more to do, and nothing is done.
         """
@@ -170,6 +170,21 @@ class Slices:
             slice_.stand(after)
             return True
         return None
+
+    def may_step(self, event: int, states: Sequence[set[int]]) -> bool:
+        """Whether nothing comes of an event in a slice but states, with its automata in any of these: what they may
+        then be in is added, as it may also not happen.
+        """
+        calm = self._calm[event]
+        if calm is None:
+            return False
+        for after, one in zip(calm, states, strict=True):
+            one |= {after[state] for state in one}
+        return not any(-1 in one for one in states)
+
+    def is_over(self, key: Key) -> bool:
+        """Whether the slice of all parameters with this key has ended."""
+        return self._whole.get(key, self._first) is None
 
     def standing(self, key: Key) -> list[tuple[Slice, Sequence[int]]]:
         """The slice of all parameters with this key, and the states of its automata, if there is one."""

@@ -513,14 +513,17 @@ class SliceWalker(Walker):
         self,
         home: Home,
         module: FeedModule,
-        feed: Feed,
+        keys: Feed,
         events: Sequence[tuple[Monitor, int]],
         *,
         stamped: bool,
+        feed: Feed | None = None,
     ) -> None:
         codes = [monitor.code.events[index] for monitor, index in events]
         names = [f"{monitor.name}.{code.name}" for (monitor, _), code in zip(events, codes, strict=True)]
-        super().__init__(home, module, feed, [monitor for monitor, _ in events], names)
+        super().__init__(home, module, feed or keys, [monitor for monitor, _ in events], names)
+        self.brief = False
+        self._note = home.machine.function(keys.name)
         self._stamped = stamped
         self._times = [0] * len(codes)
         known: dict[str, tuple[int, Monitor, int, Slices, tuple[int, ...], bool]] = {}
@@ -558,7 +561,7 @@ class SliceWalker(Walker):
         """Have the module note what messages bind; where the first one begins of which nothing is noted."""
         frames = self._frames
         try:
-            return (self._call(frames + position, frames + end, most) or 0) - frames
+            return (self._note(frames + position, frames + end, most) or 0) - frames
         except MachineTrap:
             self._machine.refuel(FUEL)
             at = _LENGTH.unpack_from(self._memory, POSITION)[0]
@@ -607,12 +610,109 @@ class SliceWalker(Walker):
         return until
 
     def _happen(self, keyed: _Keyed, key: Key, time_ns: int, sender: Sender) -> None:
-        keyed.monitor.trail.append(Bound(keyed.event, keyed.binds, key, time_ns, sender, keyed.creates))
+        self._trail(keyed, key, time_ns, sender)
         self._times[keyed.place] += 1
+
+    @staticmethod
+    def _trail(keyed: _Keyed, key: Key, time_ns: int, sender: Sender) -> None:
+        keyed.monitor.trail.append(Bound(keyed.event, keyed.binds, key, time_ns, sender, keyed.creates))
 
     def _sender(self, frame: int, source: int) -> Sender:
         size, seq = _POSITION.unpack_from(self._memory, frame)
         return Sender(source, seq, SEQ) if size >= _STAMPED else Sender(source)
+
+
+class ActingWalker(SliceWalker):
+    """The walk of a topic with events that have a condition or an action, which do not touch what slices have of their
+    own: of a message that may bring about nothing in its slices but states the module does the rest (`Walker.walk`).
+    """
+
+    def walk(  # noqa: PLR0917  as `Walker.walk`
+        self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
+    ) -> Walked | None:
+        """As `Walker.walk`; frames that stand elsewhere are left."""
+        end, begun = len(view), run
+        if view.obj is not self._owner:
+            return Walked(position, run, ())
+        dropped: Sequence[int] = ()
+        output: list[tuple[int, Output]] = []
+        seconds, most, left = 0.0, _FEW, False
+        while position < end and not left:
+            until = self._noted(position, end, most)
+            left = until == position
+            for frame, sender, notes in self._messages(prepared.source):
+                following = frame + 4 + _LENGTH.unpack_from(view, frame)[0]
+                acts = self._acts(notes)
+                if acts is None:
+                    until, left = frame, True
+                    break
+                if not acts:
+                    continue
+                walked = super(SliceWalker, self).walk(
+                    view[:following], frame, run, pieces, time_ns, prepared
+                )
+                if walked is not None and walked.position == frame:
+                    until, left = frame, True
+                    break
+                if walked is not None:
+                    run, seconds = walked.run, seconds + walked.seconds
+                    dropped = _sums(dropped, walked.dropped)
+                    output += walked.output
+                self._step(notes, [] if walked is None else walked.dropped, time_ns, sender)
+            position, most = until, 4 * most
+        if left or run != begun or output:
+            return Walked(position, run, dropped, (), False, output, seconds)
+        return None
+
+    def _messages(self, source: int) -> list[tuple[int, Sender, list[tuple[_Keyed, Key]]]]:
+        """The messages of which something is noted, with where their frames begin: where lines stand is needed."""
+        memory, frames = self._memory, self._frames
+        at, end = self._said, _LENGTH.unpack_from(memory, SURE)[0]
+        found: list[tuple[int, Sender, list[tuple[_Keyed, Key]]]] = []
+        before = 0
+        while at < end:
+            number, frame = HEAD.unpack_from(memory, at)
+            keyed = self._keys[number]
+            assert keyed is not None  # noqa: S101  this walk's module notes no other
+            if frame != before:
+                before = frame
+                sender = self._sender(frame, source) if self._stamped else Sender(source)
+                found.append((frame - frames, sender, []))
+            if keyed.monitor.enabled:
+                found[-1][2].append((keyed, (True, *keyed.noted.values_at(memory, at))))
+            at += keyed.noted.size
+        return found
+
+    @staticmethod
+    def _acts(notes: Sequence[tuple[_Keyed, Key]]) -> bool | None:
+        """Whether the functions of these events are to be called; None if the message is for the engine."""
+        states: dict[tuple[int, Key], list[set[int]]] = {}
+        over = 0
+        for keyed, key in notes:
+            if keyed.slices.is_over(key):
+                over += 1
+                continue
+            standing = keyed.slices.standing(key)
+            if not standing:
+                return None
+            may = states.setdefault((id(keyed.slices), key), [{state} for state in standing[0][1]])
+            if not keyed.slices.may_step(keyed.event, may):
+                return None
+        return None if 0 < over < len(notes) else not over and bool(notes)
+
+    def _step(
+        self, notes: Sequence[tuple[_Keyed, Key]], dropped: Sequence[int], time_ns: int, sender: Sender
+    ) -> None:
+        """Step the slices in which events have happened with the message, and count these."""
+        for place, times in enumerate(Walker.happened(self)):
+            self._times[place] += times
+            if not times or (dropped and dropped[place]):
+                continue
+            for keyed, key in notes:
+                plain = keyed.monitor.code.events[keyed.event].plain
+                if keyed.place == place and (keyed.monitor.properties or plain):
+                    keyed.slices.step(keyed.event, key)
+                    self._trail(keyed, key, time_ns, sender)
 
 
 def _sums(one: Sequence[int], other: Sequence[int]) -> Sequence[int]:
@@ -659,8 +759,9 @@ def walks_of(
         home = Home(machine, cells, interpreter, running, throttles, values=values, due=due)
         for number in group.specifications:
             monitors[number].home = home
+        of_slices = {topic for topic, _ in group.component.keyed}
         for (topic, _), events in zip(group.component.topics, group.events, strict=True):
-            if topic in module.feeds:
+            if topic in module.feeds and topic not in of_slices:
                 own = [monitors[number] for number, _ in events]
                 names = [
                     f"{monitors[number].name}.{monitors[number].code.events[index].name}"
@@ -671,5 +772,9 @@ def walks_of(
             if topic in module.keyed:
                 stamped = topic in compiled.stamped
                 acting = [(monitors[number], index) for number, index in events]
-                walks[topic] = SliceWalker(home, module, module.keyed[topic], acting, stamped=stamped)
+                keys, feed = module.keyed[topic], module.feeds.get(topic)
+                if all(monitor.code.events[index].plain for monitor, index in acting):
+                    walks[topic] = SliceWalker(home, module, keys, acting, stamped=stamped)
+                elif feed is not None and (len(acting) == 1 or not feed.changes):
+                    walks[topic] = ActingWalker(home, module, keys, acting, stamped=stamped, feed=feed)
     return Walks(walks, machine.memory[module.frames : module.frames + AREA])

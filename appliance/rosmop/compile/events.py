@@ -14,10 +14,11 @@ from appliance.rosmop.compile.fields import Bound, check_overlaps, read_fields, 
 from appliance.rosmop.compile.locate import type_of_path
 from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.compile.scope import Scope, Shared, SpecificationNames
-from appliance.rosmop.compile.slicing import acts, binds, creates
+from appliance.rosmop.compile.slicing import acts, apart, binds, creates
 from appliance.rosmop.compile.statements import check_topic, write
 from appliance.rosmop.compiled import EventCode
 from appliance.rosmop.ir import form
+from appliance.rosmop.ir.sites import Site
 from appliance.rosmop.runtime.numbers import f32
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -57,6 +58,7 @@ def compile_event(
         key=_key(shared, names, event, trigger, kind) if names.parameters else "",
         creates=creates(specification, event),
         plain=not event.action.statements and trigger.when is None,
+        apart=apart(whole, shared, names),
         acts=acts(whole, shared),
     )
 
@@ -69,7 +71,9 @@ def _key(
     """
     scope = Scope(shared, names, "action")
     scope.message_type = kind
-    site = scope.lines.site = scope.site(event)
+    site = scope.lines.site = scope.symbols.site(
+        Site(event.position)
+    )  # no slice has its turn: no values to tell
     bound = _bind(scope, event, trigger, kind)
     found = {field.variable.name: field.variable for field in bound if field.variable is not None}
     values = [found[name] for name in names.parameters if name in found]

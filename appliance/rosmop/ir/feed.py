@@ -15,6 +15,8 @@ Python.
   where (i32, i32) frames were dropped.
 - Where a message brings a property with a clock to a deadline before the time at `Cells.until`, the walk ends behind it
   with `SOONER`.
+- Of a keyed topic (below) the functions of events, and those of what they bind, have half a budget each: what takes
+  more is left, as Python has one budget for both.
 - An event that happened is counted at `Feed.counters`, its drops behind those of all, and behind these the verdicts;
   with `TOLD` there were some.
 """
@@ -114,7 +116,16 @@ def written(
     for component, own in zip(components, cells, strict=True):
         for topic, events in component.topics:
             try:
-                walks[topic] = _Walk(writer, own, tables, effects, events, stamped=topic in stamped)
+                half = any(topic == each for each, _ in component.keyed)
+                walks[topic] = _Walk(
+                    writer,
+                    own,
+                    tables,
+                    effects,
+                    events,
+                    stamped=topic in stamped,
+                    budget=BUDGET // 2 if half else BUDGET,
+                )
             except (NotScalarError, RecursionError):
                 continue
     keyed = {}
@@ -209,7 +220,7 @@ def _keys(writer: Writer, written: Sequence[Written], contexts: Collection[str])
     room, out = _get(_END) + _get(_AT) + _SUB, _BR_IF + b"\x01"
     size = 3
     frame = [store(I32, POSITION, _get(_AT)), store(I32, SURE, load(I32, SAID))]
-    frame += [store(I64, writer.budget(context), constant(I64, BUDGET)) for context in contexts]
+    frame += [store(I64, writer.budget(context), constant(I64, BUDGET // 2)) for context in contexts]
     frame += [_get(_NOW), _EQZ64, out, room, constant(I32, 4), b"\x49", out]
     frame += [_set(size, _get(_AT) + b"\x28\x00\x00"), _get(size), room, constant(I32, 4), _SUB, b"\x4b", out]
     for one in written:
@@ -235,10 +246,12 @@ class _Walk:
         events: Sequence[form.Event],
         *,
         stamped: bool,
+        budget: int,
     ) -> None:
         if len(events) > MAX_EVENTS:
             raise NotScalarError("many events")
         self._cells = cells
+        self._budget = budget
         self._events = events
         self._effects = effects
         self._writer = writer
@@ -420,7 +433,7 @@ class _Walk:
         code += _set(_NEXT, _get(_AT) + _get(_SIZE) + _ADD + constant(I32, 4) + _ADD) + _set(
             _WHO, constant(I64, 0)
         )
-        code += b"".join(store(I64, budget, constant(I64, BUDGET)) for budget in self._budgets)
+        code += b"".join(store(I64, budget, constant(I64, self._budget)) for budget in self._budgets)
         return code + b"".join(_set(_FIRST + number, constant(I32, 0)) for number in range(len(self._events)))
 
     def _event(self, number: int) -> bytes:

@@ -638,8 +638,9 @@ class Component(Node, frozen=True):
     has) with the events on each, in order.
 
     `noted` are variables more, in which is noted what nothing depends on and the same message notes again. `keyed` are
-    the topics of which all events bind all parameters of their specification and do nothing but to happen: for each
-    event the function of what it binds, and the types of that.
+    the topics of which all events bind all parameters of their specification and do not touch what its slices have of
+    their own: for each event the function of what it binds, and the types of that. Where one of them does more than to
+    happen they are among the topics, too, with no steps.
     """
 
     variables: tuple[str, ...]

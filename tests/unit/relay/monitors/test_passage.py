@@ -14,6 +14,7 @@ from appliance.channel.messages import Message, MonitorRow
 from appliance.relay.connections.frames import FrameReceiver, Scratch
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
+from appliance.relay.monitors import lane
 from appliance.relay.monitors.lane import Lane
 from appliance.relay.monitors.middle import Middle
 from appliance.relay.monitors.places import Place
@@ -24,13 +25,22 @@ from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import ClockedRun, FiniteRun
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.runtime.context import Published
+from appliance.rosmop.slices import LIMIT
 from appliance.rosmop.syntax.errors import SpecificationError
-from appliance.rosmop.walks import FUEL, SliceWalker, Walked
+from appliance.rosmop.walks import FUEL, ActingWalker, SliceWalker, Walked
 from tests.support.examples import examples
 from tests.support.relay_memory import share
 from tests.support.stated import stated
 from tests.unit.rosmop.acting import message
-from tests.unit.rosmop.random_specifications import Messages, Specifications, Traffic, definitions
+from tests.unit.rosmop.logics.driving import seeded
+from tests.unit.rosmop.random_specifications import (
+    TRIGGERS,
+    Messages,
+    Specifications,
+    Traffic,
+    definitions,
+    ways,
+)
 
 MONITORS = Path(__file__).parents[4] / "monitors"
 
@@ -65,6 +75,7 @@ class Monitored:
         trials: Collection[str] = (),
         restarted: bool = False,
         began: int = 1_000_000_000,
+        slices: int = LIMIT,
     ) -> None:
         self.heard = Heard()
         self.time = began
@@ -79,7 +90,7 @@ class Monitored:
         )
         self.middle.now = lambda: self.time  # type: ignore[method-assign]  # the test sets the time
         self._lanes: dict[tuple[str, str], Lane] = {}
-        self.set = MonitorSet.load(texts, known, on_fault, trials=trials)
+        self.set = MonitorSet.load(texts, known, on_fault, trials=trials, margins=True, slices=slices)
         if together:
             self.set.write_module()
         self.middle.loaded(stated(1, [], {}, {}, restarted=restarted), self.set)
@@ -141,7 +152,15 @@ class Monitored:
         for monitor in self.set.monitors:
             state.append((monitor.name, monitor.seen, monitor.faults, monitor.held))
             names = self.set.interpreter.variables
-            state += [(name, repr(names.get(code))) for name, code in monitor.code.variables.items()]
+            slicing = monitor.code.slicing
+            of_slices = (
+                () if slicing is None else {*slicing.own, *(code for _, code, _ in slicing.parameters)}
+            )
+            state += [
+                (name, repr(names.get(code)))
+                for name, code in monitor.code.variables.items()
+                if code not in of_slices
+            ]
             state += [
                 one.run.state
                 for one in monitor.properties
@@ -164,9 +183,12 @@ def slices(monitor: Monitor) -> list[object]:
 
 
 def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traffic], on_fault: str = "drop",
-          switched: tuple[int, str] | None = None) -> Monitored:  # fmt: skip
+          switched: tuple[int, str] | None = None, *, slices: int = LIMIT) -> Monitored:  # fmt: skip
     """The same traffic both ways; fails at the first difference."""
-    ways = [Monitored(texts, known, together=together, on_fault=on_fault) for together in (False, True)]
+    ways = [
+        Monitored(texts, known, together=together, on_fault=on_fault, slices=slices)
+        for together in (False, True)
+    ]
     try:
         for number, traffic in enumerate(all_traffic):
             for way in ways:
@@ -184,6 +206,8 @@ def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traff
         one_told, told = (way.told() for way in ways)
         assert one_told == told
         assert ways[0].rows() == ways[1].rows()
+        margins, others = ([*map(repr, way.set.take_margins())] for way in ways)
+        assert margins == others
     finally:
         for way in ways:
             way.close()
@@ -323,6 +347,25 @@ PARAMETRIC = {
     "requests": """s(int n) { event a(int n) service /serve own/Serve request '{count:n}' { }
         event b(int n) service /serve own/Serve response '{count:n}' { }
         fsm: i [ a -> o, b -> o ] o [ a -> o, b -> p ] p [ a -> o, b -> q ] q [ a -> o ] @q { DROP; } }""",
+    "conditions": """s(int n) { static double last = 0; const double most = 2;
+        event a(int n, double x, int k) /plain own/Plain '{count:n, x:x, kind:k}' when (k != 2 && x > last - most) { }
+        event b(int n, double x) /stamped own/Stamped '{count:n, x:x}' when (x < 2) { last = x; }
+        fsm: i [ a -> o, b -> o ] o [ a -> o, b -> p ] p [ a -> q, b -> p ] q [ a -> i, b -> o ] @q { } }""",
+    "a condition that faults": """s(int n) {
+        event a(int n, int k) /plain own/Plain '{count:n, kind:k}' when (7 / k > 4) { }
+        ere: a a a a a a @match { ROS_WARN("six"); __RESET; } @fail { __RESET; } }""",
+    "drops, changes, output": """s(int n) { static int total = 0;
+        event a(int n, double x, int k) /plain own/Plain '{count:n, x:x, kind:k}' {
+            total++; if (x > 2) { x = total; } if (k == 2) { ROS_INFO("%d of %d", total, n); return; } n = n; }
+        event b(int n) /stamped own/Stamped '{count:n}' { n = n + 1; if (total % 3 == 0) { DROP; total++; } }
+        fsm: i [ a -> o, b -> o ] o [ a -> o, b -> p ] p [ a -> q, b -> p ] q [ a -> i, b -> o ] @q { DROP; } }""",
+    "actions of several on a message": """s(int n) { static int total = 0;
+        event a(int n, int k) /plain own/Plain '{count:n, kind:k}' when (k < 2) { total++; }
+        event b(int n, double x) /plain own/Plain '{count:n, x:x}' when (x < 2 + total % 3) { if (x < 0) { return; } }
+        fsm: i [ a -> o, b -> o ] o [ a -> o, b -> p ] p [ a -> q, b -> p ] q [ a -> i, b -> o ] @q { } @fail { } }
+        t(double x) { event e(double x) /plain own/Plain '{x:x}' { total = total * 2 % 1000; }
+        event f(double x, int kind) /plain own/Plain '{x:x, kind:kind}' when (kind == total % 2) { }
+        fsm: i [ e -> o, f -> o ] o [ e -> o, f -> p ] p [ e -> i, f -> p ] }""",
 }
 
 
@@ -352,6 +395,89 @@ def test_slices_are_the_same_together(name: str, on_fault: str, monkeypatch: pyt
         switched = (3 * seed + 3, "s")
         agree({"x.rv": PARAMETRIC[name]}, definitions(), again, on_fault, switched)
     assert sum(happened) > 8
+
+
+def parametric(random: Random, seed: int) -> str:
+    """A random parametric specification with conditions and actions, and now and then another that shares with it."""
+    conditions = ("x > 1", "k != 1", "total % 3 != 1", "x > last", "7 / k > 2", "high(x) || k == 1", "mine < 2",
+                  "n + k > 1 && x < 3", "ros::Time::now().toSec() > 1.002")  # fmt: skip
+    actions = ("", "total = total + 1;", "x = x + 1;", "n = n + 1;", 'ROS_INFO("%d: %f", n, x);',
+               "if (k == 2) { DROP; }", "if (x > 2) { return; }", "last = x;", "mine = mine + 1;",
+               "x = last; last = n;",
+               'ROS_WARN_THROTTLE(0.005, "%d", total);', "total = total / k;", "k = mine;",
+               "if (high(x)) { total = 0; }",
+               "told.linear.z = total; PUBLISH(/told, geometry_msgs/Twist, told);")  # fmt: skip
+    topics = sorted(set(ways(seed)))
+
+    def events(parameter: str, count: int) -> str:
+        found = []
+        for number in range(count):
+            bound = {"n": "int", "x": "double", "k": "int"}
+            fields = {"n": "count:n", "x": "x:x", "k": "kind:k"}
+            if random.random() < 0.08:
+                del fields[parameter], bound[parameter]
+                bound["other"], fields["other"] = (
+                    ("int", "count:other") if parameter == "n" else ("double", "x:other")
+                )
+            head = ", ".join(f"{kind} {name}" for name, kind in bound.items())
+            when = f"when ({random.choice(conditions)})" if random.random() < 0.5 else ""
+            action = " ".join(random.choices(actions, k=random.choice((0, 0, 1, 1, 2))))
+            creation = "creation " if random.random() < 0.2 else ""
+            found.append(f"{creation}event e{number}({head}) {TRIGGERS[random.choice(topics)]} "
+                         f"'{{{', '.join(fields.values())}}}' {when} {{ {action} }}")  # fmt: skip
+        return "\n".join(found)
+
+    properties = (
+        "fsm: i [ e0 -> o, e1 -> o ] o [ e0 -> o, e1 -> p ] p [ e0 -> q, e1 -> p ] q [ e0 -> i, e1 -> o ] @q {%s}",
+        "ere: (e0 | e1)* e1 e1 e1 e1 e0 @match {%s}",
+        "ptltl: e1 -> (*) (e0 or e1) @violation {%s}",
+        "fsm: i [ e0 -> o, e1 -> i ] o [ e0 -> p, e1 -> i ] p [ e0 -> i ] @p {} @fail {%s __RESET;}",
+        "",
+    )
+    handlers = ("", "DROP;", "total = 7;", 'ROS_ERROR("%d", total);', "mine = 0;")
+    text = f"""s(int n) {{ static int total = 0; static double last = 0; int mine = 0; static geometry_msgs::Twist told;
+        bool high(double x) {{ return x > 2 + total % 2; }}
+        {events("n", 2)} """
+    for _ in range(random.choice((1, 1, 2))):
+        one = random.choice(properties)
+        text += one % random.choice(handlers) if one else ""
+    text += "}"
+    if random.random() < 0.3:
+        other = events("x", 2).replace("high(x)", "x > 2").replace("mine", "n")
+        text += f"t(double x) {{ int n = 0; static geometry_msgs::Twist told; {other} {properties[0] % ''} }}"
+    return text
+
+
+def test_random_slices_are_the_same_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Conditions and actions of all kinds, with few slices, switched off and on: as one by one."""
+    refused = taken = 0
+    monkeypatch.setattr(lane, "LONGEST", float("inf"))  # of a busy machine's time
+    acts = ActingWalker.walk
+
+    def counted(walker: ActingWalker, view: memoryview, position: int, *rest: Any) -> Walked | None:
+        nonlocal taken
+        found = acts(walker, view, position, *rest)
+        taken += found is None or found.position > position
+        return found
+
+    monkeypatch.setattr(ActingWalker, "walk", counted)
+    for seed in range(examples(60)):
+        random, messages = seeded(seed), Messages(seed)
+        text = parametric(random, seed)
+        traffic = [messages.traffic() for _ in range(10)]
+        again = [one for one in traffic for _ in range(random.choice((1, 3)))]
+        switched = (random.randrange(6), "s") if random.random() < 0.3 else None
+        slices = random.choice((2, 4, LIMIT))
+        try:
+            agree(
+                {"x.rv": text}, definitions(), again, random.choice(("drop", "pass")), switched, slices=slices
+            )
+        except SpecificationError:
+            refused += 1
+        except AssertionError as error:
+            raise AssertionError(f"seed {seed}: {text}") from error
+    assert refused < examples(60) // 4
+    assert taken > examples(60)
 
 
 @pytest.mark.parametrize("fuel", [FUEL, 20_000])
