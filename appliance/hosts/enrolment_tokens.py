@@ -7,7 +7,6 @@ Invariants:
    certificate is asked for, so two who bring it at once get one.
 """
 
-import base64
 import hashlib
 import hmac
 import re
@@ -48,7 +47,7 @@ class Awaited:
     ) -> tuple[AwaitedRow, str]:
         """Make a token; its text is given here and never again."""
         token_id, now = secrets.token_hex(6), time.time()
-        secret = base64.urlsafe_b64encode(secrets.token_bytes(32)).decode("ascii").rstrip("=")
+        secret = secrets.token_urlsafe(32)
         row = AwaitedRow(name, token_id, _hash(secret), now, now + seconds, address, days, kit, who)
         self._rows[name] = row
         self._tables.save_awaited(row)

@@ -43,9 +43,3 @@ def upper(highs: Iterable[float], windows: float, *, stops: bool = False) -> flo
     threshold = values[-highest - 1]
     excess = sum(values[-highest:]) / highest - threshold
     return max(level, threshold + excess * math.log(max(windows * highest / count, 1.0)), top)
-
-
-def lower(lows: Iterable[float], windows: float, *, stops: bool = False) -> float | None:
-    """The same for the lowest values."""
-    found = upper((-low for low in lows), windows, stops=stops)
-    return None if found is None else -found

@@ -44,3 +44,8 @@ class DefinitionError(PeerError):
         self.text = text
         self.source = source
         self.line = line
+
+
+def quoted(text: str) -> str:
+    """As much of a refused name or URI as its error repeats."""
+    return ascii(text if len(text) <= 80 else text[:80] + "...")

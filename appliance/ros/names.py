@@ -14,12 +14,10 @@ Invariants:
 
 import re
 
-from appliance.ros.errors import InvalidNameError
+from appliance.ros.errors import InvalidNameError, quoted
 
 MAX_NAME_LENGTH = 1024
 """Characters in one name; the longest that robots use are far below a quarter of it."""
-
-_SHOWN = 80  # characters of a refused name that are repeated in the error
 
 _NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*\Z")
 _CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]+)+\Z")
@@ -41,7 +39,7 @@ def resolve(name: str, caller_id: str) -> str:
     """
     resolved = _resolve(name, caller_id, _NAME)
     if resolved == "/":
-        raise InvalidNameError(f"{_show(name)} is the global namespace: give the name of something in it")
+        raise InvalidNameError(f"{quoted(name)} is the global namespace: give the name of something in it")
     return resolved
 
 
@@ -62,7 +60,7 @@ def check_caller_id(caller_id: str) -> str:
     """Return `caller_id` unchanged; raises `InvalidNameError` unless it is a canonical global name."""
     if _CANONICAL.match(caller_id) is None or len(caller_id) > MAX_NAME_LENGTH:
         raise InvalidNameError(
-            f"caller_id {_show(caller_id)} is not a global ROS name: write it as /name or /namespace/name, "
+            f"caller_id {quoted(caller_id)} is not a global ROS name: write it as /name or /namespace/name, "
             f"with letters, digits and '_', no '//', no '/' at the end, at most {MAX_NAME_LENGTH} characters"
         )
     return caller_id
@@ -113,7 +111,9 @@ def _resolve(name: str, caller_id: str, grammar: re.Pattern[str]) -> str:
             check_tool_id(caller_id)
         resolved = f"{caller_id}/{name[1:]}" if first == "~" else namespace(caller_id) + name
         if len(resolved) > MAX_NAME_LENGTH or grammar.match(resolved) is None:
-            raise InvalidNameError(f"name {_show(name)} of {_show(caller_id)}: {_refusal(resolved, grammar)}")
+            raise InvalidNameError(
+                f"name {quoted(name)} of {quoted(caller_id)}: {_refusal(resolved, grammar)}"
+            )
     if "//" in resolved:
         resolved = _SLASHES.sub("/", resolved)
     return resolved.rstrip("/") or "/"
@@ -123,7 +123,7 @@ def _refusal(name: str, grammar: re.Pattern[str]) -> str:
     if not name:
         return "empty name: a ROS name has at least one character"
     if len(name) > MAX_NAME_LENGTH:
-        return f"name {_show(name)} has {len(name)} characters; at most {MAX_NAME_LENGTH} are allowed"
+        return f"name {quoted(name)} has {len(name)} characters; at most {MAX_NAME_LENGTH} are allowed"
     for position, character in enumerate(name):
         if character != "~" and grammar.match(f"/a{character}a") is None:
             allowed = (
@@ -131,13 +131,9 @@ def _refusal(name: str, grammar: re.Pattern[str]) -> str:
                 if grammar is _PARAMETER
                 else "letters, digits, '_', '/'"
             )
-            return f"name {_show(name)}: character {position + 1} is {character!a}; allowed are {allowed}"
+            return f"name {quoted(name)}: character {position + 1} is {character!a}; allowed are {allowed}"
     if grammar is _PARAMETER:
         return (
-            f"name {_show(name)}: '~' stands in front only, and no part of a key starts or ends with a space"
+            f"name {quoted(name)}: '~' stands in front only, and no part of a key starts or ends with a space"
         )
-    return f"name {_show(name)}: a ROS name starts with a letter, '/' or '~', and '~' stands nowhere else"
-
-
-def _show(name: str) -> str:
-    return ascii(name if len(name) <= _SHOWN else name[:_SHOWN] + "...")
+    return f"name {quoted(name)}: a ROS name starts with a letter, '/' or '~', and '~' stands nowhere else"

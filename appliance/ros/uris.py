@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 
-from appliance.ros.errors import InvalidUriError
+from appliance.ros.errors import InvalidUriError, quoted
 
 MAX_URI_LENGTH = 1024
 """Characters in one URI."""
@@ -22,7 +22,6 @@ _URI = re.compile(
     r"(?P<port>:[0-9]{1,5})?"
     r"(?P<path>/[A-Za-z0-9_.~!$&'()*+,;=:@%/-]*)?\Z"
 )
-_SHOWN = 80  # characters of a refused URI that are repeated in the error
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +44,7 @@ def parse_service_uri(text: str) -> NodeUri:
     """Parse the URI of a service, whose path is empty; raises `InvalidUriError`."""
     uri = _parse(text, "rosrpc", "service", "rosrpc://host:port")
     if uri.path not in ("", "/"):
-        raise InvalidUriError(f"service URI {_show(text)} has a path; write rosrpc://host:port")
+        raise InvalidUriError(f"service URI {quoted(text)} has a path; write rosrpc://host:port")
     return NodeUri(uri.scheme, uri.host, uri.port, "")
 
 
@@ -64,16 +63,16 @@ def _parse(text: str, scheme: str, what: str, form: str) -> NodeUri:
         raise InvalidUriError(f"{what} URI of {len(text)} characters; at most {MAX_URI_LENGTH} are allowed")
     found = _URI.match(text)
     if found is None:
-        raise InvalidUriError(f"{what} URI {_show(text)} {_complaint(text)}; write {form}")
+        raise InvalidUriError(f"{what} URI {quoted(text)} {_complaint(text)}; write {form}")
     if found["scheme"].lower() != scheme:
         raise InvalidUriError(
-            f"{what} URI {_show(text)} has the scheme {_show(found['scheme'])}; write {form}"
+            f"{what} URI {quoted(text)} has the scheme {quoted(found['scheme'])}; write {form}"
         )
     if found["port"] is None:
-        raise InvalidUriError(f"{what} URI {_show(text)} has no port; write {form}")
+        raise InvalidUriError(f"{what} URI {quoted(text)} has no port; write {form}")
     port = int(found["port"][1:])
     if not 1 <= port <= 65535:
-        raise InvalidUriError(f"{what} URI {_show(text)} has port {port}; a port is between 1 and 65535")
+        raise InvalidUriError(f"{what} URI {quoted(text)} has port {port}; a port is between 1 and 65535")
     return NodeUri(
         scheme, _host(found["host"], text, what), port, found["path"] or ("/" if scheme == "http" else "")
     )
@@ -85,7 +84,7 @@ def _host(host: str, text: str, what: str) -> str:
     try:
         return str(ipaddress.IPv6Address(host.strip("[]")))
     except ValueError:
-        raise InvalidUriError(f"{what} URI {_show(text)} has no valid IPv6 address as its host") from None
+        raise InvalidUriError(f"{what} URI {quoted(text)} has no valid IPv6 address as its host") from None
 
 
 def _complaint(text: str) -> str:
@@ -104,7 +103,3 @@ def _complaint(text: str) -> str:
 
 def _bracketed(host: str) -> str:
     return f"[{host}]" if ":" in host else host
-
-
-def _show(text: str) -> str:
-    return ascii(text if len(text) <= _SHOWN else text[:_SHOWN] + "...")

@@ -7,7 +7,6 @@ A token is `rosrv_<id>_<secret>`: the id (48 bits) finds the row, the secret (25
 2. The comparison takes the same time wherever the difference is.
 """
 
-import base64
 import hashlib
 import hmac
 import re
@@ -57,7 +56,7 @@ def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[Tok
             f"at most 63, and not {' or '.join(sorted(_RESERVED))}"
         )
     token_id, salt = secrets.token_hex(6), secrets.token_bytes(16)
-    secret = base64.urlsafe_b64encode(secrets.token_bytes(32)).decode("ascii").rstrip("=")
+    secret = secrets.token_urlsafe(32)
     text = f"rosrv_{token_id}_{secret}"
     kept = hash_secret(secret, salt)
     return TokenRow(token_id, name, role, salt, kept, now, now + seconds, None, keys_of(text)), text

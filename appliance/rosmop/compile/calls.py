@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from appliance.rosmop.compile import cursors, members, order
 from appliance.rosmop.compile.assignments import require_place, store
 from appliance.rosmop.compile.conversion import condition, convert, number
-from appliance.rosmop.compile.initializers import ValueOf, elements
+from appliance.rosmop.compile.initializers import elements
 from appliance.rosmop.compile.invocation import Invocation
 from appliance.rosmop.compile.output import Stream, formatted
 from appliance.rosmop.compile.places import Value, path, root
@@ -25,32 +25,32 @@ from appliance.rosmop.types.resolve import named_type, record
 _MACRO = re.compile(r"ROS_(DEBUG|INFO|WARN|ERROR|FATAL)(_STREAM)?(_COND|_ONCE|_THROTTLE|_NAMED)?\Z")
 
 
-def call(scope: Scope, node: tree.Call, value_of: ValueOf) -> Value:
+def call(scope: Scope, node: tree.Call) -> Value:
     """A call of anything."""
     callee = node.callee
     if isinstance(callee, tree.Member):
-        base = value_of(scope, callee.base)
-        arguments = [value_of(scope, argument) for argument in node.arguments]
+        base = scope.value_of(callee.base)
+        arguments = [scope.value_of(argument) for argument in node.arguments]
         first, base, arguments = order.of_member(scope, base, arguments)
         at = (node.position, scope.site(node))
         return order.after(first, members.call(Invocation(scope, base, callee.name, arguments, at)))
     if not isinstance(callee, tree.Name):
         raise SpecificationError.at(node.position, "only functions can be called")
-    return _named(scope, node, callee.parts, value_of)
+    return _named(scope, node, callee.parts)
 
 
-def _named(scope: Scope, node: tree.Call, parts: tuple[str, ...], value_of: ValueOf) -> Value:
+def _named(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> Value:
     function = scope.names.functions.get(parts[0]) if len(parts) == 1 else None
     if function is not None:
-        return _helper(scope, node, function, value_of)
+        return _helper(scope, node, function)
     macro = _MACRO.match(parts[0]) if len(parts) == 1 else None
     if macro is not None:
-        return _macro(scope, node, macro, value_of)
+        return _macro(scope, node, macro)
     if parts in (("printf",), ("std", "printf")):
-        return _log(scope, node, "INFO", node.arguments, value_of)
+        return _log(scope, node, "INFO", node.arguments)
     if parts in (("puts",), ("std", "puts")):
-        return _line(scope, node, value_of)
-    known = _known(scope, node, parts, value_of)
+        return _line(scope, node)
+    known = _known(scope, node, parts)
     if known is not None:
         return known
     kind = named_type(parts)
@@ -58,22 +58,22 @@ def _named(scope: Scope, node: tree.Call, parts: tuple[str, ...], value_of: Valu
         kind = record(node.position, "/".join(parts), scope.messages)
     if kind is None:
         raise _unknown(scope, node, parts)
-    return construct(scope, node.position, kind, node.arguments, value_of)
+    return construct(scope, node.position, kind, node.arguments)
 
 
-def _known(scope: Scope, node: tree.Call, parts: tuple[str, ...], value_of: ValueOf) -> Value | None:
+def _known(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> Value | None:
     """A function that every specification has, None if this is none."""
     if parts[-2:] == ("Time", "now"):
         if node.arguments:
             raise SpecificationError.at(node.position, "`now` takes no argument")
         return Value(form.Now(), node.position)
     if parts[0] == "std" and parts[-1] in cursors.ALGORITHMS:
-        first, values = order.arguments(scope, [value_of(scope, argument) for argument in node.arguments])
+        first, values = order.arguments(scope, [scope.value_of(argument) for argument in node.arguments])
         at = (node.position, scope.site(node))
         return order.after(first, cursors.algorithm(scope, parts[-1], values, at))
     library = find_function(parts)
     if library is not None:
-        first, values = order.arguments(scope, [value_of(scope, argument) for argument in node.arguments])
+        first, values = order.arguments(scope, [scope.value_of(argument) for argument in node.arguments])
         return order.after(first, library(Arguments(scope, parts, values, node.position, scope.site(node))))
     return None
 
@@ -101,14 +101,14 @@ def _unknown(scope: Scope, node: tree.Call, parts: tuple[str, ...]) -> Specifica
 # Helper functions
 
 
-def _helper(scope: Scope, node: tree.Call, function: HelperFunction, value_of: ValueOf) -> Value:
+def _helper(scope: Scope, node: tree.Call, function: HelperFunction) -> Value:
     if len(node.arguments) != len(function.parameters):
         raise SpecificationError.at(
             node.position,
             f"`{function.name}` takes {len(function.parameters)} argument(s), not {len(node.arguments)}",
         )
     scope.calls.add(function.name)
-    values = [value_of(scope, argument) for argument in node.arguments]
+    values = [scope.value_of(argument) for argument in node.arguments]
     _check_references(scope, function, values)
     first, values = order.arguments(scope, values)
     handed: list[form.Expression] = []
@@ -179,14 +179,14 @@ def _check_apart(one: Value, other: Value, function: HelperFunction) -> None:
 # Output
 
 
-def _macro(scope: Scope, node: tree.Call, macro: re.Match[str], value_of: ValueOf) -> Value:
+def _macro(scope: Scope, node: tree.Call, macro: re.Match[str]) -> Value:
     level, stream, variant = macro.groups()
     arguments = list(node.arguments)
     guard: form.Expression | None = None
     if variant is not None and variant != "_ONCE":
         if not arguments:
             raise SpecificationError.at(node.position, f"`{macro[0]}` needs a first argument")
-        first = value_of(scope, arguments.pop(0))
+        first = scope.value_of(arguments.pop(0))
         if variant == "_COND":
             guard = condition(first)
         elif variant == "_THROTTLE":
@@ -196,30 +196,28 @@ def _macro(scope: Scope, node: tree.Call, macro: re.Match[str], value_of: ValueO
     if stream:
         if len(arguments) != 1:
             raise SpecificationError.at(node.position, f"`{macro[0]}` takes what is printed: `a << b`")
-        value = streamed(scope, node, level, arguments[0], value_of)
+        value = streamed(scope, node, level, arguments[0])
     else:
-        value = _log(scope, node, level, tuple(arguments), value_of)
+        value = _log(scope, node, level, tuple(arguments))
     if guard is None:
         return value
     nothing = form.Literal(kinds.VOID, None)
     return Value(form.Conditional(kinds.VOID, guard, value.form, nothing), node.position)
 
 
-def _log(
-    scope: Scope, node: tree.Call, level: str, arguments: Sequence[tree.Expression], value_of: ValueOf
-) -> Value:
+def _log(scope: Scope, node: tree.Call, level: str, arguments: Sequence[tree.Expression]) -> Value:
     if not arguments:
         raise SpecificationError.at(node.position, "there is nothing to print; write a text")
-    template, *rest = (value_of(scope, argument) for argument in arguments)
+    template, *rest = (scope.value_of(argument) for argument in arguments)
     line = form.Log(level, formatted(scope, template, rest), scope.site(node))
     return Value(line, node.position)
 
 
-def _line(scope: Scope, node: tree.Call, value_of: ValueOf) -> Value:
+def _line(scope: Scope, node: tree.Call) -> Value:
     """`puts(text)`: no format."""
     if len(node.arguments) != 1:
         raise SpecificationError.at(node.position, f"`puts` takes 1 argument(s), not {len(node.arguments)}")
-    text = convert(scope, value_of(scope, node.arguments[0]), kinds.STRING)
+    text = convert(scope, scope.value_of(node.arguments[0]), kinds.STRING)
     return Value(form.Log("INFO", text, scope.site(node)), node.position)
 
 
@@ -239,7 +237,6 @@ def streamed(
     node: tree.Node,
     level: str,
     chain: tree.Expression,
-    value_of: ValueOf,
     *,
     headed: bool = False,
 ) -> Value:
@@ -250,21 +247,21 @@ def streamed(
         chain = chain.left
     parts += [] if headed else [chain]
     stream = Stream(scope, scope.site(node))
-    pieces = [_piece(scope, stream, part, value_of) for part in reversed(parts)]
+    pieces = [_piece(scope, stream, part) for part in reversed(parts)]
     site = scope.site(node)
     text = form.Join(tuple(piece for piece in pieces if piece is not None), site)
     return Value(form.Log(level, text, site), node.position)
 
 
-def _piece(scope: Scope, stream: Stream, part: tree.Expression, value_of: ValueOf) -> form.Expression | None:
+def _piece(scope: Scope, stream: Stream, part: tree.Expression) -> form.Expression | None:
     if isinstance(part, tree.Name) and part.parts[-1] == "endl":
         return form.Literal(kinds.STRING, b"\n")
     if isinstance(part, tree.Call) and isinstance(part.callee, tree.Name):
         name, arguments = part.callee.parts[-1], part.arguments
         if name == "setprecision" and len(arguments) == 1:
-            stream.manipulated(part.callee, value_of(scope, arguments[0]))
+            stream.manipulated(part.callee, scope.value_of(arguments[0]))
             return None
-    return None if stream.manipulated(part, None) else stream.piece(value_of(scope, part))
+    return None if stream.manipulated(part, None) else stream.piece(scope.value_of(part))
 
 
 # Constructors
@@ -275,15 +272,14 @@ def construct(
     position: Position,
     kind: kinds.Type,
     arguments: Sequence[tree.Expression],
-    value_of: ValueOf,
 ) -> Value:
     """`type(arguments)`."""
     if not arguments:
         return Value(form.Zero(kind), position)
-    values = [value_of(scope, argument) for argument in arguments if not isinstance(argument, tree.Elements)]
+    values = [scope.value_of(argument) for argument in arguments if not isinstance(argument, tree.Elements)]
     site = scope.lines.site
     if isinstance(kind, kinds.Vector):
-        return Value(_vector(scope, kind, arguments, values, value_of), position)
+        return Value(_vector(scope, kind, arguments, values), position)
     if isinstance(kind, kinds.Time | kinds.Duration) and values and kinds.is_number(values[0].type):
         return Value(_moment(kind, values, site), position)
     if isinstance(kind, kinds.String) and len(values) == 2:
@@ -300,11 +296,10 @@ def _vector(
     kind: kinds.Vector,
     arguments: Sequence[tree.Expression],
     values: Sequence[Value],
-    value_of: ValueOf,
 ) -> form.Expression:
     site = scope.lines.site
     if len(arguments) == 1 and isinstance(arguments[0], tree.Elements):
-        return elements(scope, arguments[0], kind, value_of)
+        return elements(scope, arguments[0], kind)
     if len(values) == 1 and isinstance(values[0].type, kinds.Vector):
         return convert(scope, values[0], kind, site)
     if not values or len(values) > 2 or not kinds.is_number(values[0].type):

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 from appliance.ros.errors import DefinitionError
 from appliance.rosmop.compile.conversion import condition, refusal
-from appliance.rosmop.compile.expressions import value_of
 from appliance.rosmop.compile.fields import Bound, check_overlaps, read_fields, writes
 from appliance.rosmop.compile.locate import type_of_path
 from appliance.rosmop.compile.places import Variable
@@ -186,7 +185,7 @@ def _bind_one(scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Pa
 
 def _constant(scope: Scope, binding: tree.Binding, field: Type) -> bool | int | float | bytes:
     assert binding.constant is not None  # the caller has looked
-    constant = value_of(scope, binding.constant).constant
+    constant = scope.value_of(binding.constant).constant
     held = None if constant is None else _held(constant, field)
     if held is None:
         shown_as = repr(constant.decode("utf-8", "replace")) if isinstance(constant, bytes) else constant
@@ -223,7 +222,7 @@ def _body(
         if when is not None:
             with scope.at(when), scope.looking():
                 try:
-                    test = condition(value_of(scope, when))
+                    test = condition(scope.value_of(when))
                     scope.add(form.Require(scope.lines.site, test))
                 except SpecificationError as error:
                     scope.shared.findings += error.findings

@@ -26,7 +26,6 @@ from appliance.rosmop.runtime.numbers import f32
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types import kinds
-from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import shown
 from appliance.rosmop.types.resolve import resolve
 
@@ -38,16 +37,6 @@ _MAX_DIGITS = 400
 def value_of(scope: Scope, node: tree.Expression) -> Value:
     """The value of an expression; refuses what has no meaning."""
     return _KINDS[type(node)](scope, node)
-
-
-def converted(scope: Scope, node: tree.Expression, target: Type) -> form.Expression:
-    """An expression as a value of the target type; `{…}` makes a vector."""
-    return initializers.converted(scope, node, target, value_of)
-
-
-def elements(scope: Scope, node: tree.Elements, target: Type) -> form.Expression:
-    """`{a, b, c}` as a vector."""
-    return initializers.elements(scope, node, target, value_of)
 
 
 def literal_number(scope: Scope, node: tree.Number) -> Value:
@@ -234,7 +223,7 @@ def assignment(scope: Scope, node: tree.Assign) -> tuple[order.First, Value, for
     target = value_of(scope, node.target)
     assignments.require_place(target, f"`{node.operator}`")
     if node.operator == "=" and isinstance(node.value, tree.Elements):
-        return order.of_assignment(scope, target, elements(scope, node.value, target.type))
+        return order.of_assignment(scope, target, initializers.elements(scope, node.value, target.type))
     value, site = value_of(scope, node.value), scope.site(node.value)
     if node.operator == "=" and (target.pure or kinds.is_number(target.type)):
         return order.of_assignment(scope, target, _assigned(scope, target, value, site))
@@ -311,15 +300,11 @@ def _cast(scope: Scope, node: tree.Cast) -> Value:
     )
 
 
-def _call(scope: Scope, node: tree.Call) -> Value:
-    return calls.call(scope, node, value_of)
-
-
 def _construct(scope: Scope, node: tree.Construct) -> Value:
     kind = resolve(node.type, scope.messages)
     if kinds.is_number(kind) and len(node.arguments) == 1:
         return _cast(scope, tree.Cast(node.position, node.type, node.arguments[0]))
-    return calls.construct(scope, node.position, kind, node.arguments, value_of)
+    return calls.construct(scope, node.position, kind, node.arguments)
 
 
 def _new(scope: Scope, node: tree.NewCharacters) -> Value:
@@ -356,7 +341,7 @@ _KINDS: Mapping[type[tree.Expression], Callable[[Scope, Any], Value]] = {
     tree.Index: _index,
     tree.Member: _member,
     tree.Cast: _cast,
-    tree.Call: _call,
+    tree.Call: calls.call,
     tree.Construct: _construct,
     tree.NewCharacters: _new,
     tree.Limit: _limit,

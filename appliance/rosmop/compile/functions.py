@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Mapping, Set
 
 from appliance.rosmop.compile.conversion import convert
-from appliance.rosmop.compile.expressions import value_of
 from appliance.rosmop.compile.loops import charge
 from appliance.rosmop.compile.places import Value, Variable
 from appliance.rosmop.compile.scope import HelperFunction, Scope, Shared, SpecificationNames
@@ -126,7 +125,7 @@ def _constant(scope: Scope, declarator: tree.Declarator) -> Value | None:
     if declarator.is_array or declarator.value is None or isinstance(declarator.value, tree.Elements):
         return None
     try:
-        value = value_of(scope, declarator.value)
+        value = scope.value_of(declarator.value)
     except SpecificationError:
         return None
     return value if value.constant is not None else None

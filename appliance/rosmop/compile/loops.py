@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 
 from appliance.rosmop.compile.conversion import condition, convert, number
-from appliance.rosmop.compile.expressions import value_of
 from appliance.rosmop.compile.order import settled
 from appliance.rosmop.compile.places import Value, Variable
 from appliance.rosmop.compile.scope import Loop, Scope
@@ -77,7 +76,7 @@ def write_for(scope: Scope, node: tree.For, write: Write) -> None:
 
 def write_range_for(scope: Scope, node: tree.RangeFor, write: Write) -> None:
     """`for (type name : values)`."""
-    values = value_of(scope, node.values)
+    values = scope.value_of(node.values)
     by_value = not node.type.reference or node.type.constant
     if not by_value:
         first, values = settled(scope, values)
@@ -141,7 +140,7 @@ def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type, 
 
 def write_switch(scope: Scope, node: tree.Switch, write: Write) -> None:
     """`switch`: the index of the first case, then every block from there on until a `break`."""
-    value = value_of(scope, node.value)
+    value = scope.value_of(node.value)
     kind = kinds.promoted(value.type)
     if not isinstance(kind, kinds.Integer):
         raise SpecificationError.at(value.position, f"`switch` needs an integer; this is {value.type}")
@@ -179,7 +178,7 @@ def _cases(scope: Scope, node: tree.Switch, kind: kinds.Integer) -> tuple[tuple[
         if case.value is None:
             default = index
             continue
-        value = value_of(scope, case.value)
+        value = scope.value_of(case.value)
         constant = value.constant
         if not isinstance(constant, int):
             raise SpecificationError.at(
@@ -225,7 +224,7 @@ def _leave_unless(scope: Scope, node: tree.Expression) -> None:
     with scope.at(node):
         site = scope.lines.site
         with scope.looking():
-            left = form.Not(condition(value_of(scope, node)))
+            left = form.Not(condition(scope.value_of(node)))
         scope.add(form.If(site, left, (form.Break(site),), ()))
 
 

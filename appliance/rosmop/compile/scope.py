@@ -3,9 +3,10 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
-from appliance.rosmop.compile.places import Variable
+from appliance.rosmop.compile.places import Value, Variable
 from appliance.rosmop.compiled import Comparison, Publication
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.sites import Site, SiteVariable, Symbols
@@ -19,6 +20,7 @@ from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.types.messages import Messages, nearest, shown
 
 Role = Literal["action", "timer", "handler", "init", "function"]
+ValueOf = Callable[["Scope", tree.Expression], Value]
 
 
 @dataclass(eq=False)
@@ -104,10 +106,11 @@ class Statements:
 class Shared:
     """What all functions of all specifications share while they are compiled."""
 
-    def __init__(self, messages: Messages, *, margins: bool = False) -> None:
+    def __init__(self, messages: Messages, value_of: ValueOf, *, margins: bool = False) -> None:
         self.symbols = Symbols()
         self.margins = margins
         self.messages = messages
+        self.value_of = value_of
         self.values = Values(messages)
         self.functions: dict[str, form.Function] = {}
         self.specifications: list[SpecificationNames] = []
@@ -164,6 +167,8 @@ class Scope:
         self.symbols = shared.symbols
         self.values = shared.values
         self.messages = shared.messages
+        self.value_of = partial(shared.value_of, self)
+        """Computes an expression."""
         self.context = names.context
         self.lines = Statements()
         self.result: Type = kinds.VOID

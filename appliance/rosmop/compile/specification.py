@@ -15,6 +15,7 @@ from appliance.rosmop.compile.enforcement import (
     with_remedy,
 )
 from appliance.rosmop.compile.events import compile_event
+from appliance.rosmop.compile.expressions import value_of
 from appliance.rosmop.compile.functions import (
     compile_function,
     compile_handler,
@@ -48,7 +49,7 @@ def compile_files(files: Sequence[tree.File], definitions: Definitions, *, margi
 
     With `margins` the comparisons of numbers are noted (`margins.py`).
     """
-    shared = Shared(Messages(definitions), margins=margins)
+    shared = Shared(Messages(definitions), value_of, margins=margins)
     pairs = [(file, specification) for file in files for specification in file.specifications]
     compiled = _compile_all(shared, pairs)
     findings = list(dict.fromkeys(shared.findings))
@@ -67,7 +68,7 @@ def compile_files(files: Sequence[tree.File], definitions: Definitions, *, margi
 
 def findings_of(files: Sequence[tree.File], definitions: Definitions) -> list[Finding]:
     """What is wrong with these files while others of their set cannot be read; names may be declared in those."""
-    shared = Shared(Messages(definitions))
+    shared = Shared(Messages(definitions), value_of)
     shared.partial = True
     _compile_all(shared, [(file, specification) for file in files for specification in file.specifications])
     return list(dict.fromkeys(shared.findings))

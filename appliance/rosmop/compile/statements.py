@@ -11,7 +11,8 @@ from appliance.ros import names
 from appliance.rosmop.compile import calls, loops
 from appliance.rosmop.compile.assignments import write_store
 from appliance.rosmop.compile.conversion import condition, convert
-from appliance.rosmop.compile.expressions import assignment, converted, elements, value_of
+from appliance.rosmop.compile.expressions import assignment
+from appliance.rosmop.compile.initializers import converted, elements
 from appliance.rosmop.compile.scope import Scope
 from appliance.rosmop.ir import form
 from appliance.rosmop.positions import Position
@@ -68,7 +69,7 @@ def _is_copy(scope: Scope, declarator: tree.Declarator, kind: kinds.Type) -> boo
     """Whether a `char *` begins with the characters of another one."""
     if kind != kinds.CHARACTERS or declarator.is_array or not isinstance(declarator.value, tree.Name):
         return False
-    return isinstance(value_of(scope, declarator.value).type, kinds.Characters)
+    return isinstance(scope.value_of(declarator.value).type, kinds.Characters)
 
 
 def known(
@@ -82,7 +83,7 @@ def known(
         node = declarator.arguments[0]
     if node is None or isinstance(node, tree.Elements):
         return None
-    value = value_of(scope, node).constant
+    value = scope.value_of(node).constant
     if isinstance(kind, kinds.Floating):
         return None if value is None or isinstance(value, bytes) else _rounded(float(value), kind)
     if not isinstance(value, int):
@@ -106,7 +107,7 @@ def initial(
     if declarator.is_array:
         return _array(scope, kind, declarator)
     if declarator.arguments is not None:
-        value = calls.construct(scope, declarator.position, kind, declarator.arguments, value_of)
+        value = calls.construct(scope, declarator.position, kind, declarator.arguments)
         return kind, convert(scope, value, kind)
     if declarator.value is None:
         return kind, form.Zero(kind)
@@ -116,7 +117,7 @@ def initial(
 def _deduced(scope: Scope, declarator: tree.Declarator) -> tuple[kinds.Type, form.Expression]:
     if declarator.value is None or isinstance(declarator.value, tree.Elements) or declarator.is_array:
         raise SpecificationError.at(declarator.position, "`auto` needs a value: `auto x = …;`")
-    value = value_of(scope, declarator.value)
+    value = scope.value_of(declarator.value)
     if isinstance(value.type, kinds.Void | kinds.Index):
         raise SpecificationError.at(
             declarator.position, f"a variable cannot hold {value.type}; use the expression itself"
@@ -158,7 +159,7 @@ def _array_size(scope: Scope, declarator: tree.Declarator) -> int | None:
         if declarator.value is None:
             raise SpecificationError.at(declarator.position, "an array needs a size: `name[3]`")
         return None
-    value = value_of(scope, declarator.size)
+    value = scope.value_of(declarator.size)
     size = value.constant
     if not isinstance(size, int) or isinstance(size, bool) or not 0 < size <= 1 << 24:
         raise SpecificationError.at(
@@ -175,7 +176,7 @@ def _evaluate(scope: Scope, node: tree.Evaluate) -> None:
     expression = node.expression
     level = calls.stream_of(expression)
     if level is not None:
-        scope.evaluate(calls.streamed(scope, node, level, expression, value_of, headed=True).form)
+        scope.evaluate(calls.streamed(scope, node, level, expression, headed=True).form)
     elif isinstance(expression, tree.Assign):
         first, target, assigned = assignment(scope, expression)
         for each in first:
@@ -183,9 +184,9 @@ def _evaluate(scope: Scope, node: tree.Evaluate) -> None:
         write_store(scope, target, assigned)
     elif isinstance(expression, tree.Step):
         prefix = tree.Step(expression.position, expression.operator, expression.target, prefix=True)
-        scope.evaluate(value_of(scope, prefix).form)
+        scope.evaluate(scope.value_of(prefix).form)
     else:
-        scope.evaluate(value_of(scope, expression).form)
+        scope.evaluate(scope.value_of(expression).form)
 
 
 def _block(scope: Scope, node: tree.Block) -> None:
@@ -196,7 +197,7 @@ def _block(scope: Scope, node: tree.Block) -> None:
 
 def _if(scope: Scope, node: tree.If) -> None:
     with scope.at(node.condition):
-        test, site = condition(value_of(scope, node.condition)), scope.lines.site
+        test, site = condition(scope.value_of(node.condition)), scope.lines.site
     yes = loops.body(scope, [node.yes], write)
     no = () if node.no is None else loops.body(scope, [node.no], write)
     scope.add(form.If(site, test, yes, no))
@@ -252,7 +253,7 @@ def _reset(scope: Scope, node: tree.Statement) -> None:
 
 
 def _delete(scope: Scope, node: tree.Delete) -> None:
-    value = value_of(scope, node.target)
+    value = scope.value_of(node.target)
     if not isinstance(value.type, kinds.Characters):
         raise SpecificationError.at(node.position, f"`delete` is for `char` buffers; {value.type} needs none")
 
@@ -260,7 +261,7 @@ def _delete(scope: Scope, node: tree.Delete) -> None:
 def _publish(scope: Scope, node: tree.Publish) -> None:
     check_topic(node.topic, node.position)
     kind = record(node.type_position, node.type, scope.messages)
-    value = value_of(scope, node.value)
+    value = scope.value_of(node.value)
     if value.type != kind:
         raise SpecificationError.at(value.position, f"this is {value.type}, but {kind} is to be published")
     scope.add(form.Publish(scope.lines.site, node.topic, kind, value.form, scope.temporary()))
