@@ -11,6 +11,7 @@ state/relay/      0700  rosrv-relay    and so on, one folder for each role, for 
 state/control/    2710  rosrv:rosrv-api  as root: new files get the group, which may read those that say so (audit log)
 """
 
+import contextlib
 import fcntl
 import os
 import socket
@@ -92,9 +93,12 @@ class StateDirectory:
         # The lock is held and no process is started: nobody writes there.
         place, mine = os.open(self.path, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC), os.geteuid()
         for user, part in {(mine, "run"), *((account_of(role.user).uid, role.part) for role in roles)}:
-            os.seteuid(user)  # root may not look into what is others', in a container
-            remove_unfinished(part, place)
-            os.seteuid(mine)
+            with contextlib.suppress(
+                PermissionError
+            ):  # without CAP_SETUID no process starts, and that is told
+                os.seteuid(user)  # root may not look into what is others', in a container
+                remove_unfinished(part, place)
+                os.seteuid(mine)
         os.close(place)
 
     def _give_parts(self, roles: Collection[Role]) -> None:
