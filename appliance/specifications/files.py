@@ -21,7 +21,7 @@ _MOST_FILES = 1000
 _LONGEST_FILE = 1 << 20
 _LONGEST = (
     3 << 20
-)  # all of them, definitions included: the compiler has a minute, and takes some 14 s for each MiB
+)  # characters of all, with definitions: the compiler has a minute, and takes 14 s for each MiB
 
 
 class SpecificationsRefusedError(Exception):

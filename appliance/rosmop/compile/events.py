@@ -70,9 +70,8 @@ def _key(
     """
     scope = Scope(shared, names, "action")
     scope.message_type = kind
-    site = scope.lines.site = scope.symbols.site(
-        Site(event.position)
-    )  # no slice has its turn: no values to tell
+    # No slice has its turn: there are no values to tell.
+    site = scope.lines.site = scope.symbols.site(Site(event.position))
     bound = _bind(scope, event, trigger, kind)
     found = {field.variable.name: field.variable for field in bound if field.variable is not None}
     values = [found[name] for name in names.parameters if name in found]
