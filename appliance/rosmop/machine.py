@@ -232,6 +232,8 @@ def load() -> ctypes.PyDLL:
     folder = f"linux-{os.uname().machine}"
     file = str(Path(package.origin).with_name(folder) / "_libwasmtime.so")
     library = ctypes.PyDLL(file)
+    # The one that takes seconds of a large set: what else the process does goes on, and it answers its supervisor.
+    library.__dict__["wasmtime_module_new"] = ctypes.CDLL(file).wasmtime_module_new
     for name, (result, *given) in _C.items():
         function = getattr(library, name)
         function.restype, function.argtypes = result, given

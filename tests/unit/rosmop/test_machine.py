@@ -5,6 +5,8 @@ import resource
 import struct
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -177,6 +179,26 @@ def test_what_a_module_does_at_its_start_is_bounded_too() -> None:
     with pytest.raises(MachineTrap) as caught:
         made("(func $begin (loop (br 0))) (start $begin)")
     assert caught.value.reason == "out of fuel"
+
+
+def test_other_threads_go_on_while_a_module_is_translated() -> None:
+    """The compiler's process answers its supervisor meanwhile: a large set takes seconds."""
+    step = "(local.set 0 (i64.add (i64.mul (local.get 0) (i64.const 3)) (i64.const 7)))"
+    functions = "".join(f'(func (export "f{number}") (param i64) {step * 400})' for number in range(600))
+    code = bytes(wasmtime.wat2wasm(f'(module (memory (export "memory") 1) {functions})'))
+    taken: list[float] = []
+
+    def work() -> None:
+        began = time.thread_time()
+        translated(code, LIMIT)
+        taken.append(time.thread_time() - began)
+
+    thread, began = threading.Thread(target=work), time.thread_time()
+    thread.start()
+    while not taken:
+        pass
+    thread.join()
+    assert time.thread_time() - began > taken[0] / 4
 
 
 def test_a_view_outlives_its_machine() -> None:
