@@ -72,28 +72,6 @@ def visited(text: str, messages: Sequence[bytes]) -> float:
     return microseconds(visit, len(messages))
 
 
-def together(text: str, messages: Sequence[bytes]) -> float:
-    """The same when 64 arrive together, taken by the module."""
-    loaded = monitors(text)
-    loaded.write_module()
-    for message in messages:
-        loaded.process("/goal", message, 1)
-    walker, area = loaded.walker("/goal"), loaded.area
-    if walker is None or area is None:
-        raise SystemExit("a parametric specification without a module")
-    prepared = walker.prepare(loud=False, told=())
-    frames = [struct.pack("<I", len(message)) + message for message in messages]
-    batches = [b"".join(frames[first : first + 64]) for first in range(0, len(frames), 64)]
-
-    def visit() -> None:
-        for batch in batches:
-            area[: len(batch)] = batch
-            if walker.walk(area[: len(batch)], 0, 0, [], 1, prepared) is not None:
-                raise SystemExit("a message was left to the engine")
-
-    return microseconds(visit, len(messages))
-
-
 def resident() -> float:
     """Megabytes of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
@@ -105,15 +83,13 @@ def main() -> None:
     for name, formula in PROPERTIES.items():
         plain = visited(SPECIFICATION % ("", formula), few)
         sliced = visited(SPECIFICATION % ("std::string id", formula), few)
-        walked = together(SPECIFICATION % ("std::string id", formula), few)
         print(
-            f"{name}: {plain:.2f} µs without parameters, {sliced:.2f} µs with {LIVE} slices: {sliced / plain:.2f} x;"
-            f" {walked:.2f} µs of 64 together"
+            f"{name}: {plain:.2f} µs without parameters, {sliced:.2f} µs with {LIVE} slices: {sliced / plain:.2f} x"
         )
     for name, does in MORE.items():
         text = SPECIFICATION.replace("'{data:id}' { }", f"'{{data:id}}' {does}", 1)
         text = text.replace("{\n", "{ static long told = 0;\n", 1) % ("std::string id", PROPERTIES["fsm"])
-        print(f"fsm with {name}: {visited(text, few):.2f} µs, {together(text, few):.2f} µs of 64 together")
+        print(f"fsm with {name}: {visited(text, few):.2f} µs")
     loaded, before = monitors(ALL), resident()
     begun = microseconds(lambda: [loaded.process("/goal", one, 1) for one in many[:MANY]], MANY, 1)
     print(f"{MANY} slices: {resident() - before:.0f} MB, {begun:.2f} µs for each that begins")

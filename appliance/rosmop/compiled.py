@@ -38,8 +38,6 @@ class EventCode:
     """A slice may begin with it."""
     plain: bool = False
     """Where its key is known it has happened, and there is nothing to do."""
-    apart: bool = False
-    """Its condition and action neither look at nor change what each slice has of its own."""
     acts: bool = False
     """Its action does more than to change the slice's own variables."""
 

@@ -7,21 +7,19 @@ from appliance.rosmop.compiled import SpecificationCode
 from appliance.rosmop.ir import form
 from appliance.rosmop.logics.interface import ClockedProperty, FiniteProperty
 from appliance.rosmop.sharing import connected
-from appliance.rosmop.types.kinds import Type
 
 
 @dataclass(frozen=True)
 class Group:
     """A component, with the numbers of its specifications and of its properties with tables (specification, property),
-    and for each topic, and part of a service, the events on it (specification, event); `keyed`: for those of them that
-    the component has keyed.
+    and for each topic, and part of a service, the events on it (specification, event). Those with events of parametric
+    specifications have none: the engine takes their messages.
     """
 
     component: form.Component
     specifications: Sequence[int]
     properties: tuple[tuple[int, int], ...]
     events: tuple[tuple[tuple[int, int], ...], ...]
-    keyed: tuple[tuple[tuple[int, int], ...], ...]
 
 
 def groups(specifications: Sequence[SpecificationCode]) -> Iterator[Group]:
@@ -57,19 +55,10 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
             if event.way is not None:
                 topics.setdefault(event.way, []).append((number, index))
     rows = []
-    # Python has the slices of parametric specifications, and steps them.
-    keyed = {
-        topic: events
-        for topic, events in topics.items()
-        if all(_keyed(specifications, *event) for event in events)
-    }
     topics = {
         topic: events
         for topic, events in topics.items()
         if all(specifications[number].slicing is None for number, _ in events)
-        or (
-            topic in keyed and not all(specifications[number].events[index].plain for number, index in events)
-        )
     }
     for topic, events in topics.items():
         met = list(dict.fromkeys(number for number, _ in events))
@@ -82,37 +71,13 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
                 ),
             )
         )
-    keys = tuple(
-        (topic, tuple(_key(specifications, *event) for event in events)) for topic, events in keyed.items()
-    )
-    component = form.Component(tuple(variables), len(properties), tuple(rows), tuple(noted), keys)
+    component = form.Component(tuple(variables), len(properties), tuple(rows), tuple(noted))
     return Group(
         component,
         numbers,
         tuple(properties),
         tuple(map(tuple, topics.values())),
-        tuple(map(tuple, keyed.values())),
     )
-
-
-def _keyed(specifications: Sequence[SpecificationCode], number: int, index: int) -> bool:
-    """Whether an event binds all parameters, and no slice has more than states of automata from it."""
-    specification = specifications[number]
-    event, slicing = specification.events[index], specification.slicing
-    return (
-        slicing is not None
-        and (event.plain or event.apart)
-        and len(event.binds) == len(slicing.parameters)
-        and all(isinstance(declared.property, FiniteProperty) for declared in specification.properties)
-    )
-
-
-def _key(
-    specifications: Sequence[SpecificationCode], number: int, index: int
-) -> tuple[str, tuple[Type, ...]]:
-    slicing = specifications[number].slicing
-    assert slicing is not None  # noqa: S101  the caller has looked
-    return specifications[number].events[index].key, tuple(kind for _, _, kind in slicing.parameters)
 
 
 def _event(
@@ -123,8 +88,7 @@ def _event(
     place: int,
 ) -> form.Event:
     advances = []
-    stepped = specifications[number].properties if specifications[number].slicing is None else ()
-    for property_index, code in enumerate(stepped):
+    for property_index, code in enumerate(specifications[number].properties):
         compiled, handlers = code.property, set(code.order)
         if isinstance(compiled, FiniteProperty):
             automaton = compiled.automaton

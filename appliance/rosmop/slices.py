@@ -118,7 +118,7 @@ class Slices:
         idles = self._idles or [-1] * len(finite)
         self._calm = [
             [*map(_calm, finite, repeat(number), lost, idles)]
-            if every and (event.plain or event.apart) and _domain(event) == self._all
+            if every and event.plain and _domain(event) == self._all
             else None
             for number, event in enumerate(events)
         ]
@@ -170,26 +170,6 @@ class Slices:
             slice_.stand(after)
             return True
         return None
-
-    def may_step(self, event: int, states: Sequence[set[int]]) -> bool:
-        """Whether nothing comes of an event in a slice but states, with its automata in any of these: what they may
-        then be in is added, as it may also not happen.
-        """
-        calm = self._calm[event]
-        if calm is None:
-            return False
-        for after, one in zip(calm, states, strict=True):
-            one |= {after[state] for state in one}
-        return not any(-1 in one for one in states)
-
-    def is_over(self, key: Key) -> bool:
-        """Whether the slice of all parameters with this key has ended."""
-        return self._whole.get(key, self._first) is None
-
-    def standing(self, key: Key) -> list[tuple[Slice, Sequence[int]]]:
-        """The slice of all parameters with this key, and the states of its automata, if there is one."""
-        slice_ = self._whole.get(key)
-        return [] if slice_ is None else [(slice_, _states(slice_.runs))]
 
     def targets(self, event: EventCode, key: Key) -> tuple[Sequence[Slice], Sequence[Slice]]:
         """The slices with all parameters that an event belongs to, in the order in which they began, and the others.

@@ -17,7 +17,6 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 from appliance.rosmop.compiled import Compiled
-from appliance.rosmop.happened import SEQ, Sender
 from appliance.rosmop.ir.abi import (
     AREA,
     LEFT,
@@ -35,7 +34,6 @@ from appliance.rosmop.ir.abi import (
 from appliance.rosmop.ir.interpreter import Interpreter
 from appliance.rosmop.ir.kept import KeptMessage, element_code, entered, left
 from appliance.rosmop.ir.output import HEAD
-from appliance.rosmop.ir.output import Key as Noted
 from appliance.rosmop.ir.values import Values, struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import Monitor, RunningProperty
@@ -43,10 +41,9 @@ from appliance.rosmop.outcomes import Outcome, Verdict
 from appliance.rosmop.program import groups
 from appliance.rosmop.runtime.context import Context, LogLine, Published
 from appliance.rosmop.runtime.wire import Buffer
-from appliance.rosmop.slices import Key, Slice, Slices
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
-from appliance.rosmop.why import Bound, ClockedSteps, Exits
+from appliance.rosmop.why import ClockedSteps, Exits
 
 FUEL = 50_000_000
 """Instructions of one call at most: some hundredths of a second. What a call leaves is for the next ones: setting it
@@ -57,9 +54,6 @@ BEGINNING = 8192
 """Bytes that are looked at of a frame that was not received into the module's memory."""
 
 _FIRST = 512  # that are shown if they suffice: caches are cold when a large frame has gone through them
-
-_FEW = 16  # messages
-_STAMPED = 12  # bytes that a header has at least
 
 _ADDRESS = 0xFFFFFFFF
 _LENGTH = struct.Struct("<I")
@@ -492,229 +486,6 @@ class Walker:
         return more[: len(self.events)], more[len(self.events) :]
 
 
-class _Keyed(NamedTuple):
-    """An event of a `SliceWalker`: what is noted of it, its place, and what its slices need."""
-
-    noted: Noted
-    place: int
-    monitor: Monitor
-    event: int
-    slices: Slices
-    binds: tuple[int, ...]
-    creates: bool
-
-
-class SliceWalker(Walker):
-    """The walk of a topic whose events all do nothing but to happen in the one slice that they bind: the module notes
-    what messages bind, and what is done with it is done here (`Slices.step`). Where more comes of a message it is left.
-    """
-
-    def __init__(
-        self,
-        home: Home,
-        module: FeedModule,
-        keys: Feed,
-        events: Sequence[tuple[Monitor, int]],
-        *,
-        stamped: bool,
-        feed: Feed | None = None,
-    ) -> None:
-        codes = [monitor.code.events[index] for monitor, index in events]
-        names = [f"{monitor.name}.{code.name}" for (monitor, _), code in zip(events, codes, strict=True)]
-        super().__init__(home, module, feed or keys, [monitor for monitor, _ in events], names)
-        self.brief = False
-        self._note = home.machine.function(keys.name)
-        self._stamped = stamped
-        self._times = [0] * len(codes)
-        known: dict[str, tuple[int, Monitor, int, Slices, tuple[int, ...], bool]] = {}
-        for place, ((monitor, index), code) in enumerate(zip(events, codes, strict=True)):
-            assert monitor.slices is not None  # noqa: S101  it is parametric
-            known[code.key] = place, monitor, index, monitor.slices, code.binds, code.creates
-        self._keys = [
-            _Keyed(key, *known[key.function]) if key.function in known else None for key in module.keys
-        ]
-
-    def happened(self) -> Sequence[int]:
-        """How often each event has happened since this was last asked."""
-        times, self._times = self._times, [0] * len(self._times)
-        return times
-
-    def walk(
-        self, view: memoryview, position: int, run: int, _: list[Any], time_ns: int, prepared: Prepared
-    ) -> Walked | None:
-        """As `Walker.walk`. Few messages at first, as those behind one that is left are looked at again."""
-        end = len(view)
-        if view.obj is not self._owner:
-            if end > AREA:
-                return Walked(position, run, ())
-            self._memory[self._frames : self._frames + end] = view
-        most = _FEW
-        while position < end:
-            following = self._noted(position, end, most)
-            done = self._done(following, time_ns, prepared.source)
-            if done < following or done == position:
-                return Walked(done, run, ())
-            position, most = done, 4 * most
-        return None
-
-    def _noted(self, position: int, end: int, most: int) -> int:
-        """Have the module note what messages bind; where the first one begins of which nothing is noted."""
-        frames = self._frames
-        try:
-            return (self._note(frames + position, frames + end, most) or 0) - frames
-        except MachineTrap:
-            self._machine.refuel(FUEL)
-            at = _LENGTH.unpack_from(self._memory, POSITION)[0]
-            _LENGTH.pack_into(self._memory, POSITION, 0)
-            if at:
-                return int(at) - frames
-            return self._noted(position, end, most)  # the calls before have used up the fuel
-
-    def _done(self, until: int, time_ns: int, source: int) -> int:
-        """Do what follows for the messages that are noted; where the first one begins that is left."""
-        memory, keys, stamped = self._memory, self._keys, self._stamped
-        at, end = self._said, _LENGTH.unpack_from(memory, SURE)[0]
-        head, several = HEAD.unpack_from, len(self.events) > 1
-        sender, before = Sender(source), 0
-        happened: list[tuple[_Keyed, Key]] = []  # because of the message at hand, if it may be several
-        undo: list[tuple[Slice, Sequence[int]]] = []
-        while at < end:
-            number, frame = head(memory, at)
-            keyed = keys[number]
-            assert keyed is not None  # noqa: S101  this walk's module notes no other
-            if frame != before:
-                for each, key in happened:
-                    self._happen(each, key, time_ns, sender)
-                happened.clear()
-                undo.clear()
-                before = frame
-                if stamped:
-                    sender = self._sender(frame, source)
-            key = (True, *keyed.noted.values_at(memory, at))
-            at += keyed.noted.size
-            if not keyed.monitor.enabled:
-                continue
-            if several:
-                undo += keyed.slices.standing(key)
-            comes = keyed.slices.step(keyed.event, key)
-            if comes is None:
-                for slice_, states in undo[::-1]:
-                    slice_.stand(states)
-                return int(frame) - self._frames
-            if comes and several:
-                happened.append((keyed, key))
-            elif comes:
-                self._happen(keyed, key, time_ns, sender)
-        for each, key in happened:
-            self._happen(each, key, time_ns, sender)
-        return until
-
-    def _happen(self, keyed: _Keyed, key: Key, time_ns: int, sender: Sender) -> None:
-        self._trail(keyed, key, time_ns, sender)
-        self._times[keyed.place] += 1
-
-    @staticmethod
-    def _trail(keyed: _Keyed, key: Key, time_ns: int, sender: Sender) -> None:
-        keyed.monitor.trail.append(Bound(keyed.event, keyed.binds, key, time_ns, sender, keyed.creates))
-
-    def _sender(self, frame: int, source: int) -> Sender:
-        size, seq = _POSITION.unpack_from(self._memory, frame)
-        return Sender(source, seq, SEQ) if size >= _STAMPED else Sender(source)
-
-
-class ActingWalker(SliceWalker):
-    """The walk of a topic with events that have a condition or an action, which do not touch what slices have of their
-    own: of a message that may bring about nothing in its slices but states the module does the rest (`Walker.walk`).
-    """
-
-    def walk(  # noqa: PLR0917  as `Walker.walk`
-        self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
-    ) -> Walked | None:
-        """As `Walker.walk`; frames that stand elsewhere are left."""
-        end, begun = len(view), run
-        if view.obj is not self._owner:
-            return Walked(position, run, ())
-        dropped: Sequence[int] = ()
-        output: list[tuple[int, Output]] = []
-        seconds, most, left = 0.0, _FEW, False
-        while position < end and not left:
-            until = self._noted(position, end, most)
-            left = until == position
-            for frame, sender, notes in self._messages(prepared.source):
-                following = frame + 4 + _LENGTH.unpack_from(view, frame)[0]
-                acts = self._acts(notes)
-                if acts is None:
-                    until, left = frame, True
-                    break
-                if not acts:
-                    continue
-                walked = super(SliceWalker, self).walk(
-                    view[:following], frame, run, pieces, time_ns, prepared
-                )
-                if walked is not None and walked.position == frame:
-                    until, left = frame, True
-                    break
-                if walked is not None:
-                    run, seconds = walked.run, seconds + walked.seconds
-                    dropped = _sums(dropped, walked.dropped)
-                    output += walked.output
-                self._step(notes, [] if walked is None else walked.dropped, time_ns, sender)
-            position, most = until, 4 * most
-        if left or run != begun or output:
-            return Walked(position, run, dropped, (), False, output, seconds)
-        return None
-
-    def _messages(self, source: int) -> list[tuple[int, Sender, list[tuple[_Keyed, Key]]]]:
-        """The messages of which something is noted, with where their frames begin: where lines stand is needed."""
-        memory, frames = self._memory, self._frames
-        at, end = self._said, _LENGTH.unpack_from(memory, SURE)[0]
-        found: list[tuple[int, Sender, list[tuple[_Keyed, Key]]]] = []
-        before = 0
-        while at < end:
-            number, frame = HEAD.unpack_from(memory, at)
-            keyed = self._keys[number]
-            assert keyed is not None  # noqa: S101  this walk's module notes no other
-            if frame != before:
-                before = frame
-                sender = self._sender(frame, source) if self._stamped else Sender(source)
-                found.append((frame - frames, sender, []))
-            if keyed.monitor.enabled:
-                found[-1][2].append((keyed, (True, *keyed.noted.values_at(memory, at))))
-            at += keyed.noted.size
-        return found
-
-    @staticmethod
-    def _acts(notes: Sequence[tuple[_Keyed, Key]]) -> bool | None:
-        """Whether the functions of these events are to be called; None if the message is for the engine."""
-        states: dict[tuple[int, Key], list[set[int]]] = {}
-        over = 0
-        for keyed, key in notes:
-            if keyed.slices.is_over(key):
-                over += 1
-                continue
-            standing = keyed.slices.standing(key)
-            if not standing:
-                return None
-            may = states.setdefault((id(keyed.slices), key), [{state} for state in standing[0][1]])
-            if not keyed.slices.may_step(keyed.event, may):
-                return None
-        return None if 0 < over < len(notes) else not over and bool(notes)
-
-    def _step(
-        self, notes: Sequence[tuple[_Keyed, Key]], dropped: Sequence[int], time_ns: int, sender: Sender
-    ) -> None:
-        """Step the slices in which events have happened with the message, and count these."""
-        for place, times in enumerate(Walker.happened(self)):
-            self._times[place] += times
-            if not times or (dropped and dropped[place]):
-                continue
-            for keyed, key in notes:
-                plain = keyed.monitor.code.events[keyed.event].plain
-                if keyed.place == place and (keyed.monitor.properties or plain):
-                    keyed.slices.step(keyed.event, key)
-                    self._trail(keyed, key, time_ns, sender)
-
-
 def _sums(one: Sequence[int], other: Sequence[int]) -> Sequence[int]:
     return [sum(counts) for counts in zip_longest(one, other, fillvalue=0)]
 
@@ -738,7 +509,7 @@ def walks_of(
     compiled: Compiled, module: FeedModule, interpreter: Interpreter, monitors: Sequence[Monitor], due: Due
 ) -> Walks:
     """The walkers of all topics that the module of a set has; their monitors are told where their state is."""
-    if not module.feeds and not module.keyed:
+    if not module.feeds:
         return Walks()
     found = list(groups(compiled.specifications))
     values = Values(compiled.messages)
@@ -759,22 +530,12 @@ def walks_of(
         home = Home(machine, cells, interpreter, running, throttles, values=values, due=due)
         for number in group.specifications:
             monitors[number].home = home
-        of_slices = {topic for topic, _ in group.component.keyed}
         for (topic, _), events in zip(group.component.topics, group.events, strict=True):
-            if topic in module.feeds and topic not in of_slices:
+            if topic in module.feeds:
                 own = [monitors[number] for number, _ in events]
                 names = [
                     f"{monitors[number].name}.{monitors[number].code.events[index].name}"
                     for number, index in events
                 ]
                 walks[topic] = Walker(home, module, module.feeds[topic], own, names)
-        for (topic, _), events in zip(group.component.keyed, group.keyed, strict=True):
-            if topic in module.keyed:
-                stamped = topic in compiled.stamped
-                acting = [(monitors[number], index) for number, index in events]
-                keys, feed = module.keyed[topic], module.feeds.get(topic)
-                if all(monitor.code.events[index].plain for monitor, index in acting):
-                    walks[topic] = SliceWalker(home, module, keys, acting, stamped=stamped)
-                elif feed is not None and (len(acting) == 1 or not feed.changes):
-                    walks[topic] = ActingWalker(home, module, keys, acting, stamped=stamped, feed=feed)
     return Walks(walks, machine.memory[module.frames : module.frames + AREA])

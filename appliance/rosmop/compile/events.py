@@ -13,7 +13,7 @@ from appliance.rosmop.compile.fields import Bound, check_overlaps, read_fields, 
 from appliance.rosmop.compile.locate import type_of_path
 from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.compile.scope import Scope, Shared, SpecificationNames
-from appliance.rosmop.compile.slicing import acts, apart, binds, creates
+from appliance.rosmop.compile.slicing import acts, binds, creates
 from appliance.rosmop.compile.statements import check_topic, write
 from appliance.rosmop.compiled import EventCode
 from appliance.rosmop.ir import form
@@ -57,7 +57,6 @@ def compile_event(
         key=_key(shared, names, event, trigger, kind) if names.parameters else "",
         creates=creates(specification, event),
         plain=not event.action.statements and trigger.when is None,
-        apart=apart(whole, shared, names),
         acts=acts(whole, shared),
     )
 

@@ -101,22 +101,6 @@ def acts(function: form.Function, shared: Shared) -> bool:
     )
 
 
-def apart(function: form.Function, shared: Shared, names: SpecificationNames) -> bool:
-    """Whether a function, with all that it calls, neither looks at nor changes what each slice has of its own."""
-    own = {variable.code for variable in names.variables.values() if variable.sliced}
-    waiting, seen = [function], {function.name}
-    while waiting:
-        for node in form.nodes(waiting.pop().body):
-            if isinstance(node, form.Read | form.Assign) and node.name in own:
-                return False
-            if isinstance(node, form.Invoke) and node.function not in seen:
-                if node.function not in shared.functions:
-                    return False  # it is refused
-                seen.add(node.function)
-                waiting.append(shared.functions[node.function])
-    return True
-
-
 def unsliceable(compiled: CompiledProperty) -> str | None:
     """Why slices cannot have a run each of a property."""
     if compiled.timed:

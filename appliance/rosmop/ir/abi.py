@@ -8,7 +8,7 @@ where it is and how long; a message stands as it is sent (`records.py`).
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from appliance.rosmop.ir.output import Key, Line, Publication
+from appliance.rosmop.ir.output import Line, Publication
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 
@@ -139,8 +139,3 @@ class FeedModule:
     """Where lines of output and publications are noted, by their places among the `lines`."""
     publications: Mapping[tuple[str, str], int]
     """Where it must stand (i64) whether what a context publishes on a topic is only counted."""
-    keyed: Mapping[str, Feed]
-    """Exports `keys(at, end, most)` for the keyed topics: they note what frames bind, of so many at most, where lines
-    are noted, and answer where the first one begins that was not looked at, or is left.
-    """
-    keys: Sequence[Key]

@@ -15,14 +15,12 @@ Python.
   where (i32, i32) frames were dropped.
 - Where a message brings a property with a clock to a deadline before the time at `Cells.until`, the walk ends behind it
   with `SOONER`.
-- Of a keyed topic (below) the functions of events, and those of what they bind, have half a budget each: what takes
-  more is left, as Python has one budget for both.
 - An event that happened is counted at `Feed.counters`, its drops behind those of all, and behind these the verdicts;
   with `TOLD` there were some.
 """
 
 import struct
-from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.rosmop.happened import NO_NUMBER, SEQ
@@ -116,27 +114,9 @@ def written(
     for component, own in zip(components, cells, strict=True):
         for topic, events in component.topics:
             try:
-                half = any(topic == each for each, _ in component.keyed)
-                walks[topic] = _Walk(
-                    writer,
-                    own,
-                    tables,
-                    effects,
-                    events,
-                    stamped=topic in stamped,
-                    budget=BUDGET // 2 if half else BUDGET,
-                )
+                walks[topic] = _Walk(writer, own, tables, effects, events, stamped=topic in stamped)
             except (NotScalarError, RecursionError):
                 continue
-    keyed = {}
-    for topic, noted in (each for component in components for each in component.keyed):
-        try:
-            keyed[topic] = (
-                [writer.key(*event) for event in noted],
-                {functions[name].context for name, _ in noted},
-            )
-        except (NotScalarError, RecursionError):
-            continue
     settled = [writer.settling(own) for own in cells if own.kept]
     codes: list[bytes] = []
     for topic, walk in walks.items():
@@ -150,8 +130,6 @@ def written(
     wholes = [(one.parameters, one.result, one.code) for one in writer.written]
     exports = {f"settle {number}": number for number in settled}
     exports |= {feed.name: len(wholes) + place for place, feed in enumerate(feeds.values())}
-    exports |= {f"keys {place}": len(wholes) + len(feeds) + place for place in range(len(keyed))}
-    codes += [_keys(writer, *noting) for noting in keyed.values()]
     wholes += [(_PARAMETERS, I64, code) for code in codes]
     code = assembled(wholes, exports, writer.constants, memory)
     return WrittenModule(
@@ -165,8 +143,6 @@ def written(
         writer.lines,
         writer.said,
         writer.publications,
-        {topic: _noting(place, written) for place, (topic, (written, _)) in enumerate(keyed.items())},
-        writer.keys,
         writer.budgets,
         {raw: writer.constants[raw] for raw in writer.strings},
         writer.rooms,
@@ -206,34 +182,6 @@ def _set(local: int, value: bytes) -> bytes:
     return value + b"\x21" + unsigned(local)
 
 
-def _noting(place: int, written: Sequence[Written]) -> Feed:
-    """What is said about what notes keys."""
-    functions = [one.number for one in written]
-    return Feed(
-        f"keys {place}", drops=False, changes=False, verdicts=(), counters=0, log=0, undo=(), brief=False,
-        functions=functions, says=False, settle="", publishes=(),
-    )  # fmt: skip
-
-
-def _keys(writer: Writer, written: Sequence[Written], contexts: Collection[str]) -> bytes:
-    """The function."""
-    room, out = _get(_END) + _get(_AT) + _SUB, _BR_IF + b"\x01"
-    size = 3
-    frame = [store(I32, POSITION, _get(_AT)), store(I32, SURE, load(I32, SAID))]
-    frame += [store(I64, writer.budget(context), constant(I64, BUDGET // 2)) for context in contexts]
-    frame += [_get(_NOW), _EQZ64, out, room, constant(I32, 4), b"\x49", out]
-    frame += [_set(size, _get(_AT) + b"\x28\x00\x00"), _get(size), room, constant(I32, 4), _SUB, b"\x4b", out]
-    for one in written:
-        frame.append(_get(_AT) + constant(I32, 4) + _ADD + _get(size) + b"\x10" + unsigned(one.number))
-        frame += [constant(I32, ELSEWHERE), _AND, out]
-    frame.append(_set(_AT, _get(_AT) + _get(size) + _ADD + constant(I32, 4) + _ADD))
-    frame.append(_set(_NOW, _get(_NOW) + constant(I64, 1) + b"\x7d"))
-    body = [store(I32, SAID, constant(I32, writer.said)), _BLOCK, _LOOP, *frame, _BR + b"\x00", END, END]
-    body += [store(I32, POSITION, constant(I32, 0)), _get(_AT), b"\xad", END]
-    whole = row([b"\x01" + bytes((I32,))]) + b"".join(body)
-    return unsigned(len(whole)) + whole
-
-
 class _Walk:
     """Writes the walk for one topic. Raises `NotScalarError` if no message would come through."""
 
@@ -246,12 +194,10 @@ class _Walk:
         events: Sequence[form.Event],
         *,
         stamped: bool,
-        budget: int,
     ) -> None:
         if len(events) > MAX_EVENTS:
             raise NotScalarError("many events")
         self._cells = cells
-        self._budget = budget
         self._events = events
         self._effects = effects
         self._writer = writer
@@ -433,7 +379,7 @@ class _Walk:
         code += _set(_NEXT, _get(_AT) + _get(_SIZE) + _ADD + constant(I32, 4) + _ADD) + _set(
             _WHO, constant(I64, 0)
         )
-        code += b"".join(store(I64, budget, constant(I64, self._budget)) for budget in self._budgets)
+        code += b"".join(store(I64, budget, constant(I64, BUDGET)) for budget in self._budgets)
         return code + b"".join(_set(_FIRST + number, constant(I32, 0)) for number in range(len(self._events)))
 
     def _event(self, number: int) -> bytes:

@@ -637,17 +637,13 @@ class Component(Node, frozen=True):
     properties with tables they have, and their topics (of services the request or response, by a name that no topic
     has) with the events on each, in order.
 
-    `noted` are variables more, in which is noted what nothing depends on and the same message notes again. `keyed` are
-    the topics of which all events bind all parameters of their specification and do not touch what its slices have of
-    their own: for each event the function of what it binds, and the types of that. Where one of them does more than to
-    happen they are among the topics, too, with no steps.
+    `noted` are variables more, in which is noted what nothing depends on and the same message notes again.
     """
 
     variables: tuple[str, ...]
     properties: int
     topics: tuple[tuple[str, tuple[Event, ...]], ...]
     noted: tuple[str, ...] = ()
-    keyed: tuple[tuple[str, tuple[tuple[str, tuple[Type, ...]], ...]], ...] = ()
 
 
 def nodes(root: object) -> Iterator[object]:

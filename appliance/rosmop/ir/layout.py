@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.abi import FIRST, ROOM, Cells
-from appliance.rosmop.ir.output import Key, Line, Publication
+from appliance.rosmop.ir.output import Line, Publication
 from appliance.rosmop.ir.values import Values, is_array, struct_code, struct_size
 from appliance.rosmop.ir.wasm import F32, F64, I32, I64
 from appliance.rosmop.types import kinds
@@ -64,7 +64,6 @@ class Layout:
         self.rooms: list[range] = []
         """Where vectors stand."""
         self.lines: list[Line | Publication] = []
-        self.keys: list[Key] = []
         self.publications: dict[tuple[str, str], int] = {}
         """Where it stands (i64) whether what a specification publishes on a topic is only counted."""
         self.places: list[range] = []

@@ -38,7 +38,7 @@ from appliance.rosmop.ir.layout import (
     is_signed,
     machine_type,
 )
-from appliance.rosmop.ir.output import BYTES, HEAD, Key, Line, is_text
+from appliance.rosmop.ir.output import BYTES, HEAD, Line, is_text
 from appliance.rosmop.ir.places import loaded
 from appliance.rosmop.ir.records import Records
 from appliance.rosmop.ir.texts import settling
@@ -110,23 +110,17 @@ class Writer(Layout):
         function = self.functions[name]
         return self.function(function, {"at": I32, "size": I32}, I32, function.context)
 
-    def key(self, name: str, bound: tuple[Type, ...]) -> Written:
-        """The function of what an event binds, of these types: it notes them. Raises `NotScalarError`."""
-        function = self.functions[name]
-        return self.function(function, {"at": I32, "size": I32}, I32, function.context, bound)
-
     def function(
         self,
         function: form.Function | form.Skipper,
         parameters: Mapping[str, int],
         result: int,
         context: str,
-        bound: tuple[Type, ...] | None = None,
     ) -> Written:
         """A function, written when it is first asked for; `context` is whose budget it takes from."""
         key = (function.name, tuple(parameters), result, context)
         if key not in self._numbers:
-            written = _Body(self, function, parameters, result, context, bound).written()
+            written = _Body(self, function, parameters, result, context).written()
             self._numbers[key] = written
             self.written.append(written)
         return self._numbers[key]
@@ -155,21 +149,19 @@ class Writer(Layout):
 class _Body(Records):
     """Writes one function."""
 
-    def __init__(  # noqa: PLR0917  `Writer.function` gives it all
+    def __init__(
         self,
         writer: Writer,
         function: form.Function | form.Skipper,
         parameters: Mapping[str, int],
         result: int,
         context: str,
-        bound: tuple[Type, ...] | None,
     ) -> None:
         answers = isinstance(function, form.Function) and function.parameters == ("m",)
         super().__init__(writer, parameters, context, answers=answers)
         self._own_places(function)
         self._writer = writer
         self._function = function
-        self._bound = bound
         self._made, self._begun = made_in(function, writer.shared)
         self._references: dict[str, int] = {}
         """Where the values of references stand when it has returned."""
@@ -295,15 +287,6 @@ class _Body(Records):
             chosen = constant(I32, index) + self._set(node.name)
             code += self._when(test, lambda chosen=chosen: chosen)  # type: ignore[misc]  # the row of this turn
         return code
-
-    def _noted_key(self, references: Sequence[str], kinds_of: Sequence[Type]) -> bytes:
-        values = [form.Read(*value) for value in zip(kinds_of, references, strict=True)]
-        code = stores = b""
-        for place, value in enumerate(values):
-            first, slot, _ = self._slot(value, f"value {place}", HEAD.size + 8 * place)
-            code, stores = code + first, stores + slot
-        key = Key(self._context, values, self._function.name)
-        return code + self._noted_line(key, constant(I64, 0)) + stores
 
     def _leave(self, node: form.Leave) -> bytes:
         code = constant(I32, bool(node.happened))
@@ -631,8 +614,6 @@ class _Body(Records):
         return code + b"\x10" + unsigned(called.number), called.references
 
     def _return(self, node: form.Return) -> bytes:
-        if self._bound is not None:
-            return self._noted_key(node.references, self._bound) + self._leave(form.Leave(node.site, True))
         kind, code, answer = node.value.type, b"", constant(I32, 0)
         if _has_place(kind):
             code, place, count = self._noted(b"".join(self._elements(node.value)))

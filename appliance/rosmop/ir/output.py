@@ -4,8 +4,6 @@ A line stands in the module's memory as its number among those of the module, th
 bytes for each value: an integer, a double, or a string's address (the low 32 bits) and length. It costs the most that
 it can: text is not made before it is paid for.
 
-What a message binds of parameters (`Key`) is noted as a line is, with a number among those of the keys.
-
 A message that is published has behind number and frame its fields as they are sent, of strings and arrays of any
 length where they are and how long.
 """
@@ -54,16 +52,6 @@ class _Noted(msgspec.Struct, tag=True, array_like=True, dict=True):
             where = text & _ADDRESS
             values[place] = bytes(memory[where : where + (text >> 32)])
         return values
-
-
-class Key(_Noted):
-    """What a message binds of the parameters of a specification; `function` is that which notes it."""
-
-    values: Sequence[form.Expression]
-    function: str
-
-    def __post_init__(self) -> None:
-        self._note(self.values)
 
 
 class Line(_Noted):

@@ -10,13 +10,12 @@ too many nanoseconds) is written anew, and a message that puts a NaN there is le
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any
 
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.abi import BEYOND, MOST_KEPT, POSITION, ROOM, SAID
 from appliance.rosmop.ir.arrays import Arrays
 from appliance.rosmop.ir.layout import HEAP, LINES, MOST_MADE, NotScalarError, machine_type
-from appliance.rosmop.ir.output import HEAD, Key, Line, Publication
+from appliance.rosmop.ir.output import HEAD, Line, Publication
 from appliance.rosmop.ir.places import loaded, root, root_of
 from appliance.rosmop.ir.values import is_array, struct_code, struct_size
 from appliance.rosmop.ir.vectors import OF_VECTORS
@@ -297,9 +296,9 @@ class Records(Arrays):
 
     # What is published
 
-    def _noted_line(self, line: Line | Publication | Key, cost: bytes) -> bytes:
-        """Pay for a line of output, a publication or key and begin it, where the local variable `line` says then."""
-        known: list[Any] = self._layout.keys if isinstance(line, Key) else self._layout.lines
+    def _noted_line(self, line: Line | Publication, cost: bytes) -> bytes:
+        """Pay for a line of output or a publication, and begin it, where the local variable `line` says then."""
+        known = self._layout.lines
         code = self._cell(0x28, SAID) + self._set("line")
         end = self._get("line") + constant(I32, line.size) + b"\x6a"
         full = end + constant(I32, self._layout.said + LINES) + b"\x4b"

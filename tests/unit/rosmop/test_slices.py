@@ -440,8 +440,8 @@ def test_runs_that_may_grow_are_fewer() -> None:
     assert slices.limit == GROWING_LIMIT
 
 
-def test_topics_that_touch_what_a_slice_has_have_no_walk_and_others_have() -> None:
-    """The module takes what it always did beside them."""
+def test_topics_with_parametric_specifications_are_the_engines_and_others_have_a_walk() -> None:
+    """The module does not know slices; it takes the messages of other topics."""
     other = "other() { bool b = false; event e(bool x) /o std_msgs/Bool '{data:x}' { b = x; } }"
     monitors = MonitorSet.load({"x.rv": GOALS, "y.rv": other}, definitions())
     monitors.write_module()
@@ -449,24 +449,6 @@ def test_topics_that_touch_what_a_slice_has_have_no_walk_and_others_have() -> No
     assert monitors.walker("/goal") is None
     assert monitors.walker("/o") is not None
     assert compile_files([parse(GOALS, "x.rv")], definitions()).specifications[0].slicing is not None
-
-
-@pytest.mark.parametrize(("times", "taken"), [(20_000, True), (220_000, False), (10_000_000, False)])
-def test_what_an_action_costs_is_paid_beside_what_it_binds(times: int, taken: bool) -> None:
-    """The module has half a budget for it; of what takes more, or all, the engine says what comes of it."""
-    text = """s(int n) { static int m = 0;
-        event a(int n, int k) /t geometry_msgs/Pose2D '{x:n, y:k}' { for (int i = 0; i < k; i++) { m++; } }
-        fsm: i [ a -> o ] o [ a -> o ] @fail { } }"""
-    monitors = load(text)
-    monitors.write_module()
-    monitors.process("/t", message("geometry_msgs/Pose2D", x=1.0), 1)
-    one = message("geometry_msgs/Pose2D", x=1.0, y=float(times))
-    walker = monitors.walker("/t")
-    assert walker is not None
-    prepared = walker.prepare(loud=False, told=[False])
-    assert (monitors.taken("/t", one, 2, lambda _: prepared) is not None) is taken
-    outcome = monitors.process("/t", one, 3)
-    assert bool(outcome.faults) is (times > 1_000_000)
 
 
 def test_one_message_may_concern_all_slices() -> None:

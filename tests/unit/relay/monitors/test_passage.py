@@ -1,7 +1,7 @@
 """A batch through the monitors together is what its messages are one by one: bytes, records, counters, state."""
 
 import struct
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -14,32 +14,25 @@ from appliance.channel.messages import Message, MonitorRow
 from appliance.relay.connections.frames import FrameReceiver, Scratch
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
-from appliance.relay.monitors import lane
 from appliance.relay.monitors.lane import Lane
 from appliance.relay.monitors.middle import Middle
 from appliance.relay.monitors.places import Place
 from appliance.relay.report import Reporter
 from appliance.ros.definitions import Definitions
-from appliance.rosmop import walks
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.logics.interface import ClockedRun, FiniteRun
-from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.runtime.context import Published
-from appliance.rosmop.slices import LIMIT
 from appliance.rosmop.syntax.errors import SpecificationError
-from appliance.rosmop.walks import FUEL, ActingWalker, SliceWalker, Walked
+from appliance.rosmop.walks import Walked
 from tests.support.examples import examples
 from tests.support.relay_memory import share
 from tests.support.stated import stated
 from tests.unit.rosmop.acting import message
-from tests.unit.rosmop.logics.driving import seeded
 from tests.unit.rosmop.random_specifications import (
-    TRIGGERS,
     Messages,
     Specifications,
     Traffic,
     definitions,
-    ways,
 )
 
 MONITORS = Path(__file__).parents[4] / "monitors"
@@ -75,7 +68,6 @@ class Monitored:
         trials: Collection[str] = (),
         restarted: bool = False,
         began: int = 1_000_000_000,
-        slices: int = LIMIT,
     ) -> None:
         self.heard = Heard()
         self.time = began
@@ -90,7 +82,7 @@ class Monitored:
         )
         self.middle.now = lambda: self.time  # type: ignore[method-assign]  # the test sets the time
         self._lanes: dict[tuple[str, str], Lane] = {}
-        self.set = MonitorSet.load(texts, known, on_fault, trials=trials, margins=True, slices=slices)
+        self.set = MonitorSet.load(texts, known, on_fault, trials=trials, margins=True)
         if together:
             self.set.write_module()
         self.middle.loaded(stated(1, [], {}, {}, restarted=restarted), self.set)
@@ -152,43 +144,19 @@ class Monitored:
         for monitor in self.set.monitors:
             state.append((monitor.name, monitor.seen, monitor.faults, monitor.held))
             names = self.set.interpreter.variables
-            slicing = monitor.code.slicing
-            of_slices = (
-                () if slicing is None else {*slicing.own, *(code for _, code, _ in slicing.parameters)}
-            )
+            state += [(name, repr(names.get(code))) for name, code in monitor.code.variables.items()]
             state += [
-                (name, repr(names.get(code)))
-                for name, code in monitor.code.variables.items()
-                if code not in of_slices
-            ]
-            state += [
-                one.run.state
-                for one in monitor.properties
-                if isinstance(one.run, FiniteRun | ClockedRun) and monitor.slices is None
+                one.run.state for one in monitor.properties if isinstance(one.run, FiniteRun | ClockedRun)
             ]
             state += [timer.due for timer in monitor.timers]
-            state += [one.run.deadline for one in monitor.properties if monitor.slices is None]
-            state += slices(monitor)
+            state += [one.run.deadline for one in monitor.properties]
         return state
 
 
-def slices(monitor: Monitor) -> list[object]:
-    """What happened last in a parametric specification, how many slices it has, and the states of those."""
-    if monitor.slices is None:
-        return []
-    state: list[object] = [monitor.slices.live, *monitor.trail]
-    for key in {repr(bound.key): bound.key for bound in monitor.trail}.values():
-        state.append([(slice_.values, states) for slice_, states in monitor.slices.standing(key)])
-    return [repr(each) for each in state]  # a NaN is not equal to itself
-
-
 def agree(texts: dict[str, str], known: Definitions, all_traffic: Iterable[Traffic], on_fault: str = "drop",
-          switched: tuple[int, str] | None = None, *, slices: int = LIMIT) -> Monitored:  # fmt: skip
+          switched: tuple[int, str] | None = None) -> Monitored:  # fmt: skip
     """The same traffic both ways; fails at the first difference."""
-    ways = [
-        Monitored(texts, known, together=together, on_fault=on_fault, slices=slices)
-        for together in (False, True)
-    ]
+    ways = [Monitored(texts, known, together=together, on_fault=on_fault) for together in (False, True)]
     try:
         for number, traffic in enumerate(all_traffic):
             for way in ways:
@@ -306,6 +274,12 @@ HARD = {
     "a timer beside": """
         s() { int n = 0; event e(int count) /plain own/Plain '{count:count}' { n++; if (n > 20) { return; } }
             event tick() every 1ms { n = 0; ROS_INFO("tick"); } }""",
+    "slices beside": """
+        s(int n) { int seen = 0; static int total = 0;
+            event e(int n) /plain own/Plain '{count:n}' { seen++; total++; if (seen > 3) { return; } }
+            event f(int n) service /serve own/Serve request '{count:n}' { total++; }
+            fsm: i [ e -> o ] o [ f -> i ] @fail { ROS_INFO("failed"); __RESET; } }
+        t() { event e(double x) /stamped own/Stamped '{x:x}' { x = total; } }""",
     "held": """
         hold s() { event e() /plain own/Plain '{}' { } }""",
     "first values that fault": """
@@ -322,187 +296,6 @@ def test_hard_cases_are_the_same_together(name: str, on_fault: str) -> None:
     for seed in range(examples(18)):
         messages = Messages(seed)
         agree({"x.rv": HARD[name]}, definitions(), [messages.traffic() for _ in range(10)], on_fault)
-
-
-PARAMETRIC = {
-    "one property": """s(std::string id) { event a(std::string id) /stamped own/Stamped '{frame:id}' { }
-        ere: a a a a @match { ROS_WARN("four"); } }""",
-    "several kinds of a message": """s(int n, double x) {
-        creation event a(int n, double x) /plain own/Plain '{count:n, x:x, kind:1}' { }
-        event b(int n, double x) /plain own/Plain '{count:n, x:x, kind:0}' { }
-        event c(double x, int n) /plain own/Plain '{count:n, x:x}' { }
-        fsm: i [ a -> o, b -> i, c -> o ] o [ a -> o, b -> p, c -> o ] p [ a -> q, c -> o ] q [ c -> o ]
-        @fail { ROS_INFO("failed"); } @q { } }""",
-    "two specifications": """s(unsigned int n) { event a(unsigned int n) /plain own/Plain '{when.sec:n}' { }
-            event b(unsigned int n) /plain own/Plain '{when.sec:n, kind:1}' { }
-            fsm: i [ a -> o, b -> o ] o [ a -> p, b -> o ] p [ a -> o, b -> q ] q [ a -> o, b -> q ] @q { } }
-        t(float y, ros::Time w) { event e(ros::Time w, float y) /plain own/Plain '{y:y, when:w}' { }
-            event f(ros::Time w, float y) /plain own/Plain '{y:y, when:w, kind:1}' { }
-            fsm: j [ e -> k, f -> l ] k [ e -> l, f -> k ] l [ e -> m ] m [ e -> k, f -> m ] @m { } @fail { } }""",
-    "past the end": """s(double v) { event a(double v) /stamped own/Stamped '{values[1]:v}' { }
-        ere: a a a @match { DROP; } }""",
-    "an action on another event": """s(int n) { int times = 0; event a(int n) /plain own/Plain '{count:n}' { }
-        event b(int n) /stamped own/Stamped '{count:n}' { times++; if (times > 3) { return; } }
-        event t() every 3ms { times = 0; } fsm: i [ a -> o, b -> i ] o [ a -> i, b -> o ] @fail { } }""",
-    "requests": """s(int n) { event a(int n) service /serve own/Serve request '{count:n}' { }
-        event b(int n) service /serve own/Serve response '{count:n}' { }
-        fsm: i [ a -> o, b -> o ] o [ a -> o, b -> p ] p [ a -> o, b -> q ] q [ a -> o ] @q { DROP; } }""",
-    "conditions": """s(int n) { static double last = 0; const double most = 2;
-        event a(int n, double x, int k) /plain own/Plain '{count:n, x:x, kind:k}' when (k != 2 && x > last - most) { }
-        event b(int n, double x) /stamped own/Stamped '{count:n, x:x}' when (x < 2) { last = x; }
-        fsm: i [ a -> o, b -> o ] o [ a -> o, b -> p ] p [ a -> q, b -> p ] q [ a -> i, b -> o ] @q { } }""",
-    "a condition that faults": """s(int n) {
-        event a(int n, int k) /plain own/Plain '{count:n, kind:k}' when (7 / k > 4) { }
-        ere: a a a a a a @match { ROS_WARN("six"); __RESET; } @fail { __RESET; } }""",
-    "drops, changes, output": """s(int n) { static int total = 0;
-        event a(int n, double x, int k) /plain own/Plain '{count:n, x:x, kind:k}' {
-            total++; if (x > 2) { x = total; } if (k == 2) { ROS_INFO("%d of %d", total, n); return; } n = n; }
-        event b(int n) /stamped own/Stamped '{count:n}' { n = n + 1; if (total % 3 == 0) { DROP; total++; } }
-        fsm: i [ a -> o, b -> o ] o [ a -> o, b -> p ] p [ a -> q, b -> p ] q [ a -> i, b -> o ] @q { DROP; } }""",
-    "actions of several on a message": """s(int n) { static int total = 0;
-        event a(int n, int k) /plain own/Plain '{count:n, kind:k}' when (k < 2) { total++; }
-        event b(int n, double x) /plain own/Plain '{count:n, x:x}' when (x < 2 + total % 3) { if (x < 0) { return; } }
-        fsm: i [ a -> o, b -> o ] o [ a -> o, b -> p ] p [ a -> q, b -> p ] q [ a -> i, b -> o ] @q { } @fail { } }
-        t(double x) { event e(double x) /plain own/Plain '{x:x}' { total = total * 2 % 1000; }
-        event f(double x, int kind) /plain own/Plain '{x:x, kind:kind}' when (kind == total % 2) { }
-        fsm: i [ e -> o, f -> o ] o [ e -> o, f -> p ] p [ e -> i, f -> p ] }""",
-}
-
-
-def together(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How often events happen in slices without the engine from now on."""
-    counts: list[int] = []
-    happened = SliceWalker.happened
-
-    def noted(walker: SliceWalker) -> Sequence[int]:
-        found = happened(walker)
-        counts.extend(found)
-        return found
-
-    monkeypatch.setattr(SliceWalker, "happened", noted)
-    return counts
-
-
-@pytest.mark.parametrize("name", PARAMETRIC)
-@pytest.mark.parametrize("on_fault", ["drop", "pass"])
-def test_slices_are_the_same_together(name: str, on_fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which there are, their states, what is told and counted, and the events that explain verdicts."""
-    happened = together(monkeypatch)
-    for seed in range(8):
-        messages = Messages(4 * seed + 3 if name == "requests" else seed)
-        traffic = [messages.traffic() for _ in range(12)]
-        again = [one for one in traffic for _ in range(3)]
-        switched = (3 * seed + 3, "s")
-        agree({"x.rv": PARAMETRIC[name]}, definitions(), again, on_fault, switched)
-    assert sum(happened) > 8
-
-
-def parametric(random: Random, seed: int) -> str:
-    """A random parametric specification with conditions and actions, and now and then another that shares with it."""
-    conditions = ("x > 1", "k != 1", "total % 3 != 1", "x > last", "7 / k > 2", "high(x) || k == 1", "mine < 2",
-                  "n + k > 1 && x < 3", "ros::Time::now().toSec() > 1.002")  # fmt: skip
-    actions = ("", "total = total + 1;", "x = x + 1;", "n = n + 1;", 'ROS_INFO("%d: %f", n, x);',
-               "if (k == 2) { DROP; }", "if (x > 2) { return; }", "last = x;", "mine = mine + 1;",
-               "x = last; last = n;",
-               'ROS_WARN_THROTTLE(0.005, "%d", total);', "total = total / k;", "k = mine;",
-               "if (high(x)) { total = 0; }",
-               "told.linear.z = total; PUBLISH(/told, geometry_msgs/Twist, told);")  # fmt: skip
-    topics = sorted(set(ways(seed)))
-
-    def events(parameter: str, count: int) -> str:
-        found = []
-        for number in range(count):
-            bound = {"n": "int", "x": "double", "k": "int"}
-            fields = {"n": "count:n", "x": "x:x", "k": "kind:k"}
-            if random.random() < 0.08:
-                del fields[parameter], bound[parameter]
-                bound["other"], fields["other"] = (
-                    ("int", "count:other") if parameter == "n" else ("double", "x:other")
-                )
-            head = ", ".join(f"{kind} {name}" for name, kind in bound.items())
-            when = f"when ({random.choice(conditions)})" if random.random() < 0.5 else ""
-            action = " ".join(random.choices(actions, k=random.choice((0, 0, 1, 1, 2))))
-            creation = "creation " if random.random() < 0.2 else ""
-            found.append(f"{creation}event e{number}({head}) {TRIGGERS[random.choice(topics)]} "
-                         f"'{{{', '.join(fields.values())}}}' {when} {{ {action} }}")  # fmt: skip
-        return "\n".join(found)
-
-    properties = (
-        "fsm: i [ e0 -> o, e1 -> o ] o [ e0 -> o, e1 -> p ] p [ e0 -> q, e1 -> p ] q [ e0 -> i, e1 -> o ] @q {%s}",
-        "ere: (e0 | e1)* e1 e1 e1 e1 e0 @match {%s}",
-        "ptltl: e1 -> (*) (e0 or e1) @violation {%s}",
-        "fsm: i [ e0 -> o, e1 -> i ] o [ e0 -> p, e1 -> i ] p [ e0 -> i ] @p {} @fail {%s __RESET;}",
-        "",
-    )
-    handlers = ("", "DROP;", "total = 7;", 'ROS_ERROR("%d", total);', "mine = 0;")
-    text = f"""s(int n) {{ static int total = 0; static double last = 0; int mine = 0; static geometry_msgs::Twist told;
-        bool high(double x) {{ return x > 2 + total % 2; }}
-        {events("n", 2)} """
-    for _ in range(random.choice((1, 1, 2))):
-        one = random.choice(properties)
-        text += one % random.choice(handlers) if one else ""
-    text += "}"
-    if random.random() < 0.3:
-        other = events("x", 2).replace("high(x)", "x > 2").replace("mine", "n")
-        text += f"t(double x) {{ int n = 0; static geometry_msgs::Twist told; {other} {properties[0] % ''} }}"
-    return text
-
-
-def test_random_slices_are_the_same_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Conditions and actions of all kinds, with few slices, switched off and on: as one by one."""
-    refused = taken = 0
-    monkeypatch.setattr(lane, "LONGEST", float("inf"))  # of a busy machine's time
-    acts = ActingWalker.walk
-
-    def counted(walker: ActingWalker, view: memoryview, position: int, *rest: Any) -> Walked | None:
-        nonlocal taken
-        found = acts(walker, view, position, *rest)
-        taken += found is None or found.position > position
-        return found
-
-    monkeypatch.setattr(ActingWalker, "walk", counted)
-    for seed in range(examples(60)):
-        random, messages = seeded(seed), Messages(seed)
-        text = parametric(random, seed)
-        traffic = [messages.traffic() for _ in range(10)]
-        again = [one for one in traffic for _ in range(random.choice((1, 3)))]
-        switched = (random.randrange(6), "s") if random.random() < 0.3 else None
-        slices = random.choice((2, 4, LIMIT))
-        try:
-            agree(
-                {"x.rv": text}, definitions(), again, random.choice(("drop", "pass")), switched, slices=slices
-            )
-        except SpecificationError:
-            refused += 1
-        except AssertionError as error:
-            raise AssertionError(f"seed {seed}: {text}") from error
-    assert refused < examples(60) // 4
-    assert taken > examples(60)
-
-
-@pytest.mark.parametrize("fuel", [FUEL, 20_000])
-def test_slices_of_many_messages_are_the_same_together(fuel: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """More than there is room to note, with a header whose seq is told, some for the engine; with little fuel, too."""
-    monkeypatch.setattr(walks, "FUEL", fuel)
-    text = """s(double x) { event a(double x) /point geometry_msgs/PointStamped '{point.x:x}' { }
-        event b(double x) /point geometry_msgs/PointStamped '{point.x:x, point.y:1}' { }
-        fsm: i [ a -> o, b -> o ] o [ a -> o, b -> p ] p [ a -> s, b -> p ] s [ a -> p, b -> q ]
-             q [ a -> o, b -> o ] @q { ROS_INFO("q"); } }"""
-    random = Random(5)  # noqa: S311  draws examples, not keys
-    traffic = []
-    for count in (1, 40, 3000, 4000, 3000):
-        bodies = [
-            message("geometry_msgs/PointStamped", header__seq=number, point__x=float(random.randrange(60)),
-                    point__y=float(random.random() < 0.02))
-            for number in range(count)
-        ]  # fmt: skip
-        frames = b"".join(struct.pack("<I", len(body)) + body for body in bodies)
-        traffic.append(Traffic("/point", frames, count))
-    happened = together(monkeypatch)
-    monitored = agree({"x.rv": text}, definitions(), traffic)
-    assert monitored.rows()[0].verdicts > 10
-    assert sum(happened) > 5000
-    assert any(event.sender.number > 0 for event in monitored.set.monitors[0].trail)
 
 
 def _shipped_traffic(seed: int) -> list[Traffic]:
