@@ -42,16 +42,14 @@ _CHANGES: Responses = {
 def routes(services: Services) -> Routes:
     """The routes."""
     router = Routes(prefix="/v1/monitors", tags=["monitors"])
-    _add_texts(router, services)
+    _add_texts(router, services.control)
     _add_revisions(router, services.control)
     _add_removals(router, services.control)
     _add_switches(router, services.control)
     return router
 
 
-def _add_texts(router: Routes, services: Services) -> None:
-    control = services.control
-
+def _add_texts(router: Routes, control: ControlLink) -> None:
     @router.post("", responses=_CHANGES)
     async def load_monitors(
         new: Annotated[NewSpecifications, body(NewSpecifications)],
@@ -69,7 +67,7 @@ def _add_texts(router: Routes, services: Services) -> None:
         expected = _expected(if_match, dry_run=dry_run)
         if dry_run:
             tried = admin.MonitorTry(new.files, new.definitions, new.signatures, expected)
-            return await _tried(services, tried, bearer)
+            return await _tried(control, tried, bearer)
         order = admin.MonitorLoad(**asdict(new), expected=expected, confirm_within=confirm_within)
         return await _replaced(control, order, bearer)
 
@@ -97,7 +95,7 @@ def _add_texts(router: Routes, services: Services) -> None:
         file = await _file_of(control, name, bearer)
         signatures = {**new.signatures, file: new.signature}
         tried = admin.MonitorTry({file: new.text}, new.definitions, signatures, expected)
-        return await _tried(services, tried, bearer)
+        return await _tried(control, tried, bearer)
 
 
 def _add_revisions(router: Routes, control: ControlLink) -> None:
@@ -169,10 +167,9 @@ def _add_switches(router: Routes, control: ControlLink) -> None:
         return await _switched(control, to.names, to, _expected(if_match), bearer)
 
 
-async def _tried(services: Services, order: admin.MonitorTry, bearer: Bearer) -> Tagged[Replaced]:
-    """A dry run."""
-    async with services.judging:
-        done = await _ordered(services.control, order, bearer)
+async def _tried(control: ControlLink, order: admin.MonitorTry, bearer: Bearer) -> Tagged[Replaced]:
+    """Answer a dry run; control and the compiler say how many there may be."""
+    done = await _ordered(control, order, bearer)
     return tagged(Replaced(**asdict(done) | {"warnings": findings_of(done.warnings)}, loaded=False))
 
 

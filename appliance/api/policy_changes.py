@@ -91,7 +91,7 @@ async def _load(services: Services, order: admin.PolicyLoad, bearer: Bearer, *, 
         raise ProblemError(412, "changed-meanwhile", text)
     live = (await ask(services.control, admin.RegistrationsWanted(), bearer)).registrations
     try:
-        async with services.judging:
+        async with services.judging if dry_run else services.ordering:
             report = await asyncio.to_thread(judge_change, order, current, live)
     except ProblemError as refusal:
         if dry_run:

@@ -17,7 +17,9 @@ from appliance.shares.table import REST_EXPORTS
 class Services:
     """The parts that the routes share; `stopping` is set when the process is to end.
 
-    `judging` bounds the policy texts that are compiled at once, `exports` those of the audit log."""
+    `judging` bounds the texts that are compiled at once to answer questions and dry runs, `ordering` those of orders,
+    which never wait for the others; `exports` bounds the exports of the audit log.
+    """
 
     settings: Settings
     control: ControlLink
@@ -26,6 +28,7 @@ class Services:
     stopping: asyncio.Event
     history: History
     judging: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+    ordering: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
     exports: Streams = field(
         default_factory=lambda: Streams(REST_EXPORTS, REST_EXPORTS, REST_EXPORTS.bounds.whole)
     )

@@ -25,14 +25,18 @@ class Child:
         *,
         said: Callable[[Any], None],
         linked: Callable[[], None] = lambda: None,
+        lost: Callable[[str], None] = lambda _reason: None,
         ring_given: Callable[[RingGiven, int], None] = lambda _given, descriptor: os.close(descriptor),
     ) -> None:
-        """`link` is the union of the messages of the link to control; `ring_given` takes over the descriptor."""
+        """`link` is the union of the messages of the link to control; `ring_given` takes over the descriptor.
+
+        `lost(reason)` is called when control closes the link, or ends.
+        """
         self._lifeline = lifeline
         self._link = link
         self._linked = linked
         self._ring_given = ring_given
-        self._control = Link(said)
+        self._control = Link(said, lost)
         self.ended = asyncio.Event()
 
     def attach(self, ready: Ready) -> None:

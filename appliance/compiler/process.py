@@ -5,9 +5,13 @@ Invariants:
 1. It has no network and no file: what it reads are the messages of its lifeline and its link to control.
 2. Texts that take more memory or processor time than there is for them end it, and nothing else.
 3. It is there while it is needed: when nobody has asked for `_IDLE_SECONDS` it ends, with exit status 0.
+4. A question ends when its budget of processor time is used up, with an answer that says so, and when control closes
+   the link: work that no process waits for any more takes no processor. A thread cannot be stopped, so the process ends
+   with it (status 0), and the supervisor starts the next one when control asks.
 """
 
 import asyncio
+import os
 import resource
 import socket
 from typing import Any
@@ -16,10 +20,13 @@ from appliance import late
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.channel.child import Child
+from appliance.shares.table import DRY_RUNS
 from appliance.specifications.files import SpecificationsRefusedError
 
 _MEMORY = 1 << 30  # bytes of addresses: its own libraries are 50 MiB of that
-_WORK_SECONDS = 60  # of processor time, for one question
+_WORK_SECONDS = 60  # of processor time, for one question of an order
+_DRY_RUN_SECONDS = DRY_RUNS.bounds.host  # the same, for a dry run
+_SPARE_SECONDS = 5  # after which the kernel ends a process that does not even answer
 _IDLE_SECONDS = 60.0
 
 
@@ -36,8 +43,9 @@ class Process:
     """Answers one question after the other."""
 
     def __init__(self, lifeline: Channel) -> None:
-        self._child = Child(lifeline, messages.CompilerLink, said=self._said)
+        self._child = Child(lifeline, messages.CompilerLink, said=self._said, lost=self._lost)
         self._asked: asyncio.Queue[_Question] = asyncio.Queue()
+        self._working = False
 
     async def run(self) -> None:
         """Work from start to end."""
@@ -49,9 +57,30 @@ class Process:
             if not asked.done():
                 asked.cancel()
                 break
-            self._child.tell(await asyncio.to_thread(answer, asked.result()))
+            await self._work(asked.result())
         ended.cancel()
         self._child.close()
+
+    async def _work(self, wanted: _Question) -> None:
+        """Answer a question, within its budget of processor time."""
+        budget = _budget(wanted)
+        ends = _used() + budget
+        self._working = True
+        work = asyncio.ensure_future(asyncio.to_thread(answer, wanted))
+        while not work.done() and (left := ends - _used()) > 0:
+            await asyncio.wait((work,), timeout=max(left, 0.05))
+        self._working = False
+        if work.done():
+            self._child.tell(work.result())
+            return
+        text = f"they take more than the {budget} s of processor time that {_purpose(wanted)} has to compile them"
+        self._child.tell(messages.CompilationRefused(wanted.number, [text]))
+        os._exit(0)
+
+    def _lost(self, _reason: str) -> None:
+        """Control closed the link: it does not wait for what is being compiled."""
+        if self._working:
+            os._exit(0)
 
     def _said(self, message: Any) -> None:
         if isinstance(message, _Question):
@@ -60,8 +89,7 @@ class Process:
 
 def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | messages.CompilationRefused:
     """What is in these texts, or all that is wrong with them; or what relays run of them."""
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    ends = int(used.ru_utime + used.ru_stime) + _WORK_SECONDS
+    ends = int(_used()) + _budget(wanted) + _SPARE_SECONDS
     resource.setrlimit(resource.RLIMIT_CPU, (ends, resource.RLIM_INFINITY))
     try:
         checking = late.load("appliance.specifications.checking")
@@ -75,3 +103,21 @@ def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | m
     except Exception as error:  # noqa: BLE001  a defect of the compiler is a reason to refuse, no more
         text = f"a defect of rosrv, please report it: {type(error).__name__}: {error}"
     return messages.CompilationRefused(wanted.number, [text])
+
+
+def _used() -> float:
+    """Seconds of processor time that this process has used."""
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def _is_dry_run(wanted: _Question) -> bool:
+    return isinstance(wanted, messages.ContentsWanted) and wanted.dry_run
+
+
+def _budget(wanted: _Question) -> int:
+    return _DRY_RUN_SECONDS if _is_dry_run(wanted) else _WORK_SECONDS
+
+
+def _purpose(wanted: _Question) -> str:
+    return "a dry run" if _is_dry_run(wanted) else "a load"

@@ -25,7 +25,12 @@ from appliance.hosts.self_service import SelfService
 from appliance.hosts.table import HostForbiddenError, HostRefusedError, HostsChangedError, UnknownHostError
 from appliance.master.reach.topic_looks import TooManyLooksError
 from appliance.specifications.files import SpecificationsRefusedError
-from appliance.specifications.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
+from appliance.specifications.monitors import (
+    DryRunUnderWayError,
+    Monitors,
+    MonitorsChangedError,
+    UnknownMonitorError,
+)
 from appliance.store.database import StoreError
 
 # The first that an error is.
@@ -35,6 +40,7 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     UnknownThingError: "unknown",
     SenselessError: "request",
     TooManyLooksError: "busy",
+    DryRunUnderWayError: "busy",
     UnknownMonitorError: "unknown",
     UnknownHostError: "unknown",
     HostForbiddenError: "forbidden",

@@ -277,6 +277,7 @@ class Parts:
             told=[told.reported] if settings.monitors_on_rosout else [],
             site_keys=settings.site_keys,
             check=base.compiler.check,
+            try_out=base.compiler.try_out,
             parts=base.compiler.parts,
         )
 

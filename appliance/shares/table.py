@@ -179,6 +179,18 @@ RECORDER_DISK = Share(
     ),
     setting="recorder.disk (one recording has an eighth of it)",
 )
+DRY_RUNS = Share(
+    "seconds of processor time of the compiler for the dry run that is under way (a host here is a token)",
+    Bounds(whole=10, host=10, strangers=0, kept=0),
+    "the dry run is refused, with the seconds; a second one of the same token is refused, those of others wait; an"
+    " order that needs the compiler (load, reload, …) ends the dry run, which is answered so",
+    "`rest call` with status 422 or 503",
+    (
+        "unit/compiler/test_process.py::test_nested_repetitions_end_with_the_budget_of_a_dry_run",
+        "unit/specifications/test_compiler.py::test_an_order_ends_a_dry_run",
+        "unit/specifications/test_monitors.py::test_a_client_has_one_dry_run_at_a_time",
+    ),
+)
 REST_CONNECTIONS = Share(
     "connections to REST, TLS handshakes included",
     Bounds(whole=512, host=64, strangers=192, kept=320),

@@ -70,6 +70,10 @@ class UnknownMonitorError(Exception):
     """There is no monitor or file of a name, or no such revision; the text says which there are."""
 
 
+class DryRunUnderWayError(Exception):
+    """A client has a dry run under way, and may have no second one."""
+
+
 class MonitorsChangedError(Exception):
     """The monitors are not as they were when a change to them was thought of; `tag` is the present one."""
 
@@ -104,12 +108,15 @@ class Monitors:
         told: Collection[Callable[[messages.MonitorEvent], None]],
         site_keys: Sequence[str],
         check: Check,
+        try_out: Check,
         parts: Parts,
     ) -> None:
+        """`check` compiles for an order, `try_out` for a dry run."""
         self.folder = folder
         self._folder = SpecificationFolder(folder)
         self.site_keys = site_keys
         self._check = check
+        self._try_out = try_out
         self._store = store
         self._trail = trail
         self.switches = Switches(enable)
@@ -118,7 +125,7 @@ class Monitors:
         )
         self._acts = 0  # switches and resumptions, ever
         self._one_change = asyncio.Lock()
-        self._one_attempt = asyncio.Lock()
+        self._attempting: set[str] = set()  # who has a dry run under way
         self._trial = Trial(store, "confirm monitors", self._go_back, (SpecificationsRefusedError,))
         self.in_force = NOTHING  # until `start`
         self.sources = Sources()
@@ -237,16 +244,21 @@ class Monitors:
                 return self._replaced(self.revision, ([], [], []))
             return await self._change(sources, who, who, request.note or "loaded", request.confirm_within)
 
-    async def attempt(self, request: admin.MonitorTry) -> answers.Tried:
-        """What a load would do; one after the other. Raises as `load`."""
-        async with self._one_attempt:
-            if request.expected not in (None, self.tag):
-                raise MonitorsChangedError(request.expected or "", self.tag)
+    async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
+        """Return what a load would do. Raises as `load`, and `DryRunUnderWayError`."""
+        if who in self._attempting:
+            raise DryRunUnderWayError("you have a dry run under way: wait for its answer, then try again")
+        if request.expected not in (None, self.tag):
+            raise MonitorsChangedError(request.expected or "", self.tag)
+        self._attempting.add(who)
+        try:
             present, revision, tag = self.sources, self.revision, self.tag
             following = present.with_files(Sources(request.files, request.definitions, request.signatures))
-            checked = await self._check(following, self.site_keys)
-            files = following.difference(present)
-            return answers.Tried(revision, tag, *files, [*checked.warnings], [*checked.monitors])
+            checked = await self._try_out(following, self.site_keys)
+        finally:
+            self._attempting.discard(who)
+        files = following.difference(present)
+        return answers.Tried(revision, tag, *files, [*checked.warnings], [*checked.monitors])
 
     async def replace(self, request: admin.MonitorReplace, who: str) -> Replaced:
         """Put a text in the place of a monitor's file. Raises `UnknownMonitorError`, and as `load`."""

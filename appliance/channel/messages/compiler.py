@@ -28,11 +28,15 @@ class Contents(msgspec.Struct, frozen=True):
 
 
 class ContentsWanted(Message):
-    """Control asks what is in these files of specifications (name to text), with these definitions of messages."""
+    """Control asks what is in these files of specifications (name to text), with these definitions of messages.
+
+    A `dry_run` has a smaller budget of processor time than an order.
+    """
 
     number: int
     files: dict[str, str]
     definitions: dict[str, str]
+    dry_run: bool = False
 
 
 class ContentsFound(Message):

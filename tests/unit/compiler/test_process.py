@@ -1,10 +1,14 @@
 """The compiler's process: what it answers, when it ends, and what it may take."""
 
 import asyncio
+import contextlib
+import os
 import resource
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +18,7 @@ from appliance.channel.channel import Channel
 from appliance.compiler import process
 from appliance.rosmop.sent import decoded_part
 from appliance.specifications.files import Sources, SpecificationsRefusedError, check, checked
+from tests.support.waiting import eventually
 
 GOOD = """a() {
     int shared;
@@ -119,7 +124,7 @@ late.load("appliance.specifications.checking")
 size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (size + {memory}, size + {memory}))
 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-process._WORK_SECONDS = {seconds}
+process._WORK_SECONDS, process._SPARE_SECONDS = {seconds}, 0
 print(process.answer(messages.ContentsWanted(1, {{"a.rv": sys.stdin.read()}}, {{}})))
 """
     done = subprocess.run(
@@ -131,3 +136,83 @@ print(process.answer(messages.ContentsWanted(1, {{"a.rv": sys.stdin.read()}}, {{
         timeout=200,
     )
     assert done.returncode != 0 or "more than the 1024 MiB of memory" in done.stdout
+
+
+def nested_repetitions(count: int) -> str:
+    """Short specifications whose automata take about a second of processor time each."""
+    formula = "(a | b)* a"
+    for _ in range(12):
+        formula = f"({formula} (a|b))"
+    events = " ".join(f"event {name}() /{name} std_msgs/Bool '{{}}' {{ }}" for name in "ab")
+    return "\n".join(f"s{number}() {{ {events} ere : {formula} @match {{ }} }}" for number in range(count))
+
+
+@contextlib.contextmanager
+def started(program: str) -> Iterator[tuple[subprocess.Popen[str], Channel, Channel]]:
+    """A compiler in a process of its own, with its lifeline and its link to control."""
+    lifeline, its_lifeline = socket.socketpair()
+    ours, theirs = socket.socketpair()
+    supervisor, control = Channel(lifeline, messages.Lifeline), Channel(ours, messages.CompilerLink)
+    running = subprocess.Popen(
+        [sys.executable, "-c", program, str(its_lifeline.fileno())],
+        pass_fds=[its_lifeline.fileno()],
+        text=True,
+        stderr=subprocess.PIPE,
+    )
+    its_lifeline.close()
+    supervisor.attach(asyncio.get_running_loop(), lambda _message, _descriptors: None, lambda: None)
+    supervisor.send(messages.LinkOpened("control", 0), (theirs.fileno(),))
+    theirs.close()
+    try:
+        yield running, supervisor, control
+    finally:
+        supervisor.close()
+        control.close()
+        running.kill()
+        running.communicate(timeout=60)
+
+
+_COMPILER = """
+import sys
+from appliance.compiler import process
+process._DRY_RUN_SECONDS = {}
+process.main(int(sys.argv[1]))
+"""
+
+
+async def test_nested_repetitions_end_with_the_budget_of_a_dry_run() -> None:
+    """A dry run of 24 kB that would take minutes is refused with its seconds, and the process ends in order."""
+    with started(_COMPILER.format(1)) as (running, _supervisor, control):
+        answers: asyncio.Queue[Any] = asyncio.Queue()
+        control.attach(
+            asyncio.get_running_loop(), lambda heard, _fds: answers.put_nowait(heard), lambda: None
+        )
+        text = nested_repetitions(118)
+        assert 22_000 < len(text) < 25_000
+        control.send(messages.ContentsWanted(4, {"a.rv": text}, {}, dry_run=True))
+        async with asyncio.timeout(100):
+            refused = await answers.get()
+        assert (refused.number, refused.findings) == (
+            4,
+            ["they take more than the 1 s of processor time that a dry run has to compile them"],
+        )
+        assert await asyncio.to_thread(running.wait, 60) == 0
+
+
+async def test_work_that_control_does_not_wait_for_ends() -> None:
+    """When control closes the link amid a dry run the process ends at once, as one that nobody needs."""
+    with started(_COMPILER.format(1000)) as (running, _supervisor, control):
+        control.send(messages.ContentsWanted(4, {"a.rv": nested_repetitions(118)}, {}, dry_run=True))
+        await asyncio.to_thread(_until_working, running.pid)
+        control.close()
+        assert await asyncio.to_thread(running.wait, 60) == 0
+
+
+def _until_working(pid: int) -> None:
+    """Return when the process has used more processor time than a start takes."""
+
+    def used() -> float:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    eventually(lambda: used() > 3.0, "it works")

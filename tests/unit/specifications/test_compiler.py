@@ -112,3 +112,53 @@ async def test_one_that_says_nothing_or_does_not_come_is_not_waited_for(
         with pytest.raises(SpecificationsRefusedError, match="the compiler does not answer"):
             await alone.check(SOURCES, ())
     assert len(nobody) == 2
+
+
+class Told:
+    """A compiler that works without end on a dry run, and answers everything else."""
+
+    def __init__(self) -> None:
+        self.heard: asyncio.Queue[Any] = asyncio.Queue()
+
+    def __call__(self, channel: Channel, wanted: Any) -> None:
+        """Take a question."""
+        self.heard.put_nowait(wanted)
+        if not wanted.dry_run:
+            finds(channel, wanted)
+
+
+async def test_an_order_ends_a_dry_run() -> None:
+    """An order is compiled at once, by another process; the dry run is refused with the reason."""
+    told = Told()
+    scene = Scene(told, told)
+    dry_run = asyncio.ensure_future(scene.compiler.try_out(SOURCES, ()))
+    assert (await told.heard.get()).dry_run
+    assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
+    with pytest.raises(SpecificationsRefusedError, match="ended, because an order needed the compiler"):
+        await dry_run
+    assert scene.calls == 2
+    scene.close()
+
+
+async def test_a_dry_run_begins_after_the_orders_and_the_dry_runs_before_it() -> None:
+    """While an order is compiled no dry run begins, and one dry run goes at a time."""
+    heard: list[tuple[Channel, Any]] = []
+    scene = Scene(*[lambda channel, wanted: heard.append((channel, wanted))] * 3)
+
+    async def until(count: int) -> None:
+        async with asyncio.timeout(20):
+            while len(heard) < count:
+                await asyncio.sleep(0)
+
+    order = asyncio.ensure_future(scene.compiler.check(SOURCES, ()))
+    await until(1)
+    dry_runs = [asyncio.ensure_future(scene.compiler.try_out(SOURCES, ())) for _ in range(2)]
+    for count in (1, 2, 3):
+        await until(count)
+        for _ in range(20):
+            await asyncio.sleep(0)
+        assert len(heard) == count
+        finds(*heard[-1])
+    assert [found.monitors for found in await asyncio.gather(order, *dry_runs)] == [{"a": "a.rv"}] * 3
+    assert [wanted.dry_run for _channel, wanted in heard] == [False, True, True]
+    scene.close()

@@ -14,7 +14,13 @@ from appliance.audit.log import AuditLog
 from appliance.channel import admin, messages
 from appliance.specifications.allocation import Allocation, Move, Resource
 from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError, check
-from appliance.specifications.monitors import Monitors, MonitorsChangedError, UnknownMonitorError
+from appliance.specifications.monitors import (
+    DryRunUnderWayError,
+    Monitors,
+    MonitorsChangedError,
+    UnknownMonitorError,
+)
+from appliance.specifications.revisions import Check
 from appliance.store.state import StateStore
 from tests.support.audit import HeardTrail
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
@@ -47,6 +53,7 @@ class Desk:
         self.away = False
         self.carried_out = asyncio.Event()
         self.carried_out.set()
+        self.try_out: Check = here
 
     async def monitors(
         self,
@@ -71,6 +78,7 @@ class Desk:
             told=[],
             site_keys=site_keys,
             check=here,
+            try_out=self.try_out,
             parts=parts_here,
         )
         await relay.monitors.start(restarted=restarted)
@@ -128,6 +136,28 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
     desk.log.close()
 
 
+async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
+    """A second dry run of the same token is refused, that of another token is not; then it may have another one."""
+    begun, goes_on = asyncio.Event(), asyncio.Event()
+
+    async def slow(sources: Sources, site_keys: Sequence[str]) -> Checked:
+        begun.set()
+        await goes_on.wait()
+        return await here(sources, site_keys)
+
+    desk.try_out = slow
+    monitors = await desk.monitors()
+    tried = admin.MonitorTry({"b.rv": B})
+    first = asyncio.ensure_future(monitors.attempt(tried, "eve"))
+    await begun.wait()
+    with pytest.raises(DryRunUnderWayError, match="you have a dry run under way"):
+        await monitors.attempt(tried, "eve")
+    other = asyncio.ensure_future(monitors.attempt(tried, "adam"))
+    goes_on.set()
+    assert [(await one).added for one in (first, other)] == [["b.rv"]] * 2
+    assert (await monitors.attempt(tried, "eve")).added == ["b.rv"]
+
+
 async def test_the_folder_is_read_at_start_and_what_was_loaded_survives(desk: Desk) -> None:
     """The same folder again is no new revision; an operator's revision stays until `reload`."""
     first = await desk.monitors()
@@ -168,13 +198,15 @@ async def test_a_try_says_what_a_load_would_do_and_changes_nothing(desk: Desk) -
     monitors = await desk.monitors()
     before, sent = monitors.tag, len(desk.sent)
     (text,) = monitors.sources.files.values()
-    tried = await monitors.attempt(admin.MonitorTry({"a.rv": text + " ", "b.rv": B}, expected=before))
+    tried = await monitors.attempt(admin.MonitorTry({"a.rv": text + " ", "b.rv": B}, expected=before), "eve")
     assert (tried.added, tried.changed, tried.removed, tried.monitors) == (["b.rv"], ["a.rv"], [], ["a", "b"])
-    assert (await monitors.attempt(admin.MonitorTry({"a.rv": text}))).changed == []
+    assert (await monitors.attempt(admin.MonitorTry({"a.rv": text}), "eve")).changed == []
     with pytest.raises(SpecificationsRefusedError, match=r"c\.rv:1:20: error"):
-        await monitors.attempt(admin.MonitorTry({"c.rv": "c() { event e() /x nobody/Knows '{}' { } }"}))
+        await monitors.attempt(
+            admin.MonitorTry({"c.rv": "c() { event e() /x nobody/Knows '{}' { } }"}), "eve"
+        )
     with pytest.raises(MonitorsChangedError):
-        await monitors.attempt(admin.MonitorTry({"b.rv": B}, expected="9.9"))
+        await monitors.attempt(admin.MonitorTry({"b.rv": B}, expected="9.9"), "eve")
     assert (monitors.tag, len(desk.sent)) == (before, sent)
 
 
