@@ -102,7 +102,9 @@ class Explained(msgspec.Struct, frozen=True, kw_only=True):
     ]
     lost: list[LostRule]
     node: Annotated["Explained | None", told("the name that it gives, where a node is needed")]
-    command: Annotated["Explained | None", told("the command `lookupService`, for a call of a service")]
+    command: Annotated[
+        "Explained | None", told("the command with which it is done: `lookupService`, `getParam`, `setParam`")
+    ]
     allowed: Annotated[bool, told("the answer to the whole call")]
 
 

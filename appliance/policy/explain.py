@@ -93,7 +93,7 @@ def render(explanation: Explanation) -> Iterator[str]:
         if other.request.category is Category.NODE:
             yield "and the node rule, because this call makes a node part of the graph:"
         else:
-            yield f"and the rule for {other.request.resource}, with which a client learns where the service is:"
+            yield f"and the rule for {other.request.resource}, the call with which it is done:"
         yield from ("  " + line for line in _render_one(other))
     if explanation.also:
         yield f"together: {'allowed' if explanation.allowed else 'denied'}"

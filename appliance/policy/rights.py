@@ -7,7 +7,7 @@ of a deed that a person names (`publish /cmd_vel`), `decide` makes one decision 
 A right is a question to one section. All must be granted:
 
 1. the deed itself: a topic, a service, or the call as a command;
-2. for a call of a service, the command `lookupService`: a client learns with it where the service is;
+2. the command that carries it out, where that has a rule of its own (`COMMAND_FOR`);
 3. for a call that is about a parameter, reading or writing that, with what is below it and what it takes the place of;
 4. for what makes a node part of the graph, its name.
 """
@@ -40,6 +40,9 @@ _TOUCHES = {
     "setParam": Category.WRITE,
     "deleteParam": Category.WRITE,
 }
+COMMAND_FOR = {Category.CALL: "lookupService", Category.READ: "getParam", Category.WRITE: "setParam"}
+"""The command with which a node calls a service, reads and writes a parameter."""
+
 _NODE_CATEGORIES = frozenset({Category.PUBLISH, Category.SUBSCRIBE, Category.OFFER})
 _NODE_COMMANDS = frozenset({"subscribeParam", "unsubscribeParam"})
 _TELLS_NOTHING = frozenset({"unsubscribeParam"})
@@ -103,8 +106,8 @@ def rights_to_keep(request: Request, call: str, resource: str, *, namespace: boo
 def rights_of(request: Request, touched: Iterable[Right] = ()) -> list[Right]:
     """Everything that a deed needs, with what it touches."""
     rights = [Right(request)]
-    if request.category is Category.CALL:
-        rights.append(Right(_of(request, Category.COMMAND, "lookupService")))
+    if (command := COMMAND_FOR.get(request.category)) is not None:
+        rights.append(Right(_of(request, Category.COMMAND, command)))
     rights += touched
     if needs_node(request):
         rights.append(Right(_of(request, Category.NODE, request.caller_id)))
