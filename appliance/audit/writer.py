@@ -85,7 +85,7 @@ class ChainWriter:
                 self._connection.close()
                 raise
         except BaseException:
-            os.close(self._lock)
+            self._let_go()
             raise
 
     def _read_head(self) -> None:
@@ -317,7 +317,11 @@ class ChainWriter:
         try:
             self._connection.close()
         finally:
-            os.close(self._lock)
+            self._let_go()
+
+    def _let_go(self) -> None:
+        os.close(self._lock)
+        self._lock = -1
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

@@ -70,6 +70,7 @@ _OWN, _ADMIN = "own", "admin"
 _SWITCH_SECONDS = 0.001
 _GARBAGE = 10_000  # objects more than at the last look for garbage: records that wait for the log are none
 _SAVE_SECONDS = 1.0
+_TASKS_SECONDS = 0.4
 _CLOSE_SECONDS = 1.2  # of the state, and of the log: in three seconds the supervisor ends who has not ended
 _WARNINGS = 100  # of the policy, that a start tells
 _RESERVED_SHARES = AUDIT_RESERVE.bounds.whole // AUDIT_RESERVE.bounds.host  # of a host, in the disk's reserve
@@ -327,13 +328,12 @@ class _Control:
 
     async def _end(self) -> None:
         base, parts = self._base, self._parts
-        for task in self._tasks:
-            task.cancel()
         base.doors.close()
         parts.faces.close_all()
         parts.reminders.close()
         parts.delivery.close()
         parts.rosmaster.close()
+        await _end_others(_TASKS_SECONDS)  # requests write state, also while they end
         base.trail.happened("appliance stopped", "control ended in an orderly way")
         base.store.save_parameters(parts.parameters.tree)
         base.store.close(_CLOSE_SECONDS)
@@ -421,6 +421,15 @@ class _Control:
             self._parameters_dirty.clear()
             self._base.store.save_parameters(self._parts.parameters.tree)
             await asyncio.sleep(_SAVE_SECONDS)
+
+
+async def _end_others(seconds: float) -> None:
+    """Cancel every other task, and wait so long at most until they have ended."""
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in others:
+        task.cancel()
+    if others:
+        await asyncio.wait(others, timeout=seconds)
 
 
 async def _reload_policy(policies: Policies) -> None:

@@ -16,7 +16,8 @@ import errno
 import os
 import struct
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,19 +30,35 @@ Statement = tuple[str, Parameters]
 _LENGTH = struct.Struct(">I")
 
 
+class WriteAheadClosedError(OSError):
+    """The file was used after `close`."""
+
+
 class WriteAhead:
-    """The file at `path`. Raises `OSError` when it cannot be opened."""
+    """The file at `path`. Raises `OSError` when it cannot be opened.
+
+    Any thread may use it. The number of its descriptor is read under the lock alone: `close` waits for a write that is
+    under way, and every later use raises `WriteAheadClosedError`. So nothing is written to a file that gets the number.
+    """
 
     def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
+        self._path = path
+        self._open_descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
         self._encoder = msgspec.msgpack.Encoder()
         self._lock = threading.Lock()
         self._waiting = 0  # statements in the file that the database does not have
 
+    @contextmanager
+    def _descriptor(self) -> Iterator[int]:
+        with self._lock:
+            if self._open_descriptor < 0:
+                raise WriteAheadClosedError(errno.EBADF, "the state is closed already", str(self._path))
+            yield self._open_descriptor
+
     def left(self) -> list[Statement]:
         """What an earlier process could not bring to the database; a torn last statement was never answered for."""
-        size = os.fstat(self._descriptor).st_size
-        data = os.pread(self._descriptor, size, 0)
+        with self._descriptor() as descriptor:
+            data = os.pread(descriptor, os.fstat(descriptor).st_size, 0)
         decoder = msgspec.msgpack.Decoder(tuple[str, list[Any]])
         statements: list[Statement] = []
         position = 0
@@ -58,28 +75,37 @@ class WriteAhead:
         """Keep statements, by one write. Raises `OSError` when the disk is full."""
         bodies = [self._encoder.encode(statement) for statement in statements]
         data = b"".join([_LENGTH.pack(len(body)) + body for body in bodies])
-        with self._lock:
+        with self._descriptor() as descriptor:
             self._waiting += len(statements)
-            written = os.write(self._descriptor, data)
+            written = os.write(descriptor, data)
             if written < len(data):
-                os.ftruncate(self._descriptor, os.fstat(self._descriptor).st_size - written)
+                os.ftruncate(descriptor, os.fstat(descriptor).st_size - written)
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def taken(self, count: int) -> None:
         """The database has the `count` oldest statements; the file is emptied when those were all."""
-        with self._lock:
+        with self._descriptor() as descriptor:
             self._waiting -= count
             if not self._waiting:
-                os.ftruncate(self._descriptor, 0)
+                os.ftruncate(descriptor, 0)
 
     def clear(self) -> None:
         """The database has everything."""
-        os.ftruncate(self._descriptor, 0)
+        with self._descriptor() as descriptor:
+            os.ftruncate(descriptor, 0)
 
     def sync(self) -> None:
-        """Have the disk hold the file as it is now. Raises `OSError`."""
-        os.fsync(self._descriptor)
+        """Flush the file to the disk; others may append meanwhile. Raises `OSError`."""
+        with self._descriptor() as descriptor:
+            own = os.dup(descriptor)
+        try:
+            os.fsync(own)
+        finally:
+            os.close(own)
 
     def close(self) -> None:
-        """Close the file."""
-        os.close(self._descriptor)
+        """Close the file once nothing uses it; closing it again does nothing."""
+        with self._lock:
+            if self._open_descriptor >= 0:
+                os.close(self._open_descriptor)
+                self._open_descriptor = -1

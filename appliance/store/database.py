@@ -82,6 +82,8 @@ class Database:
             raise StoreError(f"{path.with_suffix('.ahead')}: {error}") from error
         self._gathered: _Gathered | None = None
         self._queue: queue.SimpleQueue[_Queued | Callable[[], None] | None] = queue.SimpleQueue()
+        self._order = threading.Lock()  # statements are in the file ahead as they are in the queue
+        self._closed = False
         self._closing = threading.Event()
         self._hurry = threading.Event()
         self._thread = threading.Thread(target=self._write, name="store", daemon=True)
@@ -106,7 +108,7 @@ class Database:
     def submit(self, sql: str, parameters: Parameters = (), *, ahead: bool = True) -> None:
         """Queue one statement; when this returns it outlasts the process (unless not `ahead`: for large values).
 
-        Of an INSERT the row stands at the end.
+        Of an INSERT the row stands at the end. Raises `StoreError` after `close`, as all do that submit.
         """
         statement = _Queued(sql, parameters, ahead)
         gathered = self._gathered
@@ -132,13 +134,21 @@ class Database:
     def _keep(self, statements: list[_Queued]) -> None:
         statements = list(_joined(statements))
         ahead = [(statement.sql, statement.parameters) for statement in statements if statement.ahead]
-        if ahead:
-            try:
-                self._ahead.append(ahead)
-            except OSError as error:
-                self._fail(f"{self._path.with_suffix('.ahead')}: {error}")
-        for statement in statements:
-            self._queue.put(statement)
+        with self._order:
+            self._require_open()
+            if ahead:
+                try:
+                    self._ahead.append(ahead)
+                except OSError as error:
+                    self._fail(f"{self._path.with_suffix('.ahead')}: {error}")
+            for statement in statements:
+                self._queue.put(statement)
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise StoreError(
+                f"{self._path}: the appliance is stopping, and this change came too late to be kept"
+            )
 
     def put(self, table: str, *row: Parameter, ahead: bool = True) -> None:
         """Queue a row of a table, in the place of the one that has its key; see `submit`."""
@@ -172,17 +182,24 @@ class Database:
             with contextlib.suppress(RuntimeError):  # the loop has ended: nobody waits any more
                 loop.call_soon_threadsafe(tell)
 
-        self._queue.put(call_back)
+        with self._order:
+            self._require_open()
+            self._queue.put(call_back)
         self._hurry.set()
         while not (await asyncio.wait([done], timeout=_SETTLE_SECONDS))[0]:
             if self._failing:
                 raise StoreError(f"{self._failing}; make room: until then a restart undoes what was ordered")
 
     def close(self, seconds: float | None = None) -> None:
-        """Write what is queued, within so many seconds (None: however long it takes), and close the file."""
+        """Write what is queued, within so many seconds (None: however long it takes), and close the file.
+
+        Nothing is taken any more from the beginning of this on.
+        """
+        with self._order:
+            self._closed = True
+            self._queue.put(None)
         self._closing.set()
         self._hurry.set()
-        self._queue.put(None)
         self._thread.join(seconds)
         if self._thread.is_alive():
             self._failed(f"{self._path}: still being written after {seconds:g} s; {_LEFT}")

@@ -138,6 +138,7 @@ class StateDirectory:
         self.config.unlink(missing_ok=True)
         os.ftruncate(self._lock, 0)
         os.close(self._lock)
+        self._lock = -1
 
     def _take_lock(self) -> None:
         try:
@@ -145,6 +146,7 @@ class StateDirectory:
         except BlockingIOError as error:
             owner = os.pread(self._lock, 20, 0).decode("ascii", "replace").strip() or "unknown"
             os.close(self._lock)
+            self._lock = -1
             raise StartError(
                 f"an appliance uses the state directory {self.path} already (process {owner}): "
                 f"stop it, or name another directory with --state DIR"

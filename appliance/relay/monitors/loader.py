@@ -50,17 +50,20 @@ class Loader:
         self._waiting.clear()
         if self._thread is not None:
             self._thread.join()
-            self._loop.unwatch(self._wake)
-            os.close(self._wake)
+            self._close_wake()
             self._thread = None
 
     def _begin(self) -> None:
-        if self._wake < 0:
-            sys.setswitchinterval(_SWITCH_SECONDS)
+        sys.setswitchinterval(_SWITCH_SECONDS)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._loop.watch(self._wake, READ, self._ready)
         self._thread = threading.Thread(target=self._work, args=(self._waiting[0], self._wake), daemon=True)
         self._thread.start()
+
+    def _close_wake(self) -> None:
+        self._loop.unwatch(self._wake)
+        os.close(self._wake)
+        self._wake = -1
 
     def _work(self, message: SpecificationsStated, wake: int) -> None:
         self._result = self.load(message)
@@ -69,8 +72,7 @@ class Loader:
     def _ready(self, _events: int) -> None:
         if self._thread is not None:
             self._thread.join()
-        self._loop.unwatch(self._wake)
-        os.close(self._wake)
+        self._close_wake()
         self._thread = None
         self._done(self._waiting.popleft(), self._result)
         if self._waiting and self._thread is None:  # `done` may have brought others, and begun

@@ -1,5 +1,6 @@
 """What control does before it serves again."""
 
+import asyncio
 import ipaddress
 from pathlib import Path
 from types import SimpleNamespace
@@ -7,7 +8,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.control.process import _restore
+from appliance.control.process import _end_others, _restore
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
 from appliance.master.reach.faces import Faces
@@ -64,3 +65,30 @@ async def test_what_comes_back_is_decided_by_the_policy_in_force(tmp_path: Path)
     await _restore(cast(Any, base), cast(Any, parts))
     store.close()
     assert decided == [("the new policy", ["/secret"])]
+
+
+def test_what_is_under_way_at_the_end_is_written_before_the_state_is_closed(tmp_path: Path) -> None:
+    """A request that changes state while it is being ended does so before the store is closed, and is kept."""
+    store = StateStore(tmp_path, failed=fail)
+
+    async def scenario() -> bool:
+        under_way = asyncio.Event()
+
+        async def request() -> None:
+            try:
+                under_way.set()
+                await asyncio.Event().wait()
+            finally:
+                await asyncio.sleep(0)
+                store.database.put("setting", "ended", "yes")
+
+        task = asyncio.create_task(request())
+        await under_way.wait()
+        await _end_others(30)
+        return task.done()
+
+    assert asyncio.run(scenario())
+    store.close()
+    again = StateStore(tmp_path, failed=fail)
+    assert again.database.query("SELECT value FROM setting WHERE name = 'ended'") == [("yes",)]
+    again.close()

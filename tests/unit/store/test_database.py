@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.store.ahead import Statement, WriteAhead
+from appliance.store import ahead as ahead_module
+from appliance.store.ahead import Statement, WriteAhead, WriteAheadClosedError
 from appliance.store.database import Database, StoreError
 from tests.support.requirements import need_root
 
@@ -283,3 +284,96 @@ def test_a_statement_torn_by_the_crash_is_left_out(tmp_path: Path) -> None:
     assert database.query("SELECT name FROM thing") == [("whole",)]
     database.close()
     assert (tmp_path / "state.ahead").stat().st_size == 0
+
+
+class _Gate:
+    """`os` and a lock for one file: a write waits until another thread closes the file, or waits to close it."""
+
+    def __init__(self) -> None:
+        self.writing, self.closing = threading.Event(), threading.Event()
+        self._lock = threading.Lock()
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(os, name)
+
+    def __enter__(self) -> None:
+        if not self._lock.acquire(blocking=False):
+            self.closing.set()
+            self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+    def Lock(self) -> "_Gate":  # noqa: N802  the name in `threading`
+        """Be the lock."""
+        return self
+
+    def write(self, descriptor: int, data: bytes) -> int:
+        """Write when another thread wants to close the file."""
+        self.writing.set()
+        assert self.closing.wait(30)
+        return os.write(descriptor, data)
+
+    def close(self, descriptor: int) -> None:
+        """Close it, and put another file in its place."""
+        os.close(descriptor)
+        self.other = os.open("another", os.O_RDWR | os.O_CREAT)  # the lowest number that is free
+        self.closing.set()
+
+
+def test_closing_waits_for_a_write_that_is_under_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread that has the descriptor's number writes to that file, also if another thread closes it meanwhile."""
+    gate = _Gate()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ahead_module, "os", gate)
+    monkeypatch.setattr(ahead_module, "threading", gate)
+    ahead = WriteAhead(tmp_path / "state.ahead")
+    writing = threading.Thread(target=ahead.append, args=([("INSERT", ())],))
+    writing.start()
+    assert gate.writing.wait(30)
+    ahead.close()
+    writing.join(30)
+    os.close(gate.other)
+    assert (tmp_path / "another").read_bytes() == b""
+    assert (tmp_path / "state.ahead").stat().st_size > 0
+
+
+def test_a_closed_file_of_statements_refuses_every_use(tmp_path: Path) -> None:
+    """After `close` each use is an error that names the file; a file that got the number stays as it is."""
+    ahead = WriteAhead(tmp_path / "state.ahead")
+    ahead.close()
+    with (tmp_path / "another").open("wb") as another:
+        another.write(b"untouched")
+        another.flush()
+        for use in (lambda: ahead.append([("INSERT", ())]), ahead.clear, ahead.sync, lambda: ahead.taken(0)):
+            with pytest.raises(WriteAheadClosedError, match=r"closed already.*state\.ahead"):
+                use()
+        ahead.close()
+    assert (tmp_path / "another").read_bytes() == b"untouched"
+
+
+def test_a_change_is_kept_or_refused_however_it_meets_the_end(tmp_path: Path) -> None:
+    """While the database closes, each thread that submits learns which of its rows are kept, and these are there."""
+    kept: list[str] = []
+    database = Database(tmp_path / "state.db", SCHEMA, failed=pytest.fail)
+    begin = threading.Barrier(9)
+
+    def submit(name: int) -> None:
+        begin.wait(30)
+        with contextlib.suppress(StoreError):
+            for number in range(3_000):
+                row = f"{name} {number}"
+                database.submit("INSERT OR REPLACE INTO thing VALUES (?, 1)", (row,), ahead=bool(number % 2))
+                kept.append(row)
+
+    threads = [threading.Thread(target=submit, args=(name,)) for name in range(8)]
+    for thread in threads:
+        thread.start()
+    begin.wait(30)
+    database.close()
+    for thread in threads:
+        thread.join(30)
+    with pytest.raises(StoreError, match="too late to be kept"):
+        asyncio.run(database.settled())
+    with contextlib.closing(sqlite3.connect(tmp_path / "state.db")) as reader:
+        assert {name for (name,) in reader.execute("SELECT name FROM thing")} == set(kept)

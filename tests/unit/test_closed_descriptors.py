@@ -1,0 +1,43 @@
+"""The number of a descriptor that was closed is not kept: another file gets it next."""
+
+import ast
+from pathlib import Path
+
+APPLIANCE = Path(__file__).parents[2] / "appliance"
+
+
+def kept_after_closing(source: str) -> list[int]:
+    """The lines where a function closes the descriptor in an attribute and leaves its number there."""
+    found = []
+    for function in ast.walk(ast.parse(source)):
+        if not isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        nodes = list(ast.walk(function))
+        replaced = {
+            ast.unparse(target)
+            for node in nodes
+            if isinstance(node, ast.Assign)
+            for target in node.targets
+            if isinstance(node.value, ast.UnaryOp | ast.Constant)
+        }
+        found += [
+            node.lineno
+            for node in nodes
+            if isinstance(node, ast.Call)
+            and ast.unparse(node.func) == "os.close"
+            and isinstance(node.args[0], ast.Attribute)
+            and ast.unparse(node.args[0]) not in replaced
+        ]
+    return found
+
+
+def test_no_object_keeps_the_number_of_a_closed_descriptor() -> None:
+    """A function that closes an attribute sets it to -1 or None: a later use fails, and reaches no other file."""
+    found = [
+        f"{path.relative_to(APPLIANCE)}:{line}"
+        for path in sorted(APPLIANCE.rglob("*.py"))
+        for line in kept_after_closing(path.read_text(encoding="utf-8"))
+    ]
+    assert found == []
+    assert kept_after_closing("def close(self):\n    os.close(self._lock)") == [2]
+    assert not kept_after_closing("def close(self):\n    os.close(self._lock)\n    self._lock = -1")
