@@ -359,6 +359,7 @@ class Engine:
             sock,
             key,
             host,
+            payer=self.ports.payer(host),
             anteroom=self._anteroom,
             introduced=self._introduced,
             failed=self._visitor_failed,
@@ -517,7 +518,8 @@ class Engine:
             self._anteroom.leave(farewell)
             self.ports.left(visitor.host)
 
-        farewell = Farewell(self._loop, sock, reason, self._limits.farewell, ended)
+        payer = self.ports.payer(visitor.host)
+        farewell = Farewell(self._loop, sock, reason, self._limits.farewell, ended, payer=payer)
         if farewell.live:
             self.farewells.add(farewell)
             self._anteroom.enter(farewell, visitor.host)

@@ -3,10 +3,18 @@
 Why not asyncio: one frame per read costs a callback, a transport and a future's worth of Python; raw epoll
 with one bound method per descriptor halves the delay a relayed message sees.
 
+Processor time is a quota. A descriptor is watched for a *payer*: a host, all unknown hosts together, or new
+connections. The relay's own descriptors (control, lifeline) have no payer. Each payer has an epoll of its own inside
+the loop's, so the kernel reports which payers have something ready, however many descriptors each of them has.
+Payers are served by deficit round robin in its continuous form: the payer that has used the least processor time goes
+first, for at most `QUANTUM`; credit for idle time is one quantum.
+
 Invariants:
 - A handler is never called for a descriptor that was unwatched earlier in the same turn, and a descriptor
   closed through `discard` is closed only at the end of the turn, so its number cannot mean another socket
-  within it.
+  within it. An event that waits for the payer's next turn is forgotten when the descriptor is unwatched or changed.
+- A turn calls the relay's own handlers first. It begins no further handler or timer after `QUANTUM`, so it lasts that
+  long and the time of one handler. Handlers with much to do stop when the quantum is `over` and call `later`.
 - A handler that raises is a defect; the exception ends the process and the supervisor starts another.
 """
 
@@ -15,11 +23,29 @@ import itertools
 import select
 import socket
 import time
+from collections import deque
 from collections.abc import Callable
+
+from appliance.shares.table import RELAY_TURN
 
 READ = select.EPOLLIN
 WRITE = select.EPOLLOUT
 HANGUP = select.EPOLLRDHUP
+
+SYSTEM = ""
+"""The payer of the relay's own descriptors: they are always served first."""
+
+UNKNOWN = "unknown hosts"
+"""The payer for all hosts without a registration."""
+
+ACCEPTING = "new connections"
+"""The payer for listening sockets."""
+
+QUANTUM = RELAY_TURN.bounds.host * 1000
+"""Nanoseconds of processor time that a payer gets in one go."""
+
+_PAYERS = 512
+"""Payers with an epoll of their own; later ones share that of unknown hosts."""
 
 # Python takes memory for so many each time: for more of them not from where that is quick
 _EVENTS_PER_TURN = 64
@@ -41,31 +67,77 @@ class Timer:
         self.callback = None
 
 
-class Loop:
-    """Watches descriptors and timers until `stop`."""
+class _Payer:
+    """One class of the quota: its epoll, what waits for its next turn, and the processor time that it has used."""
 
-    def __init__(self) -> None:
+    __slots__ = ("epoll", "events", "later", "later_first", "name", "spent", "watched")
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.spent = 0
+        self.epoll = select.epoll()
+        self.watched = 0
+        self.events: dict[int, int] = {}
+        self.later: deque[Callable[[], None]] = deque()
+        self.later_first = False
+
+    @property
+    def waits(self) -> bool:
+        """Whether something is left from its last turn."""
+        return bool(self.later or self.events)
+
+
+class Loop:
+    """Watches descriptors and timers until `stop`. `processor_time` returns nanoseconds."""
+
+    def __init__(self, processor_time: Callable[[], int] = time.thread_time_ns) -> None:
         self._epoll = select.epoll()
         self._handlers: dict[int, Handler] = {}
+        self._paid_by: dict[int, _Payer] = {}
+        self._payers: dict[str, _Payer] = {}
+        self._by_epoll: dict[int, _Payer] = {}
+        self._waiting: dict[str, _Payer] = {}
+        self._floor = 0  # the least that a payer with something to do has used
+        self._room = _EVENTS_PER_TURN
         self._timers: list[tuple[float, int, Timer]] = []
         self._order = itertools.count()
         self._discarded: list[socket.socket] = []
         self._running = False
+        self._processor_time = processor_time
+        self._since = processor_time()
         self.clock = time.monotonic
 
-    def watch(self, descriptor: int, events: int, handler: Handler) -> None:
-        """Call `handler(events)` whenever one of `events` is there (level-triggered)."""
-        self._epoll.register(descriptor, events)
+    def watch(self, descriptor: int, events: int, handler: Handler, payer: str = SYSTEM) -> None:
+        """Call `handler(events)` whenever one of `events` is there (level-triggered), at the cost of the payer."""
+        if payer == SYSTEM:
+            self._epoll.register(descriptor, events)
+        else:
+            found = self._payer(payer)
+            found.epoll.register(descriptor, events)
+            found.watched += 1
+            self._paid_by[descriptor] = found
         self._handlers[descriptor] = handler
 
     def change(self, descriptor: int, events: int) -> None:
         """Wait for other events on a watched descriptor; errors and hang-ups are always reported."""
-        self._epoll.modify(descriptor, events)
+        payer = self._paid_by.get(descriptor)
+        if payer is None:
+            self._epoll.modify(descriptor, events)
+        else:
+            payer.epoll.modify(descriptor, events)
+            payer.events.pop(descriptor, None)
 
     def unwatch(self, descriptor: int) -> None:
         """No handler is called for the descriptor any more; unknown descriptors are fine."""
-        if self._handlers.pop(descriptor, None) is not None:
+        if self._handlers.pop(descriptor, None) is None:
+            return
+        payer = self._paid_by.pop(descriptor, None)
+        if payer is None:
             self._epoll.unregister(descriptor)
+            return
+        payer.epoll.unregister(descriptor)
+        payer.events.pop(descriptor, None)
+        payer.watched -= 1
 
     def discard(self, sock: socket.socket) -> None:
         """Unwatch a socket now and close it at the end of this turn."""
@@ -79,6 +151,24 @@ class Loop:
         heapq.heappush(self._timers, (self.clock() + seconds, next(self._order), timer))
         return timer
 
+    def later(self, callback: Callable[[], None], payer: str) -> None:
+        """Call `callback` once, when it is the payer's turn again."""
+        found = self._payer(payer)
+        found.later.append(callback)
+        self._waiting[payer] = found
+
+    def used(self) -> int:
+        """Return the processor time that the running handler has used, in nanoseconds."""
+        return self._processor_time() - self._since
+
+    def over(self) -> bool:
+        """Whether the quantum of the running handler is used up; then it leaves the rest for `later`."""
+        return self.used() >= QUANTUM
+
+    def charge(self, payer: str, used: int) -> None:
+        """Charge this processor time to a payer, besides the one whose handler runs."""
+        self._payer(payer).spent += used
+
     def stop(self) -> None:
         """End `run` after this turn."""
         self._running = False
@@ -90,35 +180,148 @@ class Loop:
             self.turn(_LONGEST_WAIT)
 
     def turn(self, longest: float) -> None:
-        """Wait for at most `longest` seconds, then call what is due."""
+        """Wait for at most `longest` seconds, then call what is due, for a quantum."""
         timers = self._timers
         if timers:
             left = timers[0][0] - self.clock()
             if left < longest:
                 longest = left if left > 0 else 0
-        for descriptor, events in self._epoll.poll(longest, _EVENTS_PER_TURN):
-            handler = self._handlers.get(descriptor)
-            if handler is not None:
-                handler(events)
+        waiting = self._waiting
+        found = self._epoll.poll(0 if waiting else longest, self._room)
+        if len(found) == 1 and not waiting:
+            number, events = found[0]
+            payer = self._by_epoll.get(number)
+            if payer is None:
+                self._handlers[number](events)
+                self._since = self._processor_time()
+            else:
+                payer.spent = max(payer.spent, self._floor - QUANTUM)
+                self._serve(payer)
+                self._floor = max(self._floor, payer.spent)
+        elif found or waiting:
+            self._serve_many(found)
         if timers and timers[0][0] <= self.clock():
             self._call_due()
         if self._discarded:
             self._close_discarded()
 
     def close(self) -> None:
-        """Release the epoll descriptor and every discarded socket."""
+        """Release the epoll descriptors and every discarded socket."""
         self._close_discarded()
         self._handlers.clear()
         self._epoll.close()
+        for payer in self._payers.values():
+            payer.epoll.close()
+
+    def _payer(self, name: str) -> _Payer:
+        payer = self._payers.get(name)
+        if payer is not None:
+            return payer
+        if len(self._payers) >= _PAYERS and name not in {UNKNOWN, ACCEPTING}:
+            self._forget_idle()
+            if len(self._payers) >= _PAYERS:
+                return self._payer(UNKNOWN)
+        payer = self._payers[name] = _Payer(name)
+        number = payer.epoll.fileno()
+        self._by_epoll[number] = payer
+        self._epoll.register(number, READ)
+        return payer
+
+    def _forget_idle(self) -> None:
+        """Forget payers without descriptors that owe nothing."""
+        for payer in list(self._payers.values()):
+            if not payer.watched and not payer.waits and payer.spent <= self._floor:
+                del self._payers[payer.name], self._by_epoll[payer.epoll.fileno()]
+                payer.epoll.close()
+
+    def _serve_many(self, found: list[tuple[int, int]]) -> None:
+        """Call the relay's own handlers, then serve the payers that have used least, until a quantum is over."""
+        ready = dict(self._waiting)
+        for number, events in found:
+            payer = self._by_epoll.get(number)
+            if payer is not None:
+                ready[payer.name] = payer
+            elif (handler := self._handlers.get(number)) is not None:
+                handler(events)
+        # Who is not among so many is among the next ones: the kernel reports them in turn.
+        if len(found) == self._room:
+            self._room *= 2
+        elif len(found) < self._room // 4:
+            self._room = max(_EVENTS_PER_TURN, self._room // 2)
+        self._since = began = self._processor_time()
+        for payer in ready.values():
+            payer.spent = max(payer.spent, self._floor - QUANTUM)
+        if not ready:
+            return
+        in_order = sorted(ready.values(), key=_spent)
+        least = in_order[0].spent
+        for payer in in_order:
+            if payer.spent - least > QUANTUM or self._since - began >= QUANTUM:
+                break  # whoever has used more waits for those that may be ready again
+            self._serve(payer)
+        self._floor = max(self._floor, min(map(_spent, in_order)))
+
+    def _serve(self, payer: _Payer) -> None:
+        """Serve one payer for a quantum; its events and what it left for later begin in turn."""
+        began = self._since
+        if not payer.later:
+            self._call_ready(payer, began)
+        elif payer.later_first:
+            self._call_later(payer, began)
+            self._call_ready(payer, began)
+        else:
+            self._call_ready(payer, began)
+            self._call_later(payer, began)
+        payer.later_first = not payer.later_first
+        if payer.later or payer.events:
+            self._waiting[payer.name] = payer
+        elif self._waiting:
+            self._waiting.pop(payer.name, None)
+
+    def _call_later(self, payer: _Payer, began: int) -> None:
+        for _ in range(len(payer.later)):
+            if self._since - began >= QUANTUM:
+                return
+            payer.later.popleft()()
+            self._charge(payer)
+
+    def _call_ready(self, payer: _Payer, began: int) -> None:
+        if self._since - began >= QUANTUM:
+            return
+        if payer.events:
+            found, payer.events = [*payer.events.items()], {}
+        else:
+            found = payer.epoll.poll(0, _EVENTS_PER_TURN)
+        left = len(found)
+        for number, events in found:
+            left -= 1
+            handler = self._handlers.get(number)
+            if handler is None:
+                continue
+            handler(events)
+            self._charge(payer)
+            if left and self._since - began >= QUANTUM:
+                payer.events = dict(found[-left:])
+                break
+
+    def _charge(self, payer: _Payer) -> None:
+        now = self._processor_time()
+        payer.spent += now - self._since
+        self._since = now
 
     def _call_due(self) -> None:
-        now = self.clock()
-        while self._timers and self._timers[0][0] <= now:
+        now, began = self.clock(), self._since
+        while self._timers and self._timers[0][0] <= now and self._since - began < QUANTUM:
             callback = heapq.heappop(self._timers)[2].callback
             if callback is not None:
                 callback()
+                self._since = self._processor_time()
 
     def _close_discarded(self) -> None:
         for sock in self._discarded:
             sock.close()
         self._discarded.clear()
+
+
+def _spent(payer: _Payer) -> int:
+    return payer.spent

@@ -113,7 +113,9 @@ class ServiceClient:
             count=traffic.count,
             judge=self._judge,
         )
-        self._client = Stream(context.loop, sock, self._client_received, self.cut, drained=self._advance)
+        self._client = Stream(
+            context.loop, sock, self._client_received, self.cut, payer=host, drained=self._advance
+        )
         self._client.read(False)
 
     def start(self, rest: bytes) -> None:
@@ -138,7 +140,8 @@ class ServiceClient:
             received, opened = self._server_received, self._connected
             return OwnServer(self._own, loop, called=called, received=received, opened=opened)
         sock = begin_connect(service.host, service.port)
-        return Stream(loop, sock, self._server_received, self._server_broken, opened=self._connected)
+        received, broken = self._server_received, self._server_broken
+        return Stream(loop, sock, received, broken, payer=self.host, opened=self._connected)
 
     def judge_again(self) -> None:
         """Other specifications are in force: a service that does not fit them is carried no longer."""

@@ -11,14 +11,12 @@ from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullEr
 from appliance.channel.messages import Message
 from appliance.relay.loop import READ, WRITE, Loop, Timer
 
-_SLICE = 256
-
 
 class Link:
     """One end of a lifeline or link. `ended(reason)` is called once, when it is of no use any more.
 
     A message that is not of the link, or a backlog beyond its limit, ends it as the other end's death does.
-    A restatement of thousands of messages is carried out in slices, so that it holds up nothing else.
+    A restatement of thousands of messages is carried out a quantum at a time, so that it delays nothing else.
     """
 
     def __init__(
@@ -91,9 +89,10 @@ class Link:
             self._end(str(error))
 
     def _carry_out(self) -> None:
-        for _ in range(min(_SLICE, len(self._arrived))):
-            if self._arrived:
-                self._received(*self._arrived.popleft())
+        while self._arrived:
+            self._received(*self._arrived.popleft())
+            if self._loop.over():
+                break
         if self._slice is not None:
             self._slice.cancel()
         self._slice = self._loop.after(0, self._carry_out) if self._arrived else None

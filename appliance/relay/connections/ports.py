@@ -4,8 +4,9 @@ Invariants:
 - There are never more than `connections` peers, nor more than `connections_per_host` of one host, nor more of
   strangers together than is theirs (`RELAY_CONNECTIONS` of the table of shares), in whatever stage. A peer within
   its share that finds no room is let in if `make_room` finds another that has to go.
-- A flood of connections is accepted in slices, so that relayed messages go on between them; when the process
-  has no descriptor left, listening pauses instead of spinning.
+- Accepting is a payer of its own in the loop: a flood of connections is accepted a quantum at a time, and each
+  connection is charged to its host as well. When the process has no descriptor left, listening pauses instead of
+  spinning.
 """
 
 import errno
@@ -13,11 +14,10 @@ import socket
 from collections.abc import Callable
 
 from appliance.relay.limits import Limits
-from appliance.relay.loop import READ, Loop
+from appliance.relay.loop import ACCEPTING, QUANTUM, READ, UNKNOWN, Loop
 from appliance.shares.pool import Pool, Standing
 from appliance.shares.table import RELAY_CONNECTIONS
 
-_ACCEPTS_PER_TURN = 32
 _NO_DESCRIPTOR_PAUSE = 0.2
 _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 
@@ -40,6 +40,7 @@ class Ports:
         make_room: Callable[[str], bool],
     ) -> None:
         self._loop = loop
+        self._standing = standing
         self._arrived = arrived
         self._turned_away = turned_away
         self._listening: dict[str, socket.socket] = {}
@@ -69,15 +70,20 @@ class Ports:
         for key in list(self._listening):
             self.close(key)
 
+    def payer(self, host: str) -> str:
+        """Return who pays for a peer from this host."""
+        return host if self._standing(host) is Standing.REGISTERED else UNKNOWN
+
     def left(self, host: str) -> None:
         """A peer that arrived is gone."""
         self.connected.give_back(host)
 
     def _watch(self, key: str, sock: socket.socket) -> None:
-        self._loop.watch(sock.fileno(), READ, lambda _events: self._accept(key, sock))
+        self._loop.watch(sock.fileno(), READ, lambda _events: self._accept(key, sock), ACCEPTING)
 
     def _accept(self, key: str, listening: socket.socket) -> None:
-        for _ in range(_ACCEPTS_PER_TURN):
+        used = self._loop.used()
+        while used < QUANTUM:
             try:
                 sock, address = listening.accept()
             except BlockingIOError:
@@ -88,12 +94,15 @@ class Ports:
                     return
                 continue  # this peer is gone already; the next may be well
             host = address[0].removeprefix("::ffff:")
+            payer = self.payer(host)
             reason = self._take(host)
             if reason:
                 sock.close()
                 self._turned_away(key, host, reason)
             else:
                 self._arrived(key, sock, host)
+            before, used = used, self._loop.used()
+            self._loop.charge(payer, used - before)
 
     def _pause(self, key: str, listening: socket.socket) -> None:
         self._loop.unwatch(listening.fileno())

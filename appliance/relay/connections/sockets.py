@@ -58,7 +58,7 @@ class Stream:
 
     `received(data)` is called with what arrives and with b"" once at the end; `opened()` when a connecting
     socket is connected; `drained()` whenever the last byte waiting has been taken by the kernel;
-    `broken(reason)` once, when the socket fails. After `close` or `take` nothing is called.
+    `broken(reason)` once, when the socket fails. After `close` or `take` nothing is called. `payer` is charged.
     """
 
     def __init__(
@@ -68,6 +68,7 @@ class Stream:
         received: Callable[[bytes], None],
         broken: Callable[[str], None],
         *,
+        payer: str,
         opened: Callable[[], None] | None = None,
         drained: Callable[[], None] | None = None,
     ) -> None:
@@ -80,7 +81,7 @@ class Stream:
         self._outgoing = bytearray()
         self._reading = True
         self._live = True
-        loop.watch(sock.fileno(), WRITE if opened else READ, self._ready)
+        loop.watch(sock.fileno(), WRITE if opened else READ, self._ready, payer)
 
     @property
     def backlog(self) -> int:

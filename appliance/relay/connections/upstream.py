@@ -20,7 +20,7 @@ from appliance.relay.connections.presence import Presences, looks_for_names
 from appliance.relay.connections.sockets import Stream, begin_connect
 from appliance.relay.connections.topic import RelayedTopic
 from appliance.relay.context import RelayContext
-from appliance.relay.loop import READ, Timer
+from appliance.relay.loop import READ, UNKNOWN, Timer
 from appliance.ros.errors import LimitExceededError, PeerError
 from appliance.ros.tcpros import HeaderParser, encode_header
 
@@ -40,6 +40,7 @@ class Publisher:
         self._loop = context.loop
         self._clock = context.loop.clock
         self._topic = topic
+        self._payer = topic.host or UNKNOWN
         self._reporter = context.reporter
         self._limits = limits = context.limits
         self._weight = Weight(context.memory.frames.of(topic.host))
@@ -63,7 +64,7 @@ class Publisher:
         self._parser = HeaderParser(limits.header_bytes)
         self._address = ("", 0)
         self._header: dict[str, str] = {}
-        self._presences = Presences(context, topic.topic)
+        self._presences = Presences(context, topic.topic, self._payer)
         self._objection = objection
         self._objected = ""
 
@@ -105,7 +106,14 @@ class Publisher:
             self._lose(f"cannot connect to {host}:{port}: {error}")
             return
         self._parser = HeaderParser(self._limits.header_bytes)
-        self._stream = Stream(self._loop, sock, self._header_received, self._broken, opened=self._connected)
+        self._stream = Stream(
+            self._loop,
+            sock,
+            self._header_received,
+            self._broken,
+            payer=self._payer,
+            opened=self._connected,
+        )
         self._set_timer(self._limits.connect_seconds, self._late(f"no answer from {host}:{port}"))
 
     def refused(self) -> None:
@@ -136,7 +144,7 @@ class Publisher:
             self._pause.cancel()
             self._pause = None
             if self._socket is not None:
-                self._loop.watch(self._socket.fileno(), READ, self._ready)
+                self._loop.watch(self._socket.fileno(), READ, self._ready, self._payer)
 
     def look(self) -> None:
         """A second is over: a publisher that keeps memory for a message and sends nothing of it is cut."""
@@ -229,7 +237,7 @@ class Publisher:
         self._objected = ""
         self._flowing = self._clock()
         self._set_timer(0, None)
-        self._loop.watch(sock.fileno(), READ, self._ready)
+        self._loop.watch(sock.fileno(), READ, self._ready, self._payer)
         self._recv_into = sock.recv_into
         self._topic.upstream_opened(header)
         while rest and self._socket is sock:

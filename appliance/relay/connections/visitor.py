@@ -33,6 +33,7 @@ class Visitor:
         key: str,
         host: str,
         *,
+        payer: str,
         anteroom: Anteroom,
         introduced: Callable[["Visitor"], None],
         failed: Callable[["Visitor", str], None],
@@ -48,7 +49,9 @@ class Visitor:
         self._anteroom = anteroom
         self._parser = HeaderParser(limits.header_bytes)
         self._timer = context.loop.after(limits.header_seconds, self._late)
-        self._stream = Stream(context.loop, sock, self._received, lambda _reason: failed(self, ""))
+        self._stream = Stream(
+            context.loop, sock, self._received, lambda _reason: failed(self, ""), payer=payer
+        )
         self._received_bytes = 0
         anteroom.enter(self, host)
 
@@ -106,11 +109,15 @@ class Farewell:
         reason: str,
         seconds: float,
         ended: Callable[["Farewell"], None],
+        *,
+        payer: str,
     ) -> None:
         self.live = True
         self._ended = ended
         self._timer = loop.after(seconds, self.close)
-        self._stream = Stream(loop, sock, self._received, lambda _reason: self.close(), drained=self._told)
+        self._stream = Stream(
+            loop, sock, self._received, lambda _reason: self.close(), payer=payer, drained=self._told
+        )
         self._stream.send(encode_header({"error": reason}))
         if self.live and not self._stream.backlog:
             self._told()

@@ -1,11 +1,12 @@
 """The event loop: descriptors and timers."""
 
+import itertools
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
-from appliance.relay.loop import READ, Loop
+from appliance.relay.loop import ACCEPTING, QUANTUM, READ, SYSTEM, UNKNOWN, Loop
 
 
 @pytest.fixture
@@ -57,3 +58,171 @@ def test_stop_ends_run_after_the_turn(loop: Loop) -> None:
     """From a timer as from a handler."""
     loop.after(0, loop.stop)
     loop.run()
+
+
+class Costs:
+    """A loop whose handlers cost what a test says; `order` names the payers that were served."""
+
+    def __init__(self) -> None:
+        self.used = 0
+        self.loop = Loop(lambda: self.used)
+        self.order: list[str] = []
+        self._open: list[socket.socket] = []
+
+    def ready(self, payer: str, cost: int, times: float = float("inf")) -> socket.socket:
+        """Watch a socket that is ready so many times, each at this cost."""
+        ours, theirs = socket.socketpair()
+        self._open += (ours, theirs)
+        theirs.send(b"x")
+        left = times
+
+        def handle(_events: int) -> None:
+            nonlocal left
+            self.used += cost
+            self.order.append(payer)
+            left -= 1
+            if left <= 0:
+                self.loop.unwatch(ours.fileno())
+
+        self.loop.watch(ours.fileno(), READ, handle, payer)
+        return ours
+
+    def turns_until(self, condition: Callable[[], object]) -> int:
+        """Turn until the condition holds, a thousand times at most; the number of turns."""
+        for turns in range(1000):
+            if condition():
+                return turns
+            self.loop.turn(0)
+        raise AssertionError(f"not within 1000 turns: {self.order[-20:]}")
+
+    def close(self) -> None:
+        """Close all."""
+        self.loop.close()
+        for sock in self._open:
+            sock.close()
+
+
+@pytest.fixture
+def costs() -> Iterator[Costs]:
+    """A loop with handlers of known cost."""
+    costs = Costs()
+    yield costs
+    costs.close()
+
+
+def test_a_host_with_little_to_do_waits_for_one_quantum_of_others(costs: Costs) -> None:
+    """While two hundred hosts always have costly messages, the robot's message is served after one of them."""
+    for number in range(200):
+        costs.ready(f"10.9.0.{number}", QUANTUM)
+    costs.turns_until(lambda: len(costs.order) > 300)
+    for _ in range(20):
+        before = len(costs.order)
+        costs.ready("robot", QUANTUM // 50, 1)
+        costs.turns_until(lambda: "robot" in costs.order[before:])  # noqa: B023  it is called here
+        assert costs.order[before:].index("robot") <= 2
+        costs.turns_until(lambda: len(costs.order) >= before + 10)  # noqa: B023  as above
+
+
+def test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one(costs: Costs) -> None:
+    """Both are served in turn, whatever the number of descriptors that are ready."""
+    for _ in range(400):
+        costs.ready("guest", QUANTUM // 10)
+    costs.ready("robot", QUANTUM // 10)
+    costs.turns_until(lambda: len(costs.order) >= 1000)
+    assert 450 <= costs.order.count("robot") <= 550
+
+
+def test_each_descriptor_of_a_host_has_its_turn(costs: Costs) -> None:
+    """A handler that uses up the quantum each time starves no other descriptor of its host."""
+    costs.ready("guest", 2 * QUANTUM)
+    later = costs.ready("guest", 1, 1)
+    costs.ready("robot", QUANTUM)
+    costs.turns_until(lambda: costs.order.count("guest") > 4)
+    with pytest.raises(FileNotFoundError):
+        costs.loop.change(later.fileno(), READ)  # it was served, and unwatched itself
+
+
+def test_all_unknown_hosts_together_are_one_payer(costs: Costs) -> None:
+    """They get together what the robot gets alone, and so do new connections."""
+    for _ in range(200):
+        costs.ready(UNKNOWN, QUANTUM)
+    costs.ready(ACCEPTING, QUANTUM)
+    costs.ready("robot", QUANTUM)
+    costs.turns_until(lambda: len(costs.order) >= 300)
+    assert {payer: round(costs.order.count(payer), -1) for payer in ("robot", ACCEPTING)} == {
+        "robot": 100,
+        ACCEPTING: 100,
+    }
+
+
+def test_who_overdraws_waits_until_the_others_have_had_as_much(costs: Costs) -> None:
+    """A handler that takes twenty quanta is followed by twenty of the other host."""
+    costs.ready("guest", 20 * QUANTUM)
+    costs.ready("robot", QUANTUM)
+    costs.turns_until(lambda: costs.order.count("guest") == 3)
+    assert 38 <= costs.order.count("robot") <= 42
+
+
+def test_control_and_lifeline_are_served_in_every_turn(costs: Costs) -> None:
+    """Whatever hosts have ready, the relay's own descriptors come first."""
+    for number in range(100):
+        costs.ready(f"10.9.0.{number}", 2 * QUANTUM)
+    costs.ready(SYSTEM, 1)
+    for _ in range(3):
+        costs.loop.turn(0)  # more are ready than are asked for at first
+    costs.order.clear()
+    costs.turns_until(lambda: len(costs.order) >= 40)
+    served = [place for place, payer in enumerate(costs.order) if payer == SYSTEM]
+    assert max(after - before for before, after in itertools.pairwise(served)) <= 2
+
+
+def test_a_host_alone_is_served_without_waiting_and_owes_nothing(costs: Costs) -> None:
+    """What it used while nobody else was ready is forgotten when somebody comes."""
+    costs.ready("guest", 5 * QUANTUM)
+    costs.turns_until(lambda: len(costs.order) >= 50)
+    costs.ready("robot", QUANTUM)
+    costs.turns_until(lambda: costs.order.count("guest") >= 54)
+    assert costs.order.count("robot") <= 30
+
+
+def test_what_is_left_for_later_takes_turns_with_events_and_with_others(costs: Costs) -> None:
+    """Work that a handler has left is charged to its payer, and starves neither its events nor another host."""
+
+    def work() -> None:
+        costs.used += QUANTUM
+        costs.order.append("left")
+        costs.loop.later(work, "guest")
+
+    costs.loop.later(work, "guest")
+    costs.ready("guest", QUANTUM)
+    costs.ready("robot", QUANTUM)
+    costs.turns_until(lambda: len(costs.order) >= 200)
+    shares = {name: costs.order.count(name) for name in ("left", "guest", "robot")}
+    assert 90 <= shares["robot"] <= 110
+    assert 40 <= shares["left"] <= 60
+
+
+def test_a_charge_for_a_new_connection_delays_its_host(costs: Costs) -> None:
+    """What is done for a host by the handler of another payer counts for the host."""
+    costs.ready("guest", QUANTUM)
+    costs.ready("robot", QUANTUM)
+    costs.loop.turn(0)
+    costs.loop.charge("guest", 30 * QUANTUM)
+    costs.order.clear()
+    costs.turns_until(lambda: "guest" in costs.order)
+    assert costs.order.count("robot") >= 29
+
+
+def test_timers_that_are_due_together_are_called_a_quantum_at_a_time(costs: Costs) -> None:
+    """Ten thousand timers delay a message by one quantum."""
+    called: list[None] = []
+
+    def call() -> None:
+        costs.used += QUANTUM // 4
+        called.append(None)
+
+    for _ in range(10_000):
+        costs.loop.after(0, call)
+    costs.ready("robot", 1)
+    costs.turns_until(lambda: len(costs.order) >= 10)
+    assert len(called) <= 60

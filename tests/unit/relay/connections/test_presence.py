@@ -48,7 +48,7 @@ def presences(loop: Loop) -> Iterator[Presences]:
     memory = Memory.of(limits, lambda _host: Standing.REGISTERED)
     middle = Middle(loop, reporter, publish=_nothing, changed=_nothing)
     context = RelayContext(loop, limits, reporter, memory, Scratch(), middle)
-    presences = Presences(context, TOPIC)
+    presences = Presences(context, TOPIC, "10.0.0.9")
     yield presences
     presences.close()
 
