@@ -4,6 +4,10 @@ The events of a message happen specification by specification, in source order. 
 not drop the message, every property of its specification steps, and the handlers of the categories it is in run.
 What drops the message ends its way; what faults drops it, too, or with `on_fault="pass"` is passed over. Of a
 parametric specification each slice that an event belongs to takes its turn (`slices.py`).
+
+A dropped message has not happened for properties that are formulas (`CompiledProperty.suppresses`): whatever dropped
+it, all of them, of all specifications, take back the steps that they made for it. So the trace that such a property has
+seen is the trace that subscribers saw. Variables, output and the other properties keep what came of the message.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +23,7 @@ from appliance.rosmop.outcomes import DROPPED, Fault, Outcome, Verdict
 from appliance.rosmop.positions import Position
 from appliance.rosmop.runtime.context import FOLDED_NS, FaultError, LogLine
 from appliance.rosmop.runtime.wire import Buffer, Message
-from appliance.rosmop.slices import Key, Slice
+from appliance.rosmop.slices import Key, Slice, Slices
 from appliance.rosmop.why import Bound, of_slice
 
 OnFault = Literal["drop", "pass"]
@@ -41,6 +45,10 @@ class Execution:
         self._sender = NOBODY
         self._bound: Bound | None = None
         self._explains = True
+        self._taking_back: dict[int, Callable[[], None]] = {}
+        """What takes back the steps for the message at hand, by the run or slice that made them."""
+        self._trailed: dict[Monitor, int] = {}
+        """How many entries the message at hand has in trails."""
 
     def begin(self, monitors: Sequence[Monitor], time_ns: int) -> Outcome:
         """Constants, first values, `init`: each for all before the next, as one may read another's variables."""
@@ -63,6 +71,8 @@ class Execution:
         steps[0].monitor.come_home()
         self._turn.now = outcome.time
         self._sender = sender
+        self._taking_back.clear()
+        self._trailed.clear()
         message = Message(buffer, outcome.time)
         writers: tuple[tuple[Step, Sequence[int]], ...] = ()
         for step in steps:
@@ -84,6 +94,7 @@ class Execution:
     def tick(self, step: Step, time_ns: int) -> Outcome:
         """Let an event without a topic happen; `collect` is the caller's."""
         self._sender = NOBODY
+        self._taking_back.clear()
         step.monitor.come_home()
         outcome = Outcome(time=time_ns)
         outcome.timer = step.name
@@ -176,9 +187,11 @@ class Execution:
         self._bound = Bound(step.index, step.event.binds, key, message.time, self._sender, step.event.creates)
         slices = step.monitor.slices
         assert slices is not None  # noqa: S101  who has a key has slices
+        if step.event.plain and (slice_ := slices.at(key)) is not None:
+            self._mark_slice(slices, slice_)
         if step.event.plain and (happened := slices.step(step.index, key)) is not None:
             if happened:
-                step.monitor.trail.append(self._bound)
+                self._append_to_trail(step.monitor, self._bound)
                 outcome.events = (*outcome.events, step.name)
             return False
 
@@ -260,6 +273,7 @@ class Execution:
         assert slices is not None  # noqa: S101  it has a slice
         for running, run in zip(monitor.properties, slices.select(slice_), strict=True):
             running.run = run
+        self._mark_slice(slices, slice_)
         before, monitor.slice = outcome.events, slice_
         dropped = act(outcome, message)
         runs = tuple(running.run for running in monitor.properties)
@@ -288,6 +302,7 @@ class Execution:
         if turn.log or turn.published or turn.looked:
             self.collect(outcome)
         if message.dropped:
+            self._take_back()
             outcome.result = "dropped"
             outcome.overwritten = message.overwritten
             if outcome.fatal is not None:
@@ -324,10 +339,12 @@ class Execution:
             and step.monitor.slices is not None
             and (not trail or trail[-1] is not self._bound)
         ):
-            trail.append(self._bound)
+            self._append_to_trail(step.monitor, self._bound)
         for running in step.monitor.properties:
             try:
                 if step.monitor.slices is None:
+                    if running.code.property.suppresses and id(running.run) not in self._taking_back:
+                        self._taking_back[id(running.run)] = running.mark()
                     categories = running.history.step(running.run, step.index, time_ns, self._sender)
                 else:
                     categories = running.run.step(step.index, time_ns)
@@ -337,6 +354,22 @@ class Execution:
                 continue
             if categories:
                 self._tell(step.monitor, running, categories, message, outcome)
+
+    def _mark_slice(self, slices: Slices, slice_: Slice) -> None:
+        if id(slice_) not in self._taking_back:
+            self._taking_back[id(slice_)] = slices.mark(slice_)
+
+    def _append_to_trail(self, monitor: Monitor, bound: Bound) -> None:
+        monitor.trail.append(bound)
+        self._trailed[monitor] = self._trailed.get(monitor, 0) + 1
+
+    def _take_back(self) -> None:
+        """Undo what the message has done to formulas, the last step first."""
+        for take_back in reversed(self._taking_back.values()):
+            take_back()
+        for monitor, entries in self._trailed.items():
+            for place in range(max(-entries, -len(monitor.trail)), 0):
+                monitor.trail[place] = monitor.trail[place]._replace(passed=False)
 
     def _tell(
         self,

@@ -4,11 +4,11 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from appliance.rosmop.compiled import Compiled, EventCode, PropertyCode, SpecificationCode
 from appliance.rosmop.ir.interpreter import Interpreter
-from appliance.rosmop.logics.interface import Run
+from appliance.rosmop.logics.interface import FormulaRun, Run
 from appliance.rosmop.runtime.context import Context
 from appliance.rosmop.runtime.wire import Message
 from appliance.rosmop.slices import Slice, Slices
@@ -44,6 +44,18 @@ class RunningProperty:
         """Begin anew."""
         self.run = self.code.property.start(time_ns)
         self.history.begin(time_ns)
+
+    def mark(self) -> Callable[[], None]:
+        """Return what takes back all that comes to the property from here on, but time."""
+        run = cast("FormulaRun", self.run)
+        before, history = run.mark(), self.history.mark()
+
+        def take_back() -> None:
+            run.take_back(before)
+            self.run = run
+            self.history.take_back(history)
+
+        return take_back
 
 
 @dataclass(eq=False, slots=True)

@@ -103,7 +103,13 @@ def _event(
             table = tuple(row[index] for row in automaton.table)
             advances.append(
                 form.Advance(
-                    properties.index((number, property_index)), table, index, None, handled, automaton.initial
+                    properties.index((number, property_index)),
+                    table,
+                    index,
+                    None,
+                    handled,
+                    automaton.initial,
+                    compiled.suppresses,
                 )
             )
         elif isinstance(compiled, ClockedProperty):
@@ -117,7 +123,8 @@ def _event(
             clock = form.Clock(
                 late, compiled.within, tuple(-1 if wait is None else wait.after for wait in compiled.waits)
             )
-            advances.append(form.Advance(properties.index((number, property_index)), table, index, clock))
+            known = properties.index((number, property_index))
+            advances.append(form.Advance(known, table, index, clock, suppresses=compiled.suppresses))
         else:
             advances.append(form.Advance(None, (-1,)))
     return form.Event(specifications[number].events[index].function, place, tuple(advances))

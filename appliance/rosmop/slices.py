@@ -23,16 +23,16 @@ Theory of operation:
 """
 
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from itertools import repeat
 from operator import contains, getitem
-from typing import Any
+from typing import Any, cast
 
 from appliance.rosmop.compiled import EventCode, PropertyCode, SpecificationCode
 from appliance.rosmop.ir.sites import showing
-from appliance.rosmop.logics.interface import FiniteProperty, Run
+from appliance.rosmop.logics.interface import FiniteProperty, FormulaRun, Run
 from appliance.rosmop.types import kinds
 
 LIMIT = 100_000
@@ -100,6 +100,7 @@ class Slices:
         self._known = {domain: _Known() for domain in _joined(_domain(event) for event in code.events)}
         self._ended: deque[tuple[int, Key]] = deque()
         self._whole = self._known[self._all].slices
+        self._formulas = [declared.property.suppresses for declared in code.properties]
         self._look_at(code.properties)
         for wanted in {_domain(event) for event in code.events}:
             for domain, known in self._known.items():
@@ -170,6 +171,10 @@ class Slices:
             slice_.stand(after)
             return True
         return None
+
+    def at(self, key: Key) -> Slice | None:
+        """The slice of all parameters with this key, if there is one."""
+        return self._whole.get(key)
 
     def targets(self, event: EventCode, key: Key) -> tuple[Sequence[Slice], Sequence[Slice]]:
         """The slices with all parameters that an event belongs to, in the order in which they began, and the others.
@@ -282,6 +287,35 @@ class Slices:
         elif self._idles is not None and slice_.values == self._first.values and self._idles == _states(runs):
             self._forget(slice_.domain, slice_.key)
             self.live -= 1
+
+    def mark(self, slice_: Slice) -> Callable[[], None]:
+        """Return what takes back all that comes to the formulas of a slice from here on, but time; one that begins
+        with the message at hand has not begun, if there are only formulas.
+        """
+        runs, known = slice_.runs, self._known[slice_.domain].slices
+        begun = not slice_.kept and bool(runs) and all(self._formulas)
+        formulas = [
+            cast("FormulaRun", run) for run, formula in zip(runs, self._formulas, strict=True) if formula
+        ]
+        marks = [(run, run.mark()) for run in formulas]
+
+        def take_back() -> None:
+            for run, mark in marks:
+                run.take_back(mark)
+            both = zip(runs, slice_.runs, self._formulas, strict=True)
+            slice_.runs = tuple(before if formula else now for before, now, formula in both)
+            there, ended = slice_.key in known, known.get(slice_.key, slice_) is None
+            if begun:
+                if there:
+                    self.live -= not ended
+                    self._forget(slice_.domain, slice_.key)
+            elif not there or ended:
+                self.live += 1
+                self._put(slice_.domain, slice_.key, slice_)
+            if ended:
+                self._ended.remove((slice_.domain, slice_.key))
+
+        return take_back
 
     def values(self, slice_: Slice) -> Mapping[int, Any]:
         """The values of the parameters, by their numbers."""

@@ -67,7 +67,7 @@ class Bound(NamedTuple):
     has True before the values).
 
     `creates`: a slice may begin with it. `everywhere`: it happened in each slice that it belongs to; a `when` may look
-    at what slices differ in, and what one has dropped comes to no other.
+    at what slices differ in, and what one has dropped comes to no other. `passed`: its message was not dropped.
     """
 
     event: int
@@ -77,6 +77,7 @@ class Bound(NamedTuple):
     sender: Sender
     creates: bool
     everywhere: bool = True
+    passed: bool = True
 
 
 class Exits:
@@ -106,6 +107,12 @@ class Exits:
 
     def begin(self, time_ns: int) -> None:
         """What happened before stays on no way: it need not be forgotten."""
+
+    def mark(self) -> None:
+        """Nothing: how the present state was left is on no way, so a step taken back need not be forgotten."""
+
+    def take_back(self, mark: object) -> None:
+        """As `mark`."""
 
     def move(self, owner: object, room: memoryview) -> None:
         """Keep it from now on where the owner has it."""
@@ -188,6 +195,15 @@ class Steps:
         self._before: Run | None = None
         self._following: Run | None = None
 
+    def mark(self) -> Any:
+        """Return what `take_back` needs to forget the steps from here on."""
+        return self._started, self._steps, len(self._steps), self._before, self._following
+
+    def take_back(self, mark: Any) -> None:
+        """Forget the steps since the mark."""
+        self._started, self._steps, size, self._before, self._following = mark
+        del self._steps[size:]
+
     def step(self, run: Run, event: int, time_ns: int, sender: Sender) -> Categories:
         """Let the run take the event. Raises `RunFaultError`."""
         self._make_room(run)
@@ -217,7 +233,7 @@ class Steps:
         self._run = run
         kept = FUTURE_KEPT if isinstance(run, BoundedRun) else KEPT
         if len(self._steps) == 2 * kept:
-            del self._steps[:kept]
+            self._steps = self._steps[kept:]
             self._before = self._following
         if len(self._steps) == kept:
             self._following = None if isinstance(run, BoundedRun) else copy.copy(run)
@@ -261,6 +277,14 @@ class ClockedSteps(Steps):
         """Forget everything: the run has begun anew."""
         self._started = time_ns
         _COUNT.pack_into(self.room, 0, 0)
+
+    def mark(self) -> tuple[int, bytes]:
+        """All of it."""
+        return self._started, bytes(self.room)
+
+    def take_back(self, mark: tuple[int, bytes]) -> None:
+        """Return to it."""
+        self._started, self.room[:] = mark
 
     def step(self, run: Run, event: int, time_ns: int, sender: Sender) -> Categories:
         """Let the run take the event."""
@@ -382,6 +406,8 @@ def of_slice(
     """
     found, own = Steps(compiled, 0), dict[Happened, bool]()
     for bound in trail:
+        if not bound.passed and compiled.suppresses:
+            continue
         if all(map(_same, map(values.get, bound.binds), bound.key[1:])) and (own or bound.creates):
             happened = Happened(bound.event, bound.time, bound.sender)
             own[happened] = bound.everywhere

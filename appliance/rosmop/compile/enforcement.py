@@ -1,13 +1,13 @@
 """Whether a property can be enforced: what handlers may drop, and what is published when it is due (`enforced by`)."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from appliance.rosmop.compile.functions import topics_of
 from appliance.rosmop.compile.scope import SpecificationNames
 from appliance.rosmop.logics.interface import CompiledProperty
-from appliance.rosmop.logics.lint import Graph, graph_of, shortest_trace_to
-from appliance.rosmop.logics.pattern import ENFORCED
+from appliance.rosmop.logics.lint import TIME, Graph, graph_of, shortest_trace_to
+from appliance.rosmop.logics.pattern import ENFORCED, TimedPattern
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.rosmop.types.messages import nearest, shown
@@ -32,11 +32,14 @@ def blocking_refused(
 
 
 def enforcement(
-    compiled: CompiledProperty, specification: tree.Specification, published: Sequence[str]
+    compiled: CompiledProperty,
+    specification: tree.Specification,
+    published: Sequence[str],
+    dropping: Collection[str],
 ) -> str:
     """Whether the property can be kept from being violated, by what, or what it would take.
 
-    `published` are the topics of its remedy.
+    `published` are the topics of its remedy, `dropping` the categories whose handlers may drop the message.
     """
     if compiled.remedy is not None:
         topics = ", ".join(published)
@@ -47,24 +50,43 @@ def enforcement(
         return f"nothing to enforce: no trace leads to @{category}"
     refused = blocking_refused(compiled, specification, category)
     if refused is None:
-        brings = _bringing(graph, category) if graph is not None else compiled.events
+        brings = _bringing(compiled, graph, category) if graph is not None else compiled.events
         named = ", ".join(event for event in compiled.events if event in brings)
-        return f"can be enforced: @{category} may drop the message that brings it about ({named})"
+        said = f"can be enforced: @{category} may drop the message that brings it about ({named})"
+        if category not in dropping:
+            said += f"; to enforce it write `@{category} {{ DROP; }}`"
+        return f"{said}; {_COUNTS[compiled.suppresses]}"
     takes = "it takes an event on a topic for the timer"
     if compiled.blocking_refused(category) is not None:
         takes = _TAKES[compiled.logic]
+        if isinstance(compiled, TimedPattern):
+            refused += f", and no drop makes `{compiled.events[compiled.pattern.second]}` come"
     return f"cannot be enforced by dropping: {refused}; {takes}"
 
 
-def _bringing(graph: Graph, category: str) -> set[str]:
-    """The events that lead to the category from where it is not yet."""
-    return {
-        trace[-1]
-        for state, ways in enumerate(graph.edges)
-        if category not in graph.verdicts[state]
-        for trace, target in ways
-        if category in graph.verdicts[target]
-    }
+_COUNTS = {
+    True: "a dropped message has not happened for it",
+    False: "a dropped message counts for it, as if it had been passed on",
+}
+
+
+def _bringing(compiled: CompiledProperty, graph: Graph, category: str) -> set[str]:
+    """The events that lead to the category from where it is not yet.
+
+    Where a dropped message has not happened, only from where the messages lead that were not dropped.
+    """
+    reached, brings = {graph.initial}, set[str]()
+    waiting = [graph.initial]
+    while waiting:
+        state = waiting.pop()
+        for trace, target in graph.edges[state]:
+            leads = category in graph.verdicts[target]
+            if leads and (state == graph.initial or category not in graph.verdicts[state]):
+                brings.add(trace[-1])
+            if target not in reached and not (leads and compiled.suppresses and trace[-1] != TIME):
+                reached.add(target)
+                waiting.append(target)
+    return brings
 
 
 def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> list[str]:

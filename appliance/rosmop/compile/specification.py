@@ -28,6 +28,7 @@ from appliance.rosmop.compile.reach import identity, reached
 from appliance.rosmop.compile.scope import Shared, SpecificationNames
 from appliance.rosmop.compile.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
 from appliance.rosmop.compiled import Compiled, PropertyCode, SpecificationCode
+from appliance.rosmop.ir import form
 from appliance.rosmop.logics.catalogue import compile_property
 from appliance.rosmop.logics.interface import CompiledProperty, FormulaError
 from appliance.rosmop.positions import Finding
@@ -244,7 +245,25 @@ def _property(
         if function is not None:
             handlers[handler.category] = function
     shared.findings += lint_property(compiled, node)
-    return PropertyCode(compiled, handlers, tuple(handlers), enforcement(compiled, specification, published))
+    made = {
+        category: {type(part) for part in form.nodes(shared.functions[name])}
+        for category, name in handlers.items()
+    }
+    dropping = [category for category, parts in made.items() if form.Drop in parts]
+    if compiled.suppresses:
+        at = {handler.category: handler.position for handler in node.handlers}
+        shared.findings += [
+            Finding(
+                at[category],
+                "warning",
+                f"when @{category} drops the message, `__RESET;` does nothing: for `{compiled.logic}` a dropped message"
+                " has not happened; leave `__RESET;` out",
+            )
+            for category in dropping
+            if form.Reset in made[category]
+        ]
+    said = enforcement(compiled, specification, published, dropping)
+    return PropertyCode(compiled, handlers, tuple(handlers), said)
 
 
 def _handler_refused(

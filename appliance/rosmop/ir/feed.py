@@ -5,6 +5,7 @@
 one begins that is left (i64: the low 32 bits), how many effects there are (the next 24), and `LEFT` if that one is for
 Python.
 
+- What a dropped message did to the states of properties that suppress it (`form.Advance.suppresses`) is taken back.
 - A message is either done, with all that follows from it, or left, and then `Feed.undo` says how to take back what was
   begun. After a trap the message that is left begins at the number that stands at `POSITION`; if that is 0, nothing has
   begun.
@@ -230,6 +231,9 @@ class _Walk:
         properties = {
             advance.property for event in events for advance in event.advances if advance.property is not None
         }
+        self._suppressing = {
+            advance.property for event in events for advance in event.advances if advance.suppresses
+        }
         self._states = {
             number: _FIRST + len(events) + place for place, number in enumerate(sorted(properties))
         }
@@ -322,7 +326,7 @@ class _Walk:
             _set(_TOLD, load(I64, self._cells.source + 8)),
             _set(_ENABLED, load(I64, self._cells.source + 16)),
             *(_set(local, load(I32, self._state(number))) for number, local in self._states.items()),
-            *(_set(local, load(I64, at)) for local, at in self._clock_cells()),
+            *(_set(local, load(I64, at)) for _, local, at in self._clock_cells()),
             _set(self._telling + 1, load(I64, self._cells.source + 24)) if self.verdicts else b"",
             self._begin(), _BLOCK, _BLOCK, _LOOP,
             self._frame(),
@@ -345,13 +349,12 @@ class _Walk:
     def _state(self, number: int) -> int:
         return self._cells.base + 8 * number
 
-    def _clock_cells(self) -> Iterator[tuple[int, int]]:
-        """The locals of clocks, and where they stand."""
+    def _clock_cells(self) -> Iterator[tuple[int, int, int]]:
+        """The properties with clocks, their locals, and where they stand: when it began, its time, and the steps."""
         for number, local in self._clocks.items():
             clock = self._cells.clocks[number]
-            yield from zip(
-                range(local, local + 3), (clock, clock + 8, self._cells.exits[number]), strict=True
-            )
+            for place, at in enumerate((clock, clock + 8, self._cells.exits[number])):
+                yield number, local + place, at
 
     def _begin(self) -> bytes:
         """Nothing has happened to the frame at hand: the runtime stops, if it does, at calls and where loops begin."""
@@ -544,7 +547,7 @@ class _Walk:
         return more + store(I32, EFFECT, _get(_LAST))
 
     def _dropped(self) -> bytes:
-        """Note which bytes do not go on."""
+        """Note which bytes do not go on, and take back the steps of what suppresses: the cells have what was before."""
         last = _get(_LAST)
         same = (
             last
@@ -566,7 +569,16 @@ class _Walk:
             + _get(_AT)
             + b"\x36\x00\x08"
         )
-        code = _set(_LAST, load(I32, EFFECT)) + same + _EQZ + IF + NOTHING + new + END
+        code = b"".join(
+            _set(local, load(I32, self._state(number)))
+            for number, local in self._states.items()
+            if number in self._suppressing
+        )
+        code += b"".join(
+            _set(local, load(I64, at)) for number, local, at in self._clock_cells()
+            if number in self._suppressing and at != self._cells.clocks[number] + 8
+        )  # fmt: skip
+        code += _set(_LAST, load(I32, EFFECT)) + same + _EQZ + IF + NOTHING + new + END
         return code + last + _get(_NEXT) + b"\x36\x00\x0c"
 
     def _done(self) -> bytes:
@@ -577,7 +589,7 @@ class _Walk:
         code += b"".join(
             store(I32, self._state(number), _get(local)) for number, local in self._states.items()
         )
-        code += b"".join(store(I64, at, _get(local)) for local, at in self._clock_cells())
+        code += b"".join(store(I64, at, _get(local)) for _, local, at in self._clock_cells())
         if self.verdicts:
             _, _, ever, _, _, some = range(self._telling, self._telling + 6)
             code += _get(some) + IF + NOTHING

@@ -610,7 +610,8 @@ class Advance(Node, frozen=True):
     """What an event does to a property: the next state for each of its states, -1 where the property has no table of
     states. `property` is its number among those with tables; None without one. `event` is the event's number in its
     specification. `handlers` run in their order, and may have it begin anew in its state `initial`. With a `clock`
-    there is twice the next state, and one more where it begins anew; -1 where a handler runs.
+    there is twice the next state, and one more where it begins anew; -1 where a handler runs. One that `suppresses`
+    takes the step back when the message is dropped.
     """
 
     property: int | None
@@ -619,6 +620,7 @@ class Advance(Node, frozen=True):
     clock: Clock | None = None
     handlers: tuple[Handled, ...] = ()
     initial: int = 0
+    suppresses: bool = False
 
 
 class Event(Node, frozen=True):

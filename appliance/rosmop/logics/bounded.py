@@ -16,6 +16,9 @@ while that is open; a cell tells its *users* when it is decided. Cells are made 
   to hold). When a part is decided that was open, `until` looks at the rows that this may decide, `since` at all.
 
 A run waits for at most `MOST_OPEN` events; a step beyond that is a fault, and its event is not seen.
+
+To take a step back (`BoundedRun.mark`) the operators' rows are copied, each cell as it was before it is first changed
+(`Cell.touch`); rows do not change once their step is over.
 """
 
 from abc import ABC, abstractmethod
@@ -23,6 +26,7 @@ from bisect import bisect_left, insort
 from collections import deque
 from copy import copy
 from dataclasses import dataclass
+from typing import Any
 
 from appliance.rosmop.logics.formula import Formula
 from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
@@ -40,16 +44,30 @@ class Cell:
     The value of a `kind` (`and`, `or`, `xor`, `not`) comes from `operands`, of which `missing` are open.
     """
 
-    __slots__ = ("kind", "missing", "operands", "tells", "users", "value")
+    __slots__ = ("journal", "kind", "missing", "operands", "tells", "users", "value")
 
-    def __init__(self) -> None:
+    def __init__(self, journal: "Journal") -> None:
+        self.journal = journal
         self.users: list[Cell | _Operator] = []
         self.tells = 0
         self.value: bool | None = None
-        self.stand_for("", ())
+        self.kind, self.missing = "", 0
+        self.operands: tuple[Value, ...] = ()
+
+    def touch(self) -> None:
+        """Note what it is before it is changed, unless that is noted."""
+        if self not in self.journal:
+            self.journal[self] = (
+                [*self.users], self.tells, self.value, self.kind, self.operands, self.missing,
+            )  # fmt: skip
+
+    def restore(self, noted: tuple[Any, ...]) -> None:
+        """Be again what was noted."""
+        self.users, self.tells, self.value, self.kind, self.operands, self.missing = noted
 
     def stand_for(self, kind: str, operands: tuple["Value", ...]) -> None:
         """Take the value from these."""
+        self.touch()
         self.kind, self.operands = kind, operands
         self.missing = sum(_use(operand, self) for operand in operands)
 
@@ -60,6 +78,7 @@ class Cell:
 
     def hear(self, value: bool) -> bool | None:
         """What it is worth now that one more operand has this value; None: that is still open."""
+        self.touch()
         self.missing -= 1
         if self.kind == "not":
             return not value
@@ -69,6 +88,8 @@ class Cell:
 
 
 Value = bool | Cell
+Journal = dict[Cell, tuple[Any, ...]]
+"""What cells were at the last mark, of those that have changed since."""
 
 
 def _known(value: Value) -> bool | None:
@@ -78,6 +99,7 @@ def _known(value: Value) -> bool | None:
 def _use(value: Value, user: "Cell | _Operator") -> bool:
     """Whether the value is open; its user is told then."""
     if isinstance(value, Cell) and value.value is None:
+        value.touch()
         value.users.append(user)
         return True
     return False
@@ -89,6 +111,7 @@ def _leave(value: Value, user: "Cell | _Operator") -> None:
     while waiting:
         left, leaver = waiting.pop()
         if isinstance(left, Cell) and left.value is None:
+            left.touch()
             left.users.remove(leaver)
             if not left.wanted:
                 waiting += [(operand, left) for operand in left.operands]
@@ -126,7 +149,7 @@ class _Operator(ABC):
 
     def ask(self, now: int) -> Value:
         """Its value at the event that happens now."""
-        self.rows.append(_Row(self.run.place, now, None, None, Cell()))
+        self.rows.append(_Row(self.run.place, now, None, None, Cell(self.run.journal)))
         return self.rows[-1].cell or False
 
     @abstractmethod
@@ -235,7 +258,7 @@ class _OpenUntil(_Rows):
             self.pending.append((*mark, row))
         for value, of_right, waiting in ((row.left, False, self.doubts), (row.right, True, self.hopes)):
             if isinstance(value, Cell):
-                self.waits.setdefault(value, []).append((mark, of_right))
+                self.waits[value] = [*self.waits.get(value, ()), (mark, of_right)]
                 waiting.append(mark)
         if row.right is True:
             self._know_right(mark, True)
@@ -509,6 +532,9 @@ class BoundedProperty(CompiledProperty):
         )
 
 
+_CONTAINERS = (deque, list, dict, Window)
+"""What operators have that a step changes in place."""
+
 _KINDS: dict[str, type[_Operator]] = {
     "until": _OpenUntil,
     "since": _OpenSince,
@@ -531,6 +557,7 @@ class BoundedRun:
         self._values: dict[int, Value] = {}
         self._decided: list[Cell] = []
         self.changed: set[_Operator] = set()
+        self.journal: Journal = {}
         self._told: dict[bool, int] = {}
         self._about: dict[bool, int] = {}
 
@@ -554,6 +581,7 @@ class BoundedRun:
         self._values = {}
         whole = self.value(self._compiled.program.result)
         if isinstance(whole, Cell):
+            whole.touch()
             whole.tells = self.place
         else:
             self._told[whole] = self.place
@@ -570,6 +598,27 @@ class BoundedRun:
         for operator in self._operators.values():
             operator.pass_by(deadline)
         return self._tell()
+
+    def mark(self) -> tuple[Any, ...]:
+        """The place, the values that look back, and the rows of the operators."""
+        self.journal.clear()
+        operators = [
+            {
+                name: copy(value) if isinstance(value, _CONTAINERS) else value
+                for name, value in vars(operator).items()
+            }
+            for operator in self._operators.values()
+        ]
+        return self.place, list(map(copy, self._at_once)), operators
+
+    def take_back(self, mark: tuple[Any, ...]) -> None:
+        """Return to them; the time stays."""
+        self.place, self._at_once, operators = mark
+        for operator, before in zip(self._operators.values(), operators, strict=True):
+            operator.__dict__ = before
+        for cell, noted in self.journal.items():
+            cell.restore(noted)
+        self.journal.clear()
 
     def value(self, number: int) -> Value:
         """What an instruction is worth at the event that happens now: a cell only while it is open."""
@@ -594,13 +643,14 @@ class BoundedRun:
             if value is absorbing:
                 return value
             operands.append(value)
-        cell = Cell()
+        cell = Cell(self.journal)
         cell.stand_for(kind, tuple(operands))
         return cell if cell.missing else _together(kind, cell.operands)
 
     def decide(self, cell: Cell | None, value: bool) -> None:
         """The value of a cell is known (None: nobody has asked)."""
         if cell is not None and cell.value is None:
+            cell.touch()
             cell.value = value
             self._decided.append(cell)
 
@@ -623,6 +673,7 @@ class BoundedRun:
 
     def _pass_on(self, cell: Cell) -> None:
         assert cell.value is not None  # noqa: S101  it was decided
+        cell.touch()
         if cell.tells:
             self._told[cell.value] = cell.tells
         for user in cell.users:

@@ -15,6 +15,8 @@ Theory of operation for the caller of a run:
 3. ``run.step(event, t)`` returns the categories after the event, in the order in which they are to be told.
    After ``expire()`` handlers of the first category named run first (``timeout`` before the state entered).
 4. Times are integer nanoseconds and never run backwards; a time before the last one counts as the last one.
+5. Of a `FormulaRun`, `mark` before the first step of a message and `take_back` of that mark when the message is dropped
+   make it as if the message had not come; its time has passed all the same. No deadline expires between the two.
 
 A ``FiniteProperty`` and a ``ClockedProperty`` offer their tables as well, so that a module can step them.
 """
@@ -59,6 +61,20 @@ class Run(Protocol):
         """Let the deadline pass; return the categories that follow. Only while ``deadline`` is not None."""
 
 
+class FormulaRun(Run, Protocol):
+    """The run of a property that `suppresses`: its steps can be taken back."""
+
+    def mark(self) -> Any:
+        """Return what `take_back` needs to undo the steps from here on; an earlier mark is void then."""
+
+    def take_back(self, mark: Any) -> None:
+        """Undo the steps since the mark, but keep the time. A mark serves once."""
+
+
+FORMULAS = frozenset({"ltl", "ptltl", "mtl", "pattern"})
+"""The logics for which a dropped message has not happened; the others count each event whose action lets it pass."""
+
+
 def twin(run: Any) -> Any:
     """A copy of a run whose attributes are replaced and never changed in place: its `__copy__`."""
     made = object.__new__(type(run))
@@ -96,6 +112,11 @@ class CompiledProperty(ABC):
 
     made_of: tuple[Any, ...]
     """What it was made of: all that another process needs to make the same."""
+
+    @property
+    def suppresses(self) -> bool:
+        """Whether a dropped message has not happened for it: a run takes back the steps that the message made."""
+        return self.logic in FORMULAS
 
     remedy: str | None = None
     """The function of the specification that publishes what was due when a deadline passes (`enforced by`)."""
@@ -175,6 +196,14 @@ class FiniteRun(UntimedRun):
         self.state = self._automaton.table[self.state][event]
         return self._automaton.verdicts[self.state]
 
+    def mark(self) -> int:
+        """The state."""
+        return self.state
+
+    def take_back(self, mark: int) -> None:
+        """Return to it."""
+        self.state = mark
+
 
 Move = tuple[int, bool]
 """The next state, and whether the clock begins anew."""
@@ -245,6 +274,14 @@ class ClockedRun:
         self.now = self.since + wait.after
         self._move(wait.move)
         return wait.told
+
+    def mark(self) -> tuple[int, int]:
+        """The state, and when its clock began."""
+        return self.state, self.since
+
+    def take_back(self, mark: tuple[int, int]) -> None:
+        """Return to these; `now` stays."""
+        self.state, self.since = mark
 
     def _move(self, move: Move) -> None:
         self.state, restarts = move

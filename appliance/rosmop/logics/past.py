@@ -375,7 +375,7 @@ class Window:
     def __init__(self, low: int, high: int | None) -> None:
         self._low = low
         self._high = FOREVER if high is None else high
-        self._intervals: deque[list[int]] = deque()
+        self._intervals: deque[tuple[int, int]] = deque()
 
     def step(self, unbroken: bool, anchor: bool, now: int) -> bool:
         """The value at ``now``, where the left operand is ``unbroken`` and the right one ``anchor``."""
@@ -385,9 +385,9 @@ class Window:
         if anchor:
             begin, end = now + self._low, now + self._high
             if intervals and begin <= intervals[-1][1] + 1:
-                intervals[-1][1] = end
+                intervals[-1] = intervals[-1][0], end
             else:
-                intervals.append([begin, end])
+                intervals.append((begin, end))
         while intervals:
             begin, end = intervals[0]
             if end >= now:
@@ -397,7 +397,7 @@ class Window:
 
     def __copy__(self) -> "Window":
         twin = Window(self._low, self._high)
-        twin._intervals.extend(map(list, self._intervals))
+        twin._intervals = self._intervals.copy()
         return twin
 
     def __len__(self) -> int:
@@ -416,7 +416,7 @@ class PastRun(UntimedRun):
 
     def __copy__(self) -> "PastRun":
         made: PastRun = twin(self)
-        made.values = list(map(copy.copy, self.values))
+        made.values = self.mark()
         return made
 
     def step(self, event: int, time_ns: int) -> Categories:
@@ -427,6 +427,14 @@ class PastRun(UntimedRun):
         if operations:
             compute(operations, self.values, event, self.now)
         return TOLD[self.values[result]]
+
+    def mark(self) -> list[Any]:
+        """The values."""
+        return list(map(copy.copy, self.values))
+
+    def take_back(self, mark: list[Any]) -> None:
+        """Return to them; the time stays."""
+        self.values = mark
 
 
 class PastProperty(CompiledProperty):

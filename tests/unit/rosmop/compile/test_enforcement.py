@@ -113,6 +113,11 @@ def test_a_remedy_that_calls_what_publishes() -> None:
         ),
         ("mtl: bumped => always[0,1s] !stopped", "can be enforced: @violation may drop"),
         ("ltl: [](bumped => o !stopped)", "may drop the message that brings it about (stopped)"),
+        ("ptltl: stopped => <*> bumped", "the message that brings it about (stopped); to enforce it write"),
+        ("ptltl: stopped => <*> bumped", "`@violation { DROP; }`; a dropped message has not happened for it"),
+        ("ptltl: !bumped", "may drop the message that brings it about (bumped)"),
+        ("pattern: globally: bumped causes stopped within 1s", "no drop makes `stopped` come"),
+        ("ere: bumped stopped", "a dropped message counts for it"),
         ("ltl: [] <> bumped", "nothing to enforce: no trace leads to @violation"),
         ("ere: bumped stopped", "@fail may drop the message that brings it about (bumped, stopped)"),
     ],
@@ -121,6 +126,14 @@ def test_what_is_said_of_enforcement(text: str, expected: str) -> None:
     """Whether it can be enforced, by what, or what it would take."""
     (monitor,) = load(guard(property_text=text, handler=f"@{_bad(text)} {{ }}")).monitors
     assert expected in monitor.properties[0].code.enforcement
+
+
+def test_a_reset_beside_a_drop_is_of_no_use() -> None:
+    """For a formula the message has not happened, so the author is warned; a machine begins anew."""
+    reset = "@violation { DROP; __RESET; }"
+    (warning,) = load(guard(property_text="ptltl: stopped => <*> bumped", handler=reset)).warnings
+    assert "when @violation drops the message, `__RESET;` does nothing" in warning.text
+    assert not load(guard(property_text="ere: bumped stopped", handler="@match { DROP; __RESET; }")).warnings
 
 
 def _bad(text: str) -> str:
