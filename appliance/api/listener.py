@@ -41,7 +41,7 @@ _END_SECONDS = 1.0
 _CONNECTION = "rosrv.connection"  # the key of a request's state that has its connection
 
 
-class _Connection(Front):
+class _Connection(Front, asyncio.Protocol):
     """One connection: what the front lets pass goes to uvicorn's protocol."""
 
     most_waiting = 16
@@ -76,7 +76,7 @@ class _Connection(Front):
         if self._rests:
             self._rests = False
             self.allow(self.limits.head_seconds)
-        super().data_received(data)
+        self.parse(data)
         if not self.closing:
             self._uvicorn.data_received(data)
 

@@ -182,6 +182,7 @@ class Parts:
             limits=base.doors.http,
             visitors=base.doors.visitors,
             turns=base.doors.turns,
+            time=base.doors.time,
             refuse=base.doors.refuse,
             troubled=base.doors.troubled,
         )

@@ -18,6 +18,7 @@ from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.ros.xmlrpc import Limits, build_fault
 from appliance.rpc.front import HttpLimits
+from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import AtOnce, Handler, HttpServer, Peer, Refusal, not_at_once
 from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Visitors
@@ -50,6 +51,9 @@ class Doors:
             ),
         )
         self.turns = Turns(RVMASTER_REQUESTS.bounds, standing, lambda host: policy().alike(host), trail.pause)
+        self.time = ProcessorTime(
+            lambda host: UNKNOWN if standing(host) is Standing.STRANGER else policy().alike(host)
+        )
         self._own_visitors = Visitors(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
         self._own_turns = Turns(_SLOTS_FOR_ONE, _own_node)
         self._trail = trail
@@ -68,6 +72,7 @@ class Doors:
             limits=self.http,
             visitors=self.visitors if guarded else self._own_visitors,
             turns=self.turns if guarded else self._own_turns,
+            time=self.time,
             refuse=self.refuse if guarded else lambda _peer: None,
             troubled=self.troubled,
         )
@@ -132,6 +137,8 @@ def value_limits(settings: Settings) -> Limits:
         parts=limits.multicall_parts,
     )
 
+
+UNKNOWN = "unknown hosts"  # the class of all of them, for processor time
 
 # The appliance's own nodes and the ROS Master come from one address, and nobody else reaches those listeners.
 _FOR_ONE, _BYTES_FOR_ONE, _SLOTS_FOR_ONE = (

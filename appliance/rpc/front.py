@@ -44,7 +44,7 @@ class HttpLimits:
         return self.head_bytes + self.body_bytes // 16
 
 
-class Front(asyncio.Protocol, ABC):
+class Front(asyncio.BaseProtocol, ABC):
     """One connection; `sock` where it has a place before there is a transport."""
 
     transport: asyncio.Transport
@@ -81,6 +81,11 @@ class Front(asyncio.Protocol, ABC):
     def is_quiet(self) -> bool:
         """Whether nothing is being answered: then the next head has its deadline."""
 
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a transport."""
+        return self._socket is None
+
     def open(self, transport: asyncio.Transport) -> bool:
         """Begin with the transport; False (and it is cut) for a connection that has ended already."""
         self.transport, self._socket = transport, None
@@ -93,8 +98,8 @@ class Front(asyncio.Protocol, ABC):
         self.allow(self.limits.head_seconds)
         return True
 
-    def data_received(self, data: bytes) -> None:
-        """Parse what came, within the limits."""
+    def parse(self, data: bytes) -> None:
+        """Parse a piece of what came, within the limits."""
         if self.closing:
             return
         try:

@@ -3,11 +3,12 @@
 `Front` parses and bounds heads. Invariants beside its own:
 
 1. Nothing is buffered beyond the limits: body by `Limits.body`, one request in flight per connection (reading pauses
-   meanwhile; up to 512 that came with it in one piece wait), one response in the write buffer (the next request is not
-   served before it is sent).
+   once a second one came; what is in the same piece of 8 KiB waits), one response in the write buffer (the next request
+   is not served before it is sent).
 2. An address that no rule names is answered before its body is read, but for the beginning: what it asked for is told
    in the refusal's record.
-3. Connections, the bytes that they hold (`visitors`) and requests being served (`turns`) have shares for each host,
+3. Accepting, reading, and each step of a handler are charged to the host and wait for its turn (`processor_time`).
+   Connections, the bytes that they hold (`visitors`) and requests being served (`turns`) have shares for each host,
    for strangers, and for hosts with a registration.
 4. Who is gone before it was his turn is not served: a request waits only as long as its connection lives.
 5. Who goes over a limit is told so, in a fault that says which; of connections that are too many, a few at a time.
@@ -26,7 +27,9 @@ import structlog
 
 from appliance.policy.model import Address
 from appliance.ros.xmlrpc import build_fault
+from appliance.rpc.acceptor import BACKLOG, Acceptor
 from appliance.rpc.front import Front, HttpLimits, plain_address
+from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Stage, Visitors
 
@@ -38,6 +41,7 @@ _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: what is closed is reset
 _MOST_PIPELINED = 512
 # What a request counts beside its body and its path: ten times its memory, because thousands of small ones take time.
 _REQUEST_BYTES = 4096
+_READ_AT_ONCE = 8192  # bytes that are read and parsed in one piece
 _BEGINNING = 4096  # bytes of a body that are looked at to say what was refused
 _BEGINNING_SECONDS = 1.0  # that they are waited for
 
@@ -101,34 +105,66 @@ class HttpServer:
     limits: HttpLimits
     visitors: Visitors[Address]
     turns: Turns
+    time: ProcessorTime
     refuse: Callable[[Peer], Refusal | None] = lambda peer: None  # noqa: ARG005 - names the parameter
     troubled: Callable[[Peer, str], None] = lambda peer, reason: None  # noqa: ARG005 - same
     connections: "set[_Connection]" = field(default_factory=set, init=False)
-    _server: asyncio.Server | None = field(default=None, init=False)
+    _acceptor: Acceptor | None = field(default=None, init=False)
+    _opening: set[asyncio.Task[None]] = field(default_factory=set, init=False)
 
     async def start(self) -> None:
         """Begin to accept."""
-        loop = asyncio.get_running_loop()
-        self.sock.setblocking(False)
-        self._server = await loop.create_server(lambda: _Connection(self), sock=self.sock, backlog=1024)
+        self._acceptor = Acceptor(self.sock, self._accepted)
 
     def close(self) -> None:
         """Stop accepting and cut what is connected; the listening socket is closed with it."""
-        if self._server is not None:
-            self._server.close()
+        if self._acceptor is not None:
+            self._acceptor.close()
         for connection in list(self.connections):
             connection.abort()
 
+    def _accepted(self, sock: socket.socket, address: str) -> None:
+        """A place for the connection, and its transport when it is its host's turn."""
+        outermost = self.time.begin()
+        host = plain_address(address)
+        try:
+            connection = _Connection(self, sock, host)
+            if not connection.enter():
+                sock.close()
+            else:
+                task = asyncio.get_running_loop().create_task(
+                    self.time.spend(host, self._open(connection, sock))
+                )
+                self._opening.add(task)
+                task.add_done_callback(self._opening.discard)
+        finally:
+            if outermost:
+                self.time.end(host)
 
-class _Connection(Front):
+    async def _open(self, connection: "_Connection", sock: socket.socket) -> None:
+        try:
+            await asyncio.get_running_loop().connect_accepted_socket(lambda: connection, sock)
+        except OSError:  # it is gone
+            connection.leave()
+            sock.close()
+        except BaseException:
+            connection.abort()
+            sock.close()
+            raise
+
+
+class _Connection(Front, asyncio.BufferedProtocol):
     """One connection: serves its requests one after the other."""
 
     most_waiting = _MOST_PIPELINED
 
-    def __init__(self, server: HttpServer) -> None:
-        super().__init__(server.limits, server.visitors)
+    def __init__(self, server: HttpServer, sock: socket.socket, host: Address) -> None:
+        super().__init__(server.limits, server.visitors, sock)
         self.server = server
+        self.peer = Peer(host, str(host), str(plain_address(sock.getsockname()[0])))
         self._counted = False
+        self._too_many = ""  # why it is turned away
+        self._unparsed = b""  # what was read, until it is the host's turn
         self._busy: asyncio.Task[None] | None = None
         self._waiting = False  # for its turn
         self._pending: deque[tuple[HttpRequest, bool]] = deque()
@@ -141,24 +177,43 @@ class _Connection(Front):
 
     # --- asyncio.Protocol ---
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        if not self.open(cast(asyncio.Transport, transport)):
-            return
-        peername, sockname = transport.get_extra_info("peername"), transport.get_extra_info("sockname")
-        host = plain_address(peername[0])
-        self.peer = Peer(host, str(host), str(plain_address(sockname[0])))
+    def enter(self) -> bool:
+        """Take a place; False (and it is closed) where there is neither one nor room to say so."""
+        self._too_many = self.visitors.enter(self, self.peer.host)
+        self._counted = not self._too_many
+        if self._too_many and not self.visitors.turn_away(self, self.peer.host):
+            self.closing = True
+            self.server.troubled(self.peer, self._too_many)
+            return False
         self.server.connections.add(self)
-        too_many = self.visitors.enter(self, host)
-        if too_many:
-            self._turn_away(too_many)
-            return
-        self._counted = True
+        return True
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        if self.open(cast(asyncio.Transport, transport)) and self._too_many:
+            self._refuse(b"503 Service Unavailable", self._too_many)
 
     def connection_lost(self, _error: Exception | None) -> None:
         self.leave()
 
-    def data_received(self, data: bytes) -> None:
-        super().data_received(data)
+    def get_buffer(self, _size: int) -> bytearray:
+        self._buffer = bytearray(_READ_AT_ONCE)
+        return self._buffer
+
+    def buffer_updated(self, size: int) -> None:
+        self._unparsed = bytes(memoryview(self._buffer)[:size])
+        if not self.server.time.run(self.peer.host, self._parse_read):
+            self.transport.pause_reading()
+
+    def _parse_read(self) -> None:
+        data, self._unparsed = self._unparsed, b""
+        if not self.closing:
+            self.parse(data)
+        if not (self._pending or self.transport.is_closing()):
+            self.transport.resume_reading()
+
+    def parse(self, data: bytes) -> None:
+        """As `Front`, and a body within its limits."""
+        super().parse(data)
         if self.closing or not (self.in_request and self.head_done):
             return
         if not self._body_is_held():
@@ -317,13 +372,11 @@ class _Connection(Front):
         self.visitors.file(self, Stage.IDLE if finished else Stage.UNFINISHED)
         if self._pending:
             self._serve_next()
-        elif not closing:
+        elif not (closing or self._unparsed):
             self.transport.resume_reading()
 
     def _answered_at_once(self, request: HttpRequest, *, keep: bool) -> bool:
-        """Answer without a task, while nobody waits for a turn: this takes none from anybody."""
-        if self.server.turns.waiting:
-            return False
+        """Answer without a task and without a slot: it takes time, which is the host's, and nothing else."""
         answer = self.server.at_once(request)
         if answer is None:
             return False
@@ -334,11 +387,12 @@ class _Connection(Front):
     def _serve_next(self) -> None:
         request, keep = self._pending.popleft()
         self.deadline = float("inf")  # the handler has limits of its own
-        self._busy = asyncio.get_running_loop().create_task(self._serve(request, keep))
+        serving = self.server.time.spend(self.peer.host, self._serve(request, keep))
+        self._busy = asyncio.get_running_loop().create_task(serving)
 
     async def _serve(self, request: HttpRequest, keep: bool) -> None:
         try:
-            status, body = await self._answer(request)
+            status, body = (b"", b"") if self.closing else await self._answer(request)
         except NoAnswerError:
             self._reset()
             return
@@ -419,17 +473,11 @@ class _Connection(Front):
         self.server.troubled(self.peer, why)
         self._write(status, build_fault(int(status[:3]), why), keep=False, unread=True)
 
-    def _turn_away(self, why: str) -> None:
-        """One connection too many: it is told so, if not too many are being told."""
-        if self.visitors.turn_away(self, self.peer.host):
-            self._refuse(b"503 Service Unavailable", why)
-        else:
-            self.closing = True
-            self.server.troubled(self.peer, why)
-            self.transport.abort()
-
     def expire(self) -> None:
         """Called by the sweep when the deadline passed."""
+        if self._unparsed or not self.is_open:  # it is we who are late
+            self.allow(self.limits.stall_seconds)
+            return
         unsent = self.transport.get_write_buffer_size()
         if unsent < self._unsent:  # slow, but it moves
             self._release(self._unsent - unsent)
@@ -459,7 +507,7 @@ def listen(host: str, port: int) -> socket.socket:
         if family == socket.AF_INET6:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 0)
         sock.bind((host, port))
-        sock.listen(1024)
+        sock.listen(BACKLOG)
     except OSError:
         sock.close()
         raise

@@ -65,6 +65,19 @@ RVMASTER_REQUESTS = Share(
         "unit/rpc/test_turns.py::test_requests_of_many_guests_leave_slots_for_the_robot",
     ),
 )
+RVMASTER_TIME = Share(
+    "processor time of control: microseconds in one turn of its loop",
+    Bounds(whole=2000, host=2000, strangers=2000, kept=0),
+    "work for the host waits (accepting connections, parsing, deciding, recording, answering); next is the host"
+    " that has used least, and all unknown hosts together count as one; a long request is divided into pieces",
+    "none: nothing is refused",
+    (
+        "unit/rpc/test_processor_time.py::test_a_turn_of_the_loop_is_bounded",
+        "unit/rpc/test_processor_time.py::test_the_robot_waits_for_one_piece_of_a_flood",
+        "unit/rpc/test_processor_time.py::test_two_hundred_unknown_hosts_are_one",
+        "unit/rpc/test_server.py::test_many_connections_are_accepted_in_one_turn",
+    ),
+)
 PARAMETER_BYTES = Share(
     "bytes of parameters",
     Bounds(whole=64 << 20, host=32 << 20, strangers=8 << 20, kept=24 << 20),

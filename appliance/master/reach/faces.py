@@ -18,6 +18,7 @@ from appliance.policy.model import Address
 from appliance.ros.uris import node_uri
 from appliance.ros.xmlrpc import build_fault, build_response
 from appliance.rpc.front import HttpLimits
+from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest, HttpServer, Peer, Refusal
 from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Visitors
@@ -34,6 +35,7 @@ class Faces:
     limits: HttpLimits
     visitors: Visitors[Address]
     turns: Turns
+    time: ProcessorTime
     refuse: Callable[[Peer], Refusal | None]
     troubled: Callable[[Peer, str], None]
     servers: dict[str, HttpServer] = field(default_factory=dict, init=False)
@@ -63,6 +65,7 @@ class Faces:
             limits=self.limits,
             visitors=self.visitors,
             turns=self.turns,
+            time=self.time,
             refuse=self.refuse,
             troubled=self.troubled,
         )

@@ -25,7 +25,7 @@ def test_ports_are_closed_once() -> None:
     In between the ports may have become another node's.
     """
     places, server = Told(), Told()
-    faces = Faces(cast(Any, None), cast(Any, places), *[cast(Any, None)] * 7)
+    faces = Faces(cast(Any, None), cast(Any, places), *[cast(Any, None)] * 8)
     faces.servers["key"] = cast(Any, server)
     uri = "http://10.0.0.5:4000/"
     host = ipaddress.ip_address("10.0.0.5")
