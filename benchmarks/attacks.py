@@ -132,12 +132,14 @@ class _NodeApi(socketserver.StreamRequestHandler):
             name, _, value = line.partition(b":")
             size = int(value) if name.lower() == b"content-length" else size
         asked = b"requestTopic" in self.rfile.read(size)
-        place = ["TCPROS", self.connection.getsockname()[0], self.server.tcpros]  # type: ignore[attr-defined]
+        assert isinstance(self.server, _NodeServer)
+        place = ["TCPROS", self.connection.getsockname()[0], self.server.tcpros]
         body = xmlrpc.client.dumps(([1, "", place if asked else 0],), methodresponse=True).encode()
         self.wfile.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body))
 
 
 class _NodeServer(socketserver.ThreadingTCPServer):
+    tcpros: int
     daemon_threads = allow_reuse_address = True
     request_queue_size = 1024
 
@@ -148,7 +150,7 @@ class Nodes:
     def __init__(self) -> None:
         self._api = _NodeServer(("", 0), _NodeApi)
         self._listener = socket.create_server(("", 0), backlog=1024)
-        self._api.tcpros = self.port = self._listener.getsockname()[1]  # type: ignore[attr-defined]
+        self._api.tcpros = self.port = self._listener.getsockname()[1]
         self._peers: list[tuple[str, socket.socket]] = []
         self._changed = threading.Condition()
         for serve in (self._api.serve_forever, self._accept):
