@@ -118,12 +118,11 @@ def _render_one(explanation: Explanation) -> Iterator[str]:
 
 def _limit(policy: Policy, request: Request) -> str:
     rule, rate = policy.limit_rule(request.resource), policy.limit_on(request)
-    together = (
-        policy.limit(Part.TOPIC, request.resource) if request.category is Category.PUBLISH else NO_LIMIT
-    )
-    parts = [str(rate)] if rate else []
+    publishes = request.category is Category.PUBLISH
+    together = policy.limit(Part.TOPIC, request.resource) if publishes else NO_LIMIT
+    parts = [f"{rate} for all its nodes together" if publishes else str(rate)] if rate else []
     if together:
-        parts.append(f"{together} for all publishers together")
+        parts.append(f"{together} for all publishers together, in equal parts for hosts that want more")
     return f"{'; '.join(parts)}, by {rule.rule}" if rule is not None and parts else ""
 
 

@@ -3,8 +3,9 @@
     /camera/** = publisher 30 Hz 10 MB/s, subscriber tablet 5 Hz
     /scan      = publisher guests 20 Hz, topic 100 Hz 2 MB/s
 
-`publisher` limits each publisher of the topic, `subscriber` each subscriber, `topic` all publishers together. Hosts may
-stand behind the first two words: then only nodes there are limited. As in every section the most specific key speaks
+`publisher` limits the publishers of the topic on each host together, `subscriber` each subscriber, `topic` all
+publishers together, which share it fairly by host. Hosts may follow the first two words: then only nodes there are
+limited. As in every section the most specific key speaks
 alone; of its clauses that mean a host the strictest counts. A limit says how much of what is allowed may pass; it
 decides no request.
 """

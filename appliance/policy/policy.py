@@ -187,6 +187,10 @@ class Policy:
         """The same as text, which is looked up with at every call."""
         return self.hosts.alike(address)
 
+    def counted_as(self, address: Address) -> str:
+        """By what a host's part of something shared is counted: as `alike`; all unknown hosts are one, named ""."""
+        return self.alike(address) if self.knows(address) else ""
+
     def has_section(self, category: Category) -> bool:
         """Whether the file has the section that decides this category."""
         return category in self.present

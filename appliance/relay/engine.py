@@ -244,8 +244,9 @@ class Engine:
 
     def _limit_topic(self, message: messages.PublicationPlaced) -> None:
         relayed, _publisher = self.topics[message.key, message.topic]
-        together = self._flows.of(message.together, message.topic)
-        relayed.flow.set(message.limit, together, self._loop.clock())
+        own = self._flows.of(message.limit, message.topic, relayed.host, holder=message.key)
+        together = self._flows.of(message.together, message.topic, holder=message.counted_as)
+        relayed.flow.set(own, together)
 
     def _limit_subscriber(self, message: messages.GrantInstalled) -> None:
         """Limit the connections of this grant so from now on."""

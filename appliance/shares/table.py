@@ -182,6 +182,20 @@ RELAY_TURN = Share(
         "unit/relay/test_loop.py::test_all_unknown_hosts_together_are_one_payer",
     ),
 )
+LIMITED_TOPIC = Share(
+    "messages and bytes of a topic with a limit, in percent of that limit (a host's is for two hosts that want all)",
+    Bounds(whole=100, host=50, strangers=50, kept=0),
+    "the messages are dropped; hosts have equal parts, and what one does not use goes to those that want more; unknown"
+    " hosts have one part together, and so have the hosts of a network that the policy names; nodes of one host share"
+    " its limit as a publisher in the same way",
+    "`rate limited`; `rosrv_relay_limited_total`",
+    (
+        "unit/relay/connections/test_flow.py::test_a_host_within_its_part_loses_nothing_because_of_others",
+        "unit/relay/connections/test_flow.py::test_names_of_a_host_share_its_limit",
+        "unit/relay/test_engine.py::test_a_limit_counts_hosts_and_not_node_names",
+    ),
+    setting="[Limits] of the policy",
+)
 RECORDER_MEMORY = Share(
     "bytes of messages that the flight recorder remembers (divided among the relays)",
     Bounds(whole=64 << 20, host=32 << 20, strangers=0, kept=0),

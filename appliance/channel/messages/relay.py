@@ -63,7 +63,8 @@ UNLIMITED = FlowLimit()
 class PublicationPlaced(Message):
     """The incarnation publishes this topic (type as registered, `*` when unknown).
 
-    `limit` is for this publication, `together` for all of the topic. Said again, it changes them.
+    `limit` is for all publications of the topic on this host, `together` for all of the topic: hosts share that one
+    equally, each as `counted_as`. Said again, it changes them.
     """
 
     key: str
@@ -71,6 +72,7 @@ class PublicationPlaced(Message):
     type: str
     limit: FlowLimit = UNLIMITED
     together: FlowLimit = UNLIMITED
+    counted_as: str = ""
 
 
 class PublicationWithdrawn(Message):

@@ -223,8 +223,12 @@ class Graph:
         for node in self.registry.live():
             for registration in node.registrations.values():
                 parts = ((Part.PUBLISHER, node.host), (Part.TOPIC, None))
-                if registration.kind is Kind.PUBLICATION and _differ(
-                    before, now, registration.resource, parts
+                if registration.kind is Kind.PUBLICATION and (
+                    _differ(before, now, registration.resource, parts)
+                    or (
+                        now.limit(Part.TOPIC, registration.resource)
+                        and before.counted_as(node.host) != now.counted_as(node.host)
+                    )
                 ):
                     effects.append(Place(node, registration.kind, registration.resource, registration.detail))
             for row in self.grants.of(node.key):

@@ -269,12 +269,14 @@ class RelayControl:
 
     def _publication(self, incarnation: Incarnation, topic: str, detail: str) -> messages.PublicationPlaced:
         policy = self.policy()
+        together = policy.limit(Part.TOPIC, topic)
         return messages.PublicationPlaced(
             incarnation.key,
             topic,
             detail,
             _flow(policy.limit(Part.PUBLISHER, topic, incarnation.host)),
-            _flow(policy.limit(Part.TOPIC, topic)),
+            _flow(together),
+            policy.counted_as(incarnation.host) if together else "",
         )
 
     # --- what the relays say ---

@@ -219,7 +219,7 @@ class Carried:
         self._limited_topics.add(name := topic if known else OTHERS)
         self.limited_messages[name, row.part] += row.messages
         whose = {
-            "publisher": "a publisher may send",
+            "publisher": "the publishers of a host may send",
             "subscriber": "a subscriber gets",
             "topic": "all publishers together may send",
         }[row.part]

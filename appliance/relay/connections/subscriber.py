@@ -9,7 +9,7 @@ Invariants:
 import socket
 from collections.abc import Callable, Mapping
 
-from appliance.relay.connections.flow import Flow
+from appliance.relay.connections.flow import FlowShare
 from appliance.relay.connections.frames import LARGE, Batch
 from appliance.relay.connections.memory import Stall
 from appliance.relay.connections.outbox import Outbox
@@ -42,7 +42,7 @@ class Subscriber:
         self.topic = topic
         self.host = host
         self.caller_id = fields["callerid"]
-        self.flow: Flow | None = None
+        self.flow: FlowShare | None = None
         self.missed = False
         self.behind_since: float | None = None
         self._loop = context.loop
@@ -120,7 +120,7 @@ class Subscriber:
             self.behind_since = self._loop.clock()
         return 0
 
-    def _limited(self, flow: Flow, batch: Batch) -> Batch | None:
+    def _limited(self, flow: FlowShare, batch: Batch) -> Batch | None:
         """The first messages, as many as its limit lets pass; the others are told."""
         count = flow.room(batch, batch.messages, self._loop.clock())
         self.missed = count < batch.messages

@@ -129,6 +129,14 @@ def test_who_is_only_in_a_limit_is_a_stranger() -> None:
     assert [known.knows(ipaddress.ip_address(f"10.0.0.{last}")) for last in (1, 2)] == [True, False]
 
 
+def test_hosts_share_as_the_policy_names_them() -> None:
+    """A host counts as itself, one of a network as that network, and all unknown hosts as one."""
+    known = compile_policy("[Nodes]\n/a = 10.0.0.1 10.1.0.0/16\n", file="p.ini")
+    addresses = ("10.0.0.1", "10.1.0.1", "10.1.0.2", "10.9.0.1", "10.9.0.2")
+    shared = [known.counted_as(ipaddress.ip_address(address)) for address in addresses]
+    assert shared == ["10.0.0.1/32", "10.1.0.0/16", "10.1.0.0/16", "", ""]
+
+
 def test_explain_says_the_limit_and_its_line() -> None:
     """Of a request that is allowed, for its own part and for all together."""
     limits = policy("/scan = publisher guests 20 Hz 1500 kB/s, topic 100 Hz, subscriber 5 Hz")
@@ -137,7 +145,10 @@ def test_explain_says_the_limit_and_its_line() -> None:
         for category in (Category.PUBLISH, Category.SUBSCRIBE)
     ]
     line = "[Limits] /scan (p.ini:13)"
-    assert f"  limit: 20 Hz, 1.5 MB/s; 100 Hz for all publishers together, by {line}" in publish
+    own, all_hosts = "for all its nodes together", "for all publishers together, in equal parts"
+    assert (
+        f"  limit: 20 Hz, 1.5 MB/s {own}; 100 Hz {all_hosts} for hosts that want more, by {line}" in publish
+    )
     assert f"  limit: 5 Hz, by {line}" in subscribe
     call = explain(limits, Request(GUEST, "/lidar", Category.COMMAND, "getPid"))
     assert call.limit == ""

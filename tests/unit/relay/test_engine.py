@@ -40,6 +40,7 @@ from appliance.channel.messages import (
     UpstreamRefused,
     UpstreamWanted,
 )
+from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.upstream import Publisher
 from appliance.relay.limits import MIB
 from appliance.ros.tcpros import (
@@ -607,6 +608,34 @@ def test_limits_are_kept_for_publishers_and_for_each_subscriber_and_change_while
     world.state(PublicationPlaced("k", "/chatter", "*"))
     publisher.send(b"".join(frames * 20))
     world.gets(quick, b"".join(frames * 20))
+
+
+def test_a_limit_counts_hosts_and_not_node_names(world: World) -> None:
+    """Nodes of one host share its limit; of a topic's limit a host has its part, whatever another has sent."""
+    publishers = []
+    for key, host, topic in (
+        ("g", "10.9.9.9", "/own"),
+        ("h", "10.9.9.9", "/own"),
+        ("g", "10.9.9.9", "/all"),
+        ("h", "10.9.9.9", "/all"),
+        ("r", "10.0.0.1", "/all"),
+    ):
+        if (key, host) not in publishers:
+            publishers.append((key, host))
+            world.state(NodePlaced(key, f"/{key}", host), world.listen())
+        own, together = FlowLimit(messages=10), FlowLimit(messages=16)
+        limits = (own, UNLIMITED) if topic == "/own" else (UNLIMITED, together)
+        world.state(PublicationPlaced(key, topic, "*", *limits, counted_as=host))
+    batch = Batch(memoryview(encode_frame(b"x") * 20), 20, None)
+    passed = []
+    for key, topic in (("g", "/own"), ("h", "/own"), ("g", "/all"), ("h", "/all"), ("r", "/all")):
+        flow = world.engine.topics[key, topic][0].flow
+        passing = flow.passing(batch, world.loop.clock(), latching=False)
+        passed.append(0 if passing is None else passing.messages)
+    mine, guest, robot = sum(passed[:2]), sum(passed[2:4]), passed[4]
+    assert mine <= 6
+    assert guest <= 7, "of the sixteen a host may have its part and what is common at once"
+    assert robot >= 2, "whatever the guest has sent first"
 
 
 def test_a_flood_beyond_its_limit_delays_no_other_topic(world: World) -> None:

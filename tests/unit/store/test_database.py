@@ -9,7 +9,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -345,7 +346,10 @@ def test_a_closed_file_of_statements_refuses_every_use(tmp_path: Path) -> None:
     with (tmp_path / "another").open("wb") as another:
         another.write(b"untouched")
         another.flush()
-        for use in (lambda: ahead.append([("INSERT", ())]), ahead.clear, ahead.sync, lambda: ahead.taken(0)):
+        insert: list[Statement] = [("INSERT", ())]
+        uses: list[Callable[[], None]] = [ahead.clear, ahead.sync, partial(ahead.taken, 0)]
+        uses.append(partial(ahead.append, insert))
+        for use in uses:
             with pytest.raises(WriteAheadClosedError, match=r"closed already.*state\.ahead"):
                 use()
         ahead.close()

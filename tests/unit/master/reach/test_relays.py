@@ -334,7 +334,12 @@ async def test_limits_of_the_policy_are_stated_and_stated_again_when_they_change
     before, world.policy = world.policy, policy(line)
     world.limits_changed(before, world.policy)
     placed = messages.PublicationPlaced(
-        "key", "/right", "std_msgs/String", messages.FlowLimit(30), messages.FlowLimit(bytes=1e6)
+        "key",
+        "/right",
+        "std_msgs/String",
+        messages.FlowLimit(30),
+        messages.FlowLimit(bytes=1e6),
+        world.policy.counted_as(HOST),
     )
     grant = messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear", messages.FlowLimit(5))
     assert (first.heard(), second.heard()) == ([], [placed, grant])

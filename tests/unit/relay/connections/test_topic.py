@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 import pytest
 
 from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, TopicTraffic
+from appliance.relay.connections.flow import Flow
 from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.topic import Recorder, RelayedTopic
 from tests.support.relay_memory import share
@@ -159,7 +160,7 @@ def test_what_is_beyond_a_limit_goes_to_no_monitor_and_to_no_subscriber() -> Non
     story, judged = Story(), []
     member = story.join()
     story.topic.monitor(lambda batch: judged.append(batch.first) or batch, wanted=True)  # type: ignore[func-returns-value]  # it is told if it is asked
-    story.topic.flow.set(FlowLimit(messages=2), None, story.now)
+    story.topic.flow.set(Flow(FlowLimit(messages=2), story.now).of(""), None)
     story.topic.upstream_opened(HEADER | {"latching": "1"})
     for number in range(4):
         story.receive(batch(b"%d" % number))
