@@ -75,7 +75,8 @@ def _policy(status: Status) -> Iterator[Alarm]:
 def _monitors(status: Status) -> Iterator[Alarm]:
     monitors = status.monitors
     for name in monitors.held:
-        text = f"{name} holds its topics after a restart of the relay: resume it when that is safe"
+        why = monitors.why_held.get(name, "a relay was restarted")
+        text = f"{name} holds its topics: {why}; resume it when that is safe (rosrv monitor resume {name})"
         yield Alarm(kind=f"monitor-held:{name}", severity="alarm", text=text, about="monitors")
     for name in monitors.failing:
         text = f"{name} is failing: its actions faulted again and again"

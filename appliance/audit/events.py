@@ -46,6 +46,7 @@ EVENTS: dict[str, str] = {
     " publish, or `missed`: what it was not given.",
     "monitor resumed": "The topics that a monitor held after a restart go on; `detail` has who.",
     "monitors restarted": "A new relay process: monitors began in their initial state, some hold their topics.",
+    "topics held": "A monitor's state was lost, so it holds its topics until an operator resumes it.",
     "monitor verdict": "A property of a monitor is in a category that is handled; `detail` has logic and category, of a"
     " parametric specification the `binding`, `at` its place, `why` which events alone give the verdict,"
     " and `conditions` what they compared.",
@@ -123,6 +124,7 @@ SEVERITIES: dict[str, Severity] = {
         ),
         Severity.ALARM: (
             "forwarding gap", "monitors restarted", "probe failed", "publication refused", "records lost",
+            "topics held",
         ),
     }.items()
     for name in names

@@ -109,6 +109,7 @@ KINDS: dict[str, Kind] = {
     "trial observed": Kind(FINDING, _FOUND, _LOGGED),
     "monitor resumed": Kind(ENTITY, _RESUME, about="Monitor"),
     "monitors restarted": Kind(LIFECYCLE, _RESTART),
+    "topics held": Kind(LIFECYCLE, _RESTART),
     "monitor verdict": Kind(FINDING, _FOUND, _DETECTED),
     "message dropped": Kind(FINDING, _FOUND, _DROPPED),
     "message changed": Kind(FINDING, _FOUND, _CORRECTED),

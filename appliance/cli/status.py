@@ -64,7 +64,8 @@ def troubles_of(body: Status) -> list[str]:
     if monitors.refused:
         found.append(f"the relay does not take the specifications: {monitors.refused[0]}")
     if monitors.held:
-        found.append(f"topics are held: rosrv monitor resume {' '.join(monitors.held)}")
+        why = "".join(f" ({name}: {reason})" for name, reason in monitors.why_held.items())
+        found.append(f"topics are held{why}: rosrv monitor resume {' '.join(monitors.held)}")
     if monitors.failing:
         found.append(f"monitors fail: {', '.join(monitors.failing)}; their messages are dropped")
     relay = no_relay(body.relay)

@@ -44,6 +44,7 @@ def monitors_status(monitors: Monitors) -> MonitorsState:
         differs_from_folder=monitors.differs_from_folder,
         confirm_by=monitors.confirm_by,
         trials=[row.name for row in rows if row.trial],
+        why_held={row.name: row.why_held for row in rows if row.why_held},
     )
 
 
@@ -76,6 +77,7 @@ def _state(monitors: Monitors, name: str) -> answers.MonitorState:
         missed=row.missed if row is not None else 0,
         slices=row.slices if row is not None else 0,
         slice_limit=row.slice_limit if row is not None else 0,
+        why_held=monitors.rollout.why_held.get(name, ""),
         margins=[]
         if row is None
         else [_margin(margin, monitors.sources.files.get(row.file, "")) for margin in row.margins],

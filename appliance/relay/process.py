@@ -12,12 +12,24 @@ from dataclasses import replace
 from typing import Any
 
 from appliance.channel.channel import Channel
-from appliance.channel.messages import Lifeline, LinkOpened, Ping, Pong, Ready, RelayLink, RingGiven, Stop
+from appliance.channel.messages import (
+    Lifeline,
+    LinkOpened,
+    Ping,
+    Pong,
+    Ready,
+    RelayLink,
+    RingGiven,
+    StateGiven,
+    Stop,
+)
 from appliance.relay.connections.links import Link
 from appliance.relay.connections.sockets import congestion_control
 from appliance.relay.engine import Engine
 from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
+from appliance.relay.monitors.keeper import Keeper
+from appliance.relay.monitors.state_memory import mapped
 from appliance.relay.recorder_ring import Recorded
 
 _DESCRIPTORS_BESIDE = 1024
@@ -39,6 +51,7 @@ class RelayProcess:
         self._engine = Engine(self._loop, limits)
         self._lifeline = Link(self._loop, Channel(lifeline, Lifeline), self._obey, self._supervisor_gone)
         self._control: Link | None = None
+        self._earlier: list[memoryview] = []
 
     def run(self) -> None:
         """Serve until told to stop."""
@@ -67,8 +80,19 @@ class RelayProcess:
             self._open_control(socket.socket(fileno=descriptors[0]))
         elif isinstance(message, RingGiven):
             self._engine.record(Recorded(message, descriptors[0], self._engine.middle.now))
+        elif isinstance(message, StateGiven):
+            self._keep_state(message, descriptors[0])
         else:
             raise TypeError(f"the supervisor sent a relay {type(message).__name__}")
+
+    def _keep_state(self, given: StateGiven, descriptor: int) -> None:
+        """Map a memory for the state of monitors; with its own, keep it there from now on."""
+        memory = mapped(descriptor, writable=given.own)
+        if given.own:
+            self._engine.middle.remember(Keeper(given, memory, self._earlier))
+            self._earlier = []
+        else:
+            self._earlier.append(memory)
 
     def _supervisor_gone(self, reason: str) -> None:
         logging.getLogger(__name__).error("relay %s ends: its supervisor is gone (%s)", self._index, reason)

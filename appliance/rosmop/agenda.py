@@ -34,7 +34,7 @@ class Agenda:
     def let_go(self) -> None:
         """The set is gone: its monitors have no part any more that has them."""
         for monitor in self._monitors:
-            monitor.steps, monitor.timers, monitor.home = (), (), None
+            monitor.steps, monitor.timers, monitor.home, monitor.group = (), (), None, None
         self._monitors = ()
 
     def has_come(self, time_ns: int) -> bool:
@@ -106,6 +106,7 @@ class Agenda:
         due = timer.due or 0
         left_out = (time_ns - due) // timer.period + 1
         timer.due = due + left_out * timer.period
+        timer.step.monitor.touch()
         text = f"{left_out} ticks of {timer.step.name} are left out: {reason}"
         self._execution.warn(timer.step.monitor, text)
 

@@ -122,6 +122,8 @@ class SpecificationCode:
     """The comparisons that are noted, in the order of the text."""
     slicing: Slicing | None = None
     """Of a parametric specification: what its slices differ in."""
+    begins: bool = False
+    """Declared `begin`: where its state is lost it begins again and does not hold its topics."""
 
 
 @dataclass(eq=False)

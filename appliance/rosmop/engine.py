@@ -30,14 +30,29 @@ from appliance.rosmop.compiled import Compiled, EventCode
 from appliance.rosmop.execution import Asked, Execution, OnFault
 from appliance.rosmop.happened import NOBODY, Sender
 from appliance.rosmop.ir.abi import FeedModule
-from appliance.rosmop.monitor import Monitor, Step, monitors_of
+from appliance.rosmop.kept_runs import StateTooLargeError
+from appliance.rosmop.monitor import Group, Monitor, Step, monitors_of
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding, Position
+from appliance.rosmop.program import groups
+from appliance.rosmop.remembered import (
+    KeptGroup,
+    encoded,
+    guards,
+    kept_monitor,
+    refused,
+    restore,
+    shape,
+    states_of,
+    types_of,
+)
 from appliance.rosmop.runtime.context import TRIAL_BUDGET, Context
 from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.sharing import way_of
 from appliance.rosmop.slices import LIMIT
 from appliance.rosmop.walks import Prepared, Walker, Walks, walks_of
+
+_CHANGED = "its text, or the definition of a message, has changed, and its state is lost"
 
 
 def _never() -> bool:
@@ -117,6 +132,11 @@ class MonitorSet:
         self.on_fault: OnFault = on_fault
         self.patience = patience
         self._monitors = monitors_of(compiled, self.interpreter, 0, slices)
+        self.groups = tuple(_groups(compiled, self._monitors))
+        self._guards = guards(compiled)
+        self._types = types_of(compiled)
+        self._beginnings: dict[str, bytes] = {}
+        """The state in which those that guard began (`shape`), as far as it is known."""
         self.steps: dict[str, tuple[Step, ...]] = {}
         self._contexts: dict[str, tuple[Context, ...]] = {}
         self._silent: dict[tuple[str, int], Prepared] = {}
@@ -287,6 +307,8 @@ class MonitorSet:
         """Offer the walks of this module, which was written of these specifications without those on trial."""
         self._silent.clear()
         self._walks = walks_of(self.compiled, module, self.interpreter, self._monitors, self._agenda.when_due)
+        for group in self.groups:
+            group.home = group.monitors[0].home
 
     def explain_when(self, asked: Asked, tried: Asked) -> None:
         """Explain only verdicts that are asked for, by themselves and the source of the message; and those on trial."""
@@ -356,16 +378,73 @@ class MonitorSet:
         on one of them starts its timers with its first message. With `restarted`, specifications with the
         modifier `hold` block their topics until `resume`; none on trial does.
         """
-        outcome = self._start(self._monitors, time_ns, expected, restarted=restarted)
+        outcome = self._start(self._monitors, time_ns, expected)
+        for monitor in self._monitors if restarted else ():
+            monitor.held = monitor.code.hold
         return self._with_trials(outcome, [trial.start(time_ns, expected) for trial in self.trials])
 
-    def _start(
-        self, monitors: Sequence[Monitor], time_ns: int, expected: frozenset[str] | None, *, restarted: bool
+    def state_of(self, group: Group) -> bytes:
+        """The state of a group as data; of one that is too large, why it is not kept."""
+        try:
+            states = [
+                kept_monitor(monitor, self.interpreter.variables, self._types[monitor.name])
+                for monitor in group.monitors
+            ]
+            data = encoded(states)
+        except StateTooLargeError as error:
+            data = refused(str(error))
+        group.changed = False
+        if group.home is not None:
+            group.home.left = False
+        return data
+
+    def recover(
+        self, kept: Sequence[KeptGroup], lost: Mapping[str, str], time_ns: int, *, restarted: bool = False
     ) -> Outcome:
+        """Begin where earlier processes ended: specifications go on with the state that was `kept`, the last of each.
+
+        Those of which the state is `lost` (why; "": of all), or cannot be used, begin; they hold their topics if
+        `hold_lost` says so. With `restarted`, those with the modifier `hold` hold them in any case.
+        """
+        states, unread = states_of(kept)
+        fresh, reasons = [], {**lost, **unread}
+        for monitor in self._monitors:
+            state = states.get(monitor.name)
+            if state is None:
+                fresh.append(monitor)
+                if "" in lost:
+                    reasons.setdefault(monitor.name, lost[""])
+                continue
+            try:
+                if (state.identity, state.types) != (monitor.code.identity, self._types[monitor.name]):
+                    raise ValueError(_CHANGED)
+                restore(monitor, state, self.interpreter.variables, self.compiled, time_ns)
+            except ValueError as error:
+                reasons[monitor.name] = str(error)
+                fresh.append(monitor)
+        self._index()
+        outcome = self._start(fresh, time_ns, None)
+        for monitor in fresh:
+            if monitor.name in reasons:
+                self.hold_lost(monitor, reasons[monitor.name])
+        for monitor in self._monitors if restarted else ():
+            monitor.held = monitor.held or monitor.code.hold
+        return self._with_trials(outcome, [trial.start(time_ns) for trial in self.trials])
+
+    def hold_lost(self, monitor: Monitor, why: str) -> None:
+        """The monitor began again because its state is lost: it holds its topics if it is declared `hold`, or acts by a
+        state and is not declared `begin`.
+        """
+        if monitor.code.hold or (monitor.name in self._guards and not monitor.code.begins):
+            monitor.hold(why)
+
+    def _start(self, monitors: Sequence[Monitor], time_ns: int, expected: frozenset[str] | None) -> Outcome:
         self.began = tuple(monitor.name for monitor in monitors)
         outcome = self._execution.begin(monitors, time_ns)
         for monitor in monitors:
-            monitor.held = restarted and monitor.code.hold
+            monitor.touch()
+            if monitor.name in self._guards:
+                self._beginnings[monitor.name] = shape(monitor, self.interpreter.variables)
             awaited = expected is not None and any(step.event.topic in expected for step in monitor.steps)
             for timer in monitor.timers:
                 timer.due = None if awaited else time_ns + timer.period
@@ -398,12 +477,17 @@ class MonitorSet:
             for part in (before, *before.trials)
             for monitor in part.monitors
         }
+        departed = {monitor.name for monitor in before.monitors if before.has_departed(monitor)}
+        self._beginnings |= before._beginnings
         others = _redefined(before.definitions, self.definitions)
         tried = [trial._follow(known, others, time_ns) for trial in self.trials]
         for monitor in self.tried:
-            monitor.held = False
+            monitor.resume()
         known = {name: found for name, found in known.items() if name not in incomplete}
         outcome = self._follow(known, others, time_ns)
+        for monitor in self._monitors:
+            if monitor.name in departed.intersection(self.began):
+                self.hold_lost(monitor, _CHANGED)
         was_tried, is_tried = ({monitor.name for monitor in part.tried} for part in (before, self))
         for monitor in (*self._monitors, *self.tried):
             if (monitor.name in was_tried) is not (monitor.name in is_tried):
@@ -425,10 +509,18 @@ class MonitorSet:
             else:
                 fresh.append(monitor)
         self._index()
-        outcome = self._start(fresh, time_ns, None, restarted=False)
+        outcome = self._start(fresh, time_ns, None)
         for monitor in fresh:  # only an operator lets the topics go on
-            monitor.held = monitor.code.hold and monitor.name in known and known[monitor.name][0].held
+            if monitor.name in known and (earlier := known[monitor.name][0]).held:
+                self.hold_lost(monitor, earlier.why_held)
         return outcome
+
+    def has_departed(self, monitor: Monitor) -> bool:
+        """Whether a monitor that guards is, or may be, in another state than that in which it began."""
+        if monitor.name not in self._guards:
+            return False
+        beginning = self._beginnings.get(monitor.name)
+        return beginning is None or shape(monitor, self.interpreter.variables) != beginning
 
     def _with_trials(self, outcome: Outcome, tried: Sequence[Outcome]) -> Outcome:
         outcome.tried = tried
@@ -447,6 +539,7 @@ class MonitorSet:
                 continue
             changed.append(monitor)
             monitor.come_home()
+            monitor.touch()
             monitor.enabled = wanted
             if wanted:
                 for timer in monitor.timers:
@@ -461,7 +554,9 @@ class MonitorSet:
 
     def resume(self, name: str) -> None:
         """Let a held specification carry its topics again; raises KeyError."""
-        self.monitor(name).held = False
+        monitor = self.monitor(name)
+        monitor.resume()
+        monitor.touch()
 
     # What happens
 
@@ -529,7 +624,8 @@ class MonitorSet:
             step.past, step.told = old_step.past, old_step.told
         for timer, ticking in zip(monitor.timers, before.timers, strict=True):
             timer.due, timer.ticked = ticking.due, ticking.ticked
-        monitor.enabled, monitor.held, monitor.seen = before.enabled, before.held, before.seen
+        monitor.enabled, monitor.seen = before.enabled, before.seen
+        monitor.held, monitor.why_held = before.held, before.why_held
         monitor.broken = before.broken
         monitor.faults = before.faults
 
@@ -573,6 +669,16 @@ class MonitorSet:
             return False
 
         return tap
+
+
+def _groups(compiled: Compiled, monitors: Sequence[Monitor]) -> Iterator[Group]:
+    for found in groups(compiled.specifications):
+        own = tuple(monitors[number] for number in found.specifications)
+        ways = {step.event.way for monitor in own for step in monitor.steps if step.event.way is not None}
+        group = Group(own, frozenset(ways))
+        for monitor in own:
+            monitor.group = group
+        yield group
 
 
 def _redefined(before: Definitions, after: Definitions) -> frozenset[str]:

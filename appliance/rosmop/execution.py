@@ -69,6 +69,7 @@ class Execution:
     def message(self, steps: Sequence[Step], buffer: Buffer, outcome: Outcome, sender: Sender) -> None:
         """Let the events of a message happen that is received at the time of the outcome; at least one step."""
         steps[0].monitor.come_home()
+        steps[0].monitor.touch()
         self._turn.now = outcome.time
         self._sender = sender
         self._taking_back.clear()
@@ -96,6 +97,7 @@ class Execution:
         self._sender = NOBODY
         self._taking_back.clear()
         step.monitor.come_home()
+        step.monitor.touch()
         outcome = Outcome(time=time_ns)
         outcome.timer = step.name
         self._turn.now = time_ns
@@ -123,6 +125,7 @@ class Execution:
         """Tell a property that its deadline has passed."""
         self._sender = NOBODY
         monitor.come_home()
+        monitor.touch()
         deadline = running.run.deadline or 0
         word = "timeout" if running.code.property.logic == "tfsm" else "deadline"
         outcome = Outcome(time=deadline)
@@ -319,7 +322,8 @@ class Execution:
     def _first(self, monitor: Monitor, message: Message, outcome: Outcome) -> bool:
         """A message for a monitor that has seen none yet, or that holds its topics; whether it was dropped."""
         if monitor.held:
-            outcome.reason = f"{monitor.name} holds its topics until it is resumed"
+            why = f" ({monitor.why_held})" if monitor.why_held else ""
+            outcome.reason = f"{monitor.name} holds its topics until it is resumed{why}"
         elif monitor.broken and self.on_fault == "drop":
             outcome.reason = f"{monitor.name} could not begin: its first values or `init` faulted"
         if outcome.reason is not None:

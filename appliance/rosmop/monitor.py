@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Protocol, cast
 
+import msgspec
+
 from appliance.rosmop.compiled import Compiled, EventCode, PropertyCode, SpecificationCode
 from appliance.rosmop.ir.interpreter import Interpreter
 from appliance.rosmop.logics.interface import FormulaRun, Run
@@ -18,11 +20,52 @@ FAILING_AFTER = 10
 """Faults after which a monitor is shown as failing."""
 
 
+class CellNames(msgspec.Struct, frozen=True, array_like=True):
+    """What is in the bytes that a module has of a group's state.
+
+    First the states of properties (monitor, number), then the variables (monitor, name; None for one that is not state)
+    with their `struct` codes, then the clocks of the properties with these numbers.
+    """
+
+    properties: list[tuple[str, int]] = []
+    variables: list[tuple[str, str] | None] = []
+    code: str = ""
+    clocks: list[int] = []
+
+
 class Home(Protocol):
     """Where the state of monitors is: with Python, or in a module."""
 
+    names: CellNames
+    """What `cells` are."""
+
     def leave(self) -> None:
         """See that Python has it."""
+
+    size: int
+    """Bytes of `cells`; 0 where the state is more than numbers."""
+
+    left: bool
+    """Python has had the state since it was last kept."""
+
+    def cells(self) -> bytes | None:
+        """The state as it is in the module's memory, if it is only numbers; empty if Python has it, and had it when it
+        was last kept. None: it is to be kept as Python has it.
+        """
+
+
+@dataclass(eq=False, slots=True)
+class Group:
+    """The monitors that share topics or variables, so that a message changes the state of one group at most.
+
+    `ways` are their topics and parts of services; `changed`: something else than the module may have changed their
+    state since that was last kept.
+    """
+
+    monitors: tuple["Monitor", ...]
+    ways: frozenset[str]
+    home: Home | None = None
+    changed: bool = True
 
 
 Handler = Callable[[Message | None], None]
@@ -99,6 +142,8 @@ class Monitor:
     timers: tuple[Timer, ...] = ()
     enabled: bool = True
     held: bool = False
+    why_held: str = ""
+    """Why, if it is because its state was lost."""
     broken: bool = False
     """Its first values or `init` faulted, so it has no state to judge by."""
     faults: int = 0
@@ -110,6 +155,8 @@ class Monitor:
     """Of a parametric specification: its states. `properties` have the runs of the one that was looked at last."""
     slice: Slice | None = None
     """The slice that was looked at last."""
+    group: Group | None = None
+    """Those whose state changes together with its own."""
     trail: deque[Bound] = field(default_factory=partial(deque, maxlen=TRAIL))
     """Of a parametric specification: what happened last in all slices."""
 
@@ -122,6 +169,19 @@ class Monitor:
     def failing(self) -> bool:
         """Whether it has faulted so often, or could not even begin, that somebody should look."""
         return self.broken or self.faults >= FAILING_AFTER
+
+    def hold(self, why: str = "") -> None:
+        """Drop the messages of its topics until `resume`."""
+        self.held, self.why_held = True, why
+
+    def resume(self) -> None:
+        """Let the messages of its topics go on."""
+        self.held, self.why_held = False, ""
+
+    def touch(self) -> None:
+        """Note that its state, or that of others in its group, is about to change."""
+        if self.group is not None:
+            self.group.changed = True
 
     def come_home(self) -> None:
         """Before Python looks at its state, or at that of others on its topics, it is with Python."""

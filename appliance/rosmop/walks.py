@@ -36,7 +36,7 @@ from appliance.rosmop.ir.kept import KeptMessage, element_code, entered, left
 from appliance.rosmop.ir.output import HEAD
 from appliance.rosmop.ir.values import Values, struct_code
 from appliance.rosmop.machine import Machine, MachineTrap
-from appliance.rosmop.monitor import Monitor, RunningProperty
+from appliance.rosmop.monitor import CellNames, Monitor, RunningProperty
 from appliance.rosmop.outcomes import Outcome, Verdict
 from appliance.rosmop.program import groups
 from appliance.rosmop.runtime.context import Context, LogLine, Published
@@ -124,8 +124,12 @@ class Home:
         *,
         values: Values,
         due: Due,
+        properties: Sequence[tuple[str, int]] = (),
+        known: Mapping[str, tuple[str, str]] = MappingProxyType({}),
     ) -> None:
-        """`throttles`: specification, site, and address of when output there was last due."""
+        """`throttles`: specification, site, and address of when output there was last due. `properties` are those of
+        `running` by monitor and number, `known` the variables by monitor and name.
+        """
         self.machine = machine
         self._memory = machine.memory
         self._base = cells.base
@@ -149,6 +153,13 @@ class Home:
             )
             for name, (at, kind) in cells.records.items()
         }
+        codes = "".join(_cell(kind) for _, kind in variables.values())
+        self.names = CellNames([*properties], [*map(known.get, variables)], codes, [*cells.clocks])
+        self._end = cells.base + self._cells.size
+        self._clocked = [*cells.clocks.values()]
+        plain = not (self._spans or self._records)
+        self.size = self._cells.size + _CLOCK.size * len(self._clocked) if plain else 0
+        self.left = False
         self._generation = cells.generation
         self._source, self._until = cells.source, cells.until
         self._clocks = [(running[number], address) for number, address in cells.clocks.items()]
@@ -186,6 +197,20 @@ class Home:
         _TIME.pack_into(self._memory, self._until, _NEVER if due is None else min(due - 1, _NEVER))
         self._inside = True
 
+    def cells(self) -> bytes | None:
+        """The state as it is in the module's memory, if it is only numbers; empty if Python has it, and had it when it
+        was last kept. None: it is to be kept as Python has it.
+        """
+        if not self._inside and not self.left:
+            return b""
+        if self.left or not self.size:
+            return None
+        memory = self._memory
+        cells = memory[self._base : self._end].tobytes()
+        for address in self._clocked:
+            cells += memory[address : address + _CLOCK.size]
+        return cells
+
     def hasten(self) -> None:
         """A deadline is earlier than what was due."""
         self.leave()
@@ -199,7 +224,7 @@ class Home:
         """Give it back to Python."""
         if not self._inside:
             return
-        self._inside, self.prepared = False, None
+        self._inside, self.prepared, self.left = False, None, True
         values = self._cells.unpack_from(self._memory, self._base)
         for running, state in zip(self._running, values, strict=False):
             running.run.state = state  # type: ignore[attr-defined]  # of tables
@@ -527,7 +552,18 @@ def walks_of(
             for (context, site), address in module.throttles.items()
             if context in contexts
         ]
-        home = Home(machine, cells, interpreter, running, throttles, values=values, due=due)
+        specifications = [compiled.specifications[number] for number in group.specifications]
+        home = Home(
+            machine,
+            cells,
+            interpreter,
+            running,
+            throttles,
+            values=values,
+            due=due,
+            properties=[(monitors[number].name, index) for number, index in group.properties],
+            known={code: (one.name, name) for one in specifications for name, code in one.variables.items()},
+        )
         for number in group.specifications:
             monitors[number].home = home
         for (topic, _), events in zip(group.component.topics, group.events, strict=True):

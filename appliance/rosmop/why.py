@@ -118,6 +118,12 @@ class Exits:
         """Keep it from now on where the owner has it."""
         self.room, self.owner = room[: len(self.room)], owner
 
+    def forget(self, run: Any, _time_ns: int) -> None:
+        """The run goes on from where another process left it: nothing is known of how it got there."""
+        self._at = run.state
+        for state in range(len(self._automaton)):
+            ENTRY.pack_into(self.room, ENTRY.size * state, 0, _EVENT, 0)
+
     def follow(self, earlier: "Exits | Steps") -> "Exits":
         """Go on from what another has kept of the same property."""
         assert isinstance(earlier, Exits)  # noqa: S101  it has the same tables
@@ -139,7 +145,11 @@ class Exits:
         state = self._automaton.initial
         while state != self._at:
             time, who, number = ENTRY.unpack_from(self.room, ENTRY.size * state)
-            if len(found) == len(self._automaton) or (found and time < found[-1].time):
+            if (
+                who & _EVENT == _EVENT
+                or len(found) == len(self._automaton)
+                or (found and time < found[-1].time)
+            ):
                 return None
             sender = Sender(who >> 32, number, who >> 24 & 0xFF)
             found.append(Happened(who & 0xFFFFFF, time, sender))
@@ -210,6 +220,11 @@ class Steps:
         categories = run.step(event, time_ns)
         self._steps.append(Happened(event, time_ns, sender))
         return categories
+
+    def forget(self, run: Run, time_ns: int) -> None:
+        """The run goes on from where another process left it: what happens next is explained by it as it is now."""
+        self.begin(time_ns)
+        self._before = None if isinstance(run, BoundedRun) else copy.copy(run)
 
     def add(self, happened: Happened) -> None:
         """It has happened."""
@@ -290,6 +305,11 @@ class ClockedSteps(Steps):
         """Let the run take the event."""
         self._note(run, event, time_ns, sender)
         return run.step(event, time_ns)
+
+    def forget(self, run: Run, time_ns: int) -> None:
+        """The run goes on from where another process left it."""
+        del run
+        self.begin(time_ns)
 
     def expire(self, run: Run) -> Categories:
         """Let the deadline of the run pass."""

@@ -3,9 +3,8 @@
 A load is tried first: every relay that gives nothing up is told what it is to have, before anything is carried
 elsewhere; so is one that comes meanwhile. When all have taken it, what moves is withdrawn where it was, the allocation
 changes, and it is placed where its monitors are now: no message goes past its monitors. Those that give something up
-are told then; a load is over when they have said so (`all_taken`). A monitor whose file moves begins in its initial
-state on the other relay (its variables are in the memory of the one it was on); one that is declared `hold` then holds
-its topics.
+are told then; a load is over when they have said so (`all_taken`). A monitor whose file moves loses its state, which is
+with the relay that it was on: what acts by a state holds its topics then.
 """
 
 import asyncio
@@ -76,7 +75,7 @@ class Rollout:
     _numbers: Iterator[int] = field(default_factory=lambda: itertools.count(time.monotonic_ns()))
     _refusals: dict[int, list[str]] = field(default_factory=dict)
     _began: set[str] = field(default_factory=set)  # by what is being changed
-    _held: dict[int, set[str]] = field(default_factory=dict)
+    _held: dict[int, dict[str, str]] = field(default_factory=dict)
     _rows: dict[int, list[messages.MonitorRow]] = field(default_factory=dict)
 
     @property
@@ -87,7 +86,12 @@ class Rollout:
     @property
     def held(self) -> set[str]:
         """The monitors that hold their topics."""
-        return {name for names in self._held.values() for name in names}
+        return set(self.why_held)
+
+    @property
+    def why_held(self) -> dict[str, str]:
+        """The monitors that hold their topics, and why their state was lost (empty: it was not)."""
+        return {name: why for names in self._held.values() for name, why in names.items()}
 
     async def start(self, now: Revision, *, restarted: bool, kept: str) -> None:
         """These are in force. After a crash of control (`restarted`) the relays go on with what they have.
@@ -129,7 +133,7 @@ class Rollout:
     def resumed(self, monitor: str) -> None:
         """A monitor holds its topics no longer."""
         for names in self._held.values():
-            names.discard(monitor)
+            names.pop(monitor, None)
 
     # --- a change ---
 
@@ -297,8 +301,8 @@ class Rollout:
     def received(self, message: messages.Message, relay: int) -> None:
         """A message of a relay about its monitors."""
         match message:
-            case messages.SpecificationsTaken(_, began, held, statement):
-                self._taken(relay, statement, began, held)
+            case messages.SpecificationsTaken():
+                self._taken(relay, message)
             case messages.SpecificationsRefused(number, findings, statement):
                 self._refused(relay, number, findings, statement)
             case messages.MonitorsCounted(rows):
@@ -310,16 +314,19 @@ class Rollout:
         for at, statement in [entry for entry in self._waiting if entry[0] == relay]:
             self._answer(at, statement, ["a relay process ended while it took them: try again"])
 
-    def _taken(self, relay: int, statement: int, began: list[str], held: list[str]) -> None:
+    def _taken(self, relay: int, taken: messages.SpecificationsTaken) -> None:
+        statement, began, held = taken.statement, taken.began, taken.held
         self._refusals.pop(relay, None)
-        self._held[relay] = set(held)
+        self._say_held(relay, taken)
+        self._held[relay] = {name: taken.because.get(name, "") for name in held}
         if (relay, statement) in self._waiting:
             self._began |= set(began)
-        if relay in self._fresh and began:
+        if relay in self._fresh and (began or held):
+            parts = [f"{', '.join(began)} began in the initial state"] if began else []
+            parts += [f"{', '.join(held)} hold their topics until resumed"] if held else []
             self.trail.happened(
                 "monitors restarted",
-                f"a new relay process: {', '.join(began)} began in the initial state"
-                + (f"; {', '.join(held)} hold their topics until resumed" if held else ""),
+                f"a new relay process: {'; '.join(parts)}",
                 category="monitor",
                 resource="",
                 monitors=began,
@@ -327,6 +334,20 @@ class Rollout:
             )
         self._fresh.discard(relay)
         self._answer(relay, statement, [])
+
+    def _say_held(self, relay: int, taken: messages.SpecificationsTaken) -> None:
+        """Record those that hold their topics from now on because their state is lost, and what lets them go on."""
+        before = self._held.get(relay, {})
+        for name, why in taken.because.items():
+            if before.get(name) != why:
+                self.trail.happened(
+                    "topics held",
+                    f"{name} holds its topics: {why}; when it is safe: rosrv monitor resume {name}",
+                    severity=Severity.ALARM,
+                    category="monitor",
+                    resource="",
+                    monitor=name,
+                )
 
     def _refused(self, relay: int, number: int, findings: list[str], statement: int) -> None:
         if number == self._now.number:

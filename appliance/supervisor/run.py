@@ -17,6 +17,7 @@ from appliance.network.protect import local_port_range
 from appliance.supervisor import signals
 from appliance.supervisor.enclosure import Enclosure, Ports, enclosure_of
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.ports import free_port, require_free, spare_ports
 from appliance.supervisor.privileges import keep_supervisors, raise_file_limit
 from appliance.supervisor.restore_mark import refuse_half_restored
@@ -215,6 +216,7 @@ def _supervise(
             enclosure=enclosure,
             listeners={"api": api} if api is not None else {},
             rings=Rings(settings.recorder, settings.relays) if settings.recorder.enabled else None,
+            memory=MonitorMemory(state.path, settings.relays),
         )
         async with manager.watched():
             try:

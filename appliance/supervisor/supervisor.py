@@ -42,6 +42,7 @@ from appliance.supervisor.life import (
     link,
 )
 from appliance.supervisor.listeners import KeptSockets, RefusedSocketError
+from appliance.supervisor.monitor_memory import MonitorMemory
 from appliance.supervisor.post import Post
 from appliance.supervisor.rings import Rings
 from appliance.supervisor.roles import Facts, Role
@@ -100,11 +101,13 @@ class Supervisor:
         enclosure: Enclosure | None = None,
         listeners: Mapping[str, socket.socket] | None = None,
         rings: Rings | None = None,
+        memory: MonitorMemory | None = None,
     ) -> None:
         """`admin` is handed to control; `ready` is called once, when nodes may connect; it may raise `StartError`.
 
         `listeners` are the sockets of the roles that listen; they stay open here over a role's death, so that
         connections wait for its next life. `rings` is the memory of the flight recorder; None: nothing is recorded.
+        `memory` is what relays keep the state of monitors in; None: it dies with them.
         """
         self._facts = facts
         self.posts = [Post(role, index) for role in roles for index in range(relays if role.indexed else 1)]
@@ -112,6 +115,7 @@ class Supervisor:
         self.kept.keep(ADMIN, admin.detach())
         self._listeners = dict(listeners or {})
         self._rings = rings
+        self._memory = memory
         self._ready = ready
         self.is_ready = False
         self._guard = Guard(enclosure or Enclosure(), self._tell_control)
@@ -153,6 +157,8 @@ class Supervisor:
                 listener.close()
             if self._rings is not None:
                 self._rings.close()
+            if self._memory is not None:
+                self._memory.close()
 
     def stop(self, failure: str | None = None) -> None:
         """End the appliance; `failure` is why it cannot go on, nothing for an orderly end."""
@@ -240,6 +246,8 @@ class Supervisor:
             )
         for given, descriptor in self._rings.given_to(post.role.name, post.index) if self._rings else ():
             post.life.send(given, (descriptor,))
+        for state, descriptor in self._memory.given_to(post.role.name, post.index) if self._memory else ():
+            post.life.send(state, (descriptor,))
         self._link(post)
         self._tell_processes()
 

@@ -73,6 +73,7 @@ class MonitorState(msgspec.Struct, frozen=True):
     margins: Annotated[
         list[MonitorMargin], told("of its comparisons of numbers that came up, in the order of the text")
     ] = []
+    why_held: Annotated[str, told("why its state was lost, if it holds its topics for that")] = ""
 
 
 class Monitors(msgspec.Struct, frozen=True):

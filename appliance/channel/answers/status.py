@@ -96,6 +96,9 @@ class MonitorsState(msgspec.Struct, frozen=True):
     differs_from_folder: bool
     confirm_by: Moment | None
     trials: Annotated[list[str], told("monitors on trial")] = []
+    why_held: Annotated[
+        dict[str, str], told("why the state of those was lost that hold their topics for that")
+    ] = {}
 
 
 class ForwardingState(msgspec.Struct, frozen=True):

@@ -172,10 +172,28 @@ class ApplianceStopRequested(Message):
     reason: str
 
 
+class StateGiven(Message):
+    """Supervisor gives a relay a memory for the state of its monitors: its `own`, or one of an earlier life of the
+    appliance, to be read only; those come first.
+
+    `boot` names this start of the machine; `offset` and the machine's monotonic clock are the time of monitors (ns).
+    `ended_boot` names the start of the machine in which the appliance last ended in order, at `ended_at` (ns since the
+    epoch).
+    """
+
+    descriptors: ClassVar[int] = 1
+    own: bool
+    boot: str
+    offset: int
+    ended_boot: str = ""
+    ended_at: int = 0
+
+
 Lifeline = (
     Ping | Pong | Stop | Walled | Ready | Failed | LinkOpened | SocketKept | SocketDropped | SocketRestored
     | SocketsRestored | Announced | ProcessesChanged | ClockRead | FirewallReported | ProbeFailed | ProbePassed
     | PolicyReloadRequested | RouteWanted | EndpointWanted | EndpointFound
     | TunnelsWanted | TunnelsEnclosed
-    | RingGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested | SignatureWanted | SignatureMade
+    | RingGiven | StateGiven | RouteFound | LogHeld | CompilerWanted | ApplianceStopRequested
+    | SignatureWanted | SignatureMade
 )  # fmt: skip

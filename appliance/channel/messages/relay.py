@@ -315,12 +315,15 @@ class MonitorResumed(Message):
 
 
 class SpecificationsTaken(Message):
-    """The relay has these specifications in force. `began` are the monitors that started in their initial state."""
+    """The relay has these specifications in force. `began` are the monitors that started in their initial state, `held`
+    those that hold their topics, `because` why, of those that hold them because their state is lost.
+    """
 
     revision: int
     began: list[str]
     held: list[str]
     statement: int = 0
+    because: dict[str, str] = msgspec.field(default_factory=dict)
 
 
 class SpecificationsRefused(Message):

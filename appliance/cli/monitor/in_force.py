@@ -176,7 +176,7 @@ def load(
         signatures=sent.signatures,
     )
     say_replaced(appliance.answer_or_exit(order))
-    _say_disabled(appliance, sent.files)
+    _say_idle(appliance, sent.files)
 
 
 @speaks
@@ -204,12 +204,12 @@ def reload(
     say_replaced(body)
     if body.kept:
         say(f"not of the folder, and still in force: {', '.join(body.kept)} (--prune removes them)", "yellow")
-    _say_disabled(appliance, [*body.added, *body.changed])
+    _say_idle(appliance, [*body.added, *body.changed])
 
 
 @speaks
 def resume(appliance: Appliance, names: _Names) -> None:
-    """Let the topics go on that these monitors hold since the relay was restarted (`hold` specifications).
+    """Let the topics go on that these monitors hold: their state was lost, or they are declared `hold`.
 
     Example: rosrv monitor resume safeTrigger
     """
@@ -269,9 +269,11 @@ def say_replaced(body: Replaced) -> None:
     say_deadline(body.confirm_by, "monitor")
 
 
-def _say_disabled(appliance: Appliance, files: Collection[str]) -> None:
-    """Who loads a monitor expects it to stand guard; with `--enable none` it does not yet."""
+def _say_idle(appliance: Appliance, files: Collection[str]) -> None:
+    """Print which monitors do not judge messages yet: disabled by `--enable none`, or holding their topics."""
     rows = appliance.ask_or_exit(admin.MonitorsWanted()).monitors
     names = [row.name for row in rows if row.file in files and not row.enabled and not row.trial]
     if names:
         say(f"disabled (--enable): {', '.join(names)}; rosrv monitor enable {' '.join(names)}", "yellow")
+    for row in (row for row in rows if row.why_held):
+        say(f"{row.name} holds its topics: {row.why_held}; rosrv monitor resume {row.name}", "yellow")

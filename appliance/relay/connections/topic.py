@@ -37,7 +37,6 @@ from appliance.relay.connections.flow import Part, PublicationFlow
 from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.headers import to_subscriber
 from appliance.relay.connections.memory import HostShare
-from appliance.relay.recorder_ring import LeftOut
 
 _SEEN_OF_A_HOST = 16  # subscribers that a publisher may see by name: each is a connection to it more
 
@@ -102,7 +101,7 @@ class Upstream(Protocol):
 class Recorder(Protocol):
     """The flight recorder, as a topic sees it."""
 
-    def open(self, topic: str, host: str, header: Mapping[str, str]) -> Stream | LeftOut | None:
+    def open(self, topic: str, host: str, header: Mapping[str, str]) -> Stream | None:
         """A publisher is connected; None: what it says is not recorded."""
 
 
@@ -146,7 +145,7 @@ class RelayedTopic:
         self._make_room = make_room
         self._refused = refused
         self._recorder = recorded
-        self._recording: Stream | LeftOut | None = None
+        self._recording: Stream | None = None
         self._unkept: LatchRefused | None = None
         self._fresh_until = clock() + (APPEARED if fresh else -1)
         self._header: dict[str, str] | None = None
@@ -284,8 +283,7 @@ class RelayedTopic:
             (self._pass if self.flow.limits else self._admit)(batch, since)
             return
         # Recorded when subscribers have it, so that nothing is later; monitors may change it in place meanwhile.
-        changes = self.through is not None and recording.keeps
-        view = memoryview(bytes(batch.view)) if changes else batch.view
+        view = batch.view if self.through is None else memoryview(bytes(batch.view))
         messages, first = batch.messages, batch.first
         self._pass(batch, since)
         if recording is self._recording:

@@ -68,6 +68,9 @@ class Monitors(Protocol):
     def now(self) -> int:
         """Nanoseconds."""
 
+    def keep(self, way: str) -> None:
+        """Keep the state of those that judge messages on a topic."""
+
     def look_again(self) -> None:
         """Something has happened: there is another `sight`."""
 
@@ -90,7 +93,12 @@ class Lane:
         self._source = middle.senders.number(place)
 
     def through(self, batch: Batch) -> Batch | None:
-        """The frames that go on, as the monitors leave them; None when none does."""
+        """The frames that go on, as the monitors leave them; None when none does. Their state is kept before that."""
+        judged = self._judged(batch)
+        self._middle.keep(self._place[1])
+        return judged
+
+    def _judged(self, batch: Batch) -> Batch | None:
         middle = self._middle
         now = batch.judged = middle.now()
         if self._sight is not middle.sight or now >= self._until or batch.messages > _MANY:

@@ -29,6 +29,7 @@ from appliance.channel.messages import (
     SpecificationsTaken,
 )
 from appliance.relay.loop import Loop, Timer
+from appliance.relay.monitors.keeper import Keeper
 from appliance.relay.monitors.lane import LONGEST, TOO_LONG, Lane, dropped
 from appliance.relay.monitors.loader import Loader, Result
 from appliance.relay.monitors.margins import Margins
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from appliance.rosmop.walks import Prepared, Walker
 
 _AFTER_DEFECT = 1.0
+_NO_MEMORY = "the relay process before this one ended, and nothing keeps the state of monitors"
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +94,18 @@ class Middle:
         self._changed = changed
         self.senders = Senders()
         self._margins = Margins()
-        self.observer = Observer(self.observations, publish, self._margins, self.senders)
+        self._publish = publish
+        self._keeper: Keeper | None = None
+        self.observer = Observer(self.observations, self._published, self._margins, self.senders)
         self._on_trial = Observer(
             self.observations, lambda _published: None, self._margins, self.senders, "trial "
         )
         self.trials = Trials(loop, self.now, self._on_trial)
+
+    def remember(self, keeper: Keeper) -> None:
+        """Keep the state of the monitors there, and begin with what it has; before anything is stated."""
+        self._keeper = keeper
+        self._offset = keeper.offset
 
     # --- what control states ---
 
@@ -109,6 +118,8 @@ class Middle:
                 return
             if not message.part and (self._stated is None or self.blocked):
                 self._stated, self.blocked = message, ""
+                if self._keeper is not None:
+                    self._keeper.take_nothing()
                 self._taken(message, [], None)
                 return
         if message.ahead or (self._stated is None and not self.blocked):
@@ -126,7 +137,7 @@ class Middle:
         result.explain_when(self.observer.asks, self._on_trial.asks)
         before, now, first = self.monitors, self.now(), self._stated is None or bool(self.blocked)
         if before is None:
-            outcome = result.start(now, restarted=first and message.restarted)
+            outcome = self._begun(result, now, restarted=first and message.restarted)
         else:
             incomplete = self.trials.settle()
             self._margins.take(before, now)
@@ -135,28 +146,43 @@ class Middle:
         began = list(result.began)
         self._margins.keep([monitor.name for monitor in (*result.monitors, *result.tried)], began)
         for monitor in result.monitors:
-            monitor.held = monitor.held or (
-                monitor.code.hold and monitor.name in message.moved and monitor.name in began
-            )
+            if monitor.name in message.moved and monitor.name in began and not monitor.held:
+                result.hold_lost(
+                    monitor, "it is on another relay process now, and its state was on the one before"
+                )
+        if self._keeper is not None:
+            self._keeper.take(result)
         self.observer.keep([monitor.name for monitor in result.monitors], began, now)
         self.observer.told(outcome, NOWHERE)
         self.trials.take(result, outcome)
         anew = None if first else _topics(_replaced(before, result))
         self._taken(message, began, anew)
 
+    def _begun(self, monitors: MonitorSet, now: int, *, restarted: bool) -> Outcome:
+        """The first monitors of this process begin, or go on where an earlier one ended."""
+        left = self._keeper.recovered() if self._keeper is not None else None
+        if left is not None:
+            return monitors.recover(left.groups, left.lost, now, restarted=restarted)
+        if restarted and self._keeper is None:
+            return monitors.recover((), {"": _NO_MEMORY}, now, restarted=True)
+        return monitors.start(now, restarted=restarted)
+
     def _taken(self, message: SpecificationsStated, began: list[str], anew: frozenset[str] | None) -> None:
         self.look_again()
         held: list[str] = []
+        because: dict[str, str] = {}
         if self.monitors is not None:
             both = (*self.monitors.monitors, *self.monitors.tried)
             switches = {monitor.name: self._switches.get(monitor.name, True) for monitor in both}
             switched = _topics(self.monitors.switch(switches, self.now()))
             anew = None if anew is None else anew | switched
             held = [monitor.name for monitor in self.monitors.monitors if monitor.held]
+            because = {one.name: one.why_held for one in self.monitors.monitors if one.why_held}
+            self.keep_all()
         self.schedule()
         self.trials.schedule()
         self._changed(anew)
-        self._reporter.send(SpecificationsTaken(message.revision, began, held, message.statement))
+        self._reporter.send(SpecificationsTaken(message.revision, began, held, message.statement, because))
 
     def _refuse(self, message: SpecificationsStated, findings: list[str]) -> None:
         self.look_again()
@@ -173,6 +199,7 @@ class Middle:
         if self.monitors is not None:
             switched = self.monitors.switch({name: enabled}, self.now())
             if switched:
+                self.keep_all()
                 self.schedule()
                 self.trials.schedule()
                 self._changed(_topics(switched))
@@ -185,6 +212,7 @@ class Middle:
         held = [monitor for monitor in self.monitors.monitors if monitor.name == name and monitor.held]
         for monitor in held:
             self.monitors.resume(monitor.name)
+        self.keep_all()
         return _topics(held)
 
     # --- what is asked when something changes ---
@@ -236,6 +264,22 @@ class Middle:
             "message_definition": self.monitors.definitions.full_text(name),
             "latching": "0",
         }
+
+    # --- what is kept ---
+
+    def keep(self, way: str) -> None:
+        """Keep the state of those that judge messages on a topic: before one of these is passed on."""
+        if self._keeper is not None:
+            self._keeper.keep(way)
+
+    def keep_all(self) -> None:
+        """Keep the state of all monitors."""
+        if self._keeper is not None:
+            self._keeper.keep_all()
+
+    def _published(self, published: Published) -> None:
+        self.keep_all()
+        self._publish(published)
 
     # --- messages ---
 
@@ -304,6 +348,7 @@ class Middle:
                 self.trials.wait(place, None)
         elif self.monitors.next_due != due:
             self.look_again()
+        self.keep(way_of(service, part))
         self.observer.told(outcome, place)
         self.spent += time.thread_time() - began
         self.schedule()
@@ -372,6 +417,7 @@ class Middle:
             self._due = now + int(_AFTER_DEFECT * 1e9)
             self._timer = self._loop.after(_AFTER_DEFECT, self._advance)
             return
+        self.keep_all()
         self.spent += time.thread_time() - began
         self.schedule()
 

@@ -40,7 +40,7 @@ from appliance.rosmop.types.messages import Messages, nearest, shown
 _T = TypeVar("_T")
 
 _TAKEN = "revisions"
-MODIFIERS = frozenset({"hold"})
+MODIFIERS = frozenset({"hold", "begin"})
 IGNORED_MODIFIERS = frozenset({"unsynchronized", "decentralized", "perthread", "suffix", "creation"})
 """Modifiers of MOP that say how a monitor is generated, and mean nothing here (`creation` does before an event)."""
 
@@ -165,6 +165,7 @@ def _compile(
         uses,
         tuple(sorted(names.comparisons.values(), key=lambda comparison: comparison.position)),
         slicing_of(names),
+        any(modifier.parts == ("begin",) for modifier in specification.modifiers),
     )
 
 
@@ -196,6 +197,9 @@ def _check_head(shared: Shared, specification: tree.Specification) -> None:
         elif word not in MODIFIERS:
             text = f"{shown(word)} is no modifier of a specification{nearest(word, MODIFIERS)}"
             shared.findings.append(Finding(modifier.position, "error", text))
+    if {modifier.parts[0] for modifier in specification.modifiers} >= MODIFIERS:
+        text = "`hold` and `begin` exclude each other: leave one of them out"
+        shared.findings.append(Finding(specification.position, "error", text))
     if specification.name == _TAKEN:
         text = f"no specification can be called {shown(_TAKEN)}: over REST /v1/monitors/{_TAKEN} is their history"
         shared.findings.append(Finding(specification.position, "error", text))

@@ -24,9 +24,10 @@ To take a step back (`BoundedRun.mark`) the operators' rows are copied, each cel
 from abc import ABC, abstractmethod
 from bisect import bisect_left, insort
 from collections import deque
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from appliance.rosmop.logics.formula import Formula
 from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
@@ -45,6 +46,7 @@ class Cell:
     """
 
     __slots__ = ("journal", "kind", "missing", "operands", "tells", "users", "value")
+    keeps = ("kind", "missing", "operands", "tells", "users", "value")
 
     def __init__(self, journal: "Journal") -> None:
         self.journal = journal
@@ -131,6 +133,8 @@ def _together(kind: str, operands: tuple[Value, ...]) -> bool:
 class _Row:
     """An event that an operator keeps: its time, what its operands are worth at it, and what it was asked for."""
 
+    keeps: ClassVar = ("place", "time", "left", "right", "cell")
+
     place: int
     time: int
     left: Value | None
@@ -140,6 +144,8 @@ class _Row:
 
 class _Operator(ABC):
     """An operator in a run. `ask` comes before `take` for each event, and `pass_by` between events."""
+
+    keeps: ClassVar[tuple[str, ...]] = ("rows",)
 
     def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
         self.run, self.number = run, number
@@ -237,6 +243,8 @@ class _OpenUntil(_Rows):
     becomes known concerns those pending rows only for which it was the first or the last of its kind: they are found by
     their times, so a step costs the same however many wait, unless it decides them.
     """
+
+    keeps = ("rows", "passed", "pending", "holds", "hopes", "fails", "doubts", "waits")
 
     def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
         super().__init__(run, number, instruction)
@@ -389,6 +397,8 @@ class _OpenSince(_Rows):
     `least` and `most` are behind the newest row, if all that is open were to fail, or to hold.
     """
 
+    keeps = ("rows", "window", "least", "most")
+
     def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
         super().__init__(run, number, instruction)
         self.window = Window(self.low, self.high)
@@ -424,6 +434,8 @@ class _OpenSince(_Rows):
 class _OpenPreviously(_Operator):
     """`previously` of what may be open: what that was at the event before."""
 
+    keeps = ("rows", "before", "time")
+
     before: Value = False
     time = -FOREVER
 
@@ -438,6 +450,8 @@ class _OpenPreviously(_Operator):
 
 class _Next(_Operator):
     """`next`: the rows ask about the event before; `fresh` are those of the event that happens now."""
+
+    keeps = ("rows", "before")
 
     def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
         super().__init__(run, number, instruction)
@@ -546,12 +560,14 @@ _KINDS: dict[str, type[_Operator]] = {
 class BoundedRun:
     """A run of a formula about the future."""
 
+    keeps = ("_at_once", "place", "_now", "_told", "_about", "operators")
+
     def __init__(self, compiled: BoundedProperty, time_ns: int) -> None:
         self._compiled = compiled
         self._at_once = compiled.folded.start()
         self.later = compiled.later
         self.place = 0
-        self._operators = compiled.operators(self)
+        self.operators = compiled.operators(self)
         self._now = time_ns
         self._places: tuple[int, ...] = ()
         self._values: dict[int, Value] = {}
@@ -564,7 +580,7 @@ class BoundedRun:
     @property
     def deadline(self) -> int | None:
         """When the first bound passes on which a verdict depends."""
-        found = (operator.deadline for operator in self._operators.values())
+        found = (operator.deadline for operator in self.operators.values())
         return min((deadline for deadline in found if deadline is not None), default=None)
 
     def step(self, event: int, time_ns: int) -> Categories:
@@ -574,7 +590,7 @@ class BoundedRun:
             if deadline is not None and time_ns > deadline:
                 raise ValueError("the deadline has passed: expire the run first")
             self._now = time_ns
-        if sum(len(operator.rows) for operator in self._operators.values()) >= MOST_OPEN:
+        if sum(len(operator.rows) for operator in self.operators.values()) >= MOST_OPEN:
             raise RunFaultError(f"more than {MOST_OPEN} events wait for what follows them")
         self.place += 1
         self._places = self._compiled.folded.take(self._at_once, event, self._now)
@@ -585,7 +601,7 @@ class BoundedRun:
             whole.tells = self.place
         else:
             self._told[whole] = self.place
-        for operator in self._operators.values():
+        for operator in self.operators.values():
             operator.take(self._now)
         return self._tell()
 
@@ -595,7 +611,7 @@ class BoundedRun:
         if deadline is None:
             raise ValueError("this run has no deadline")
         self._now = deadline
-        for operator in self._operators.values():
+        for operator in self.operators.values():
             operator.pass_by(deadline)
         return self._tell()
 
@@ -607,14 +623,14 @@ class BoundedRun:
                 name: copy(value) if isinstance(value, _CONTAINERS) else value
                 for name, value in vars(operator).items()
             }
-            for operator in self._operators.values()
+            for operator in self.operators.values()
         ]
         return self.place, list(map(copy, self._at_once)), operators
 
     def take_back(self, mark: tuple[Any, ...]) -> None:
         """Return to them; the time stays."""
         self.place, self._at_once, operators = mark
-        for operator, before in zip(self._operators.values(), operators, strict=True):
+        for operator, before in zip(self.operators.values(), operators, strict=True):
             operator.__dict__ = before
         for cell, noted in self.journal.items():
             cell.restore(noted)
@@ -632,7 +648,7 @@ class BoundedRun:
         return value if known is None else known
 
     def _find(self, number: int) -> Value:
-        operator = self._operators.get(number)
+        operator = self.operators.get(number)
         if operator is not None:
             return operator.ask(self._now)
         kind = self._compiled.program.instructions[number].operator
@@ -695,3 +711,6 @@ _CATEGORIES: dict[tuple[bool, bool], Categories] = {
     (False, True): VERDICTS[1:],
     (True, True): VERDICTS,
 }
+
+PARTS: Mapping[str, type] = {"cell": Cell, "row": _Row, "window": Window}
+"""What runs of these formulas are made of, besides numbers and truth values, by the names that `kept_runs.py` uses."""

@@ -47,6 +47,7 @@ class GrammarRun(UntimedRun):
     """A run: the current frame, or None after a failure."""
 
     __slots__ = ("_step", "frame")
+    keeps = ("frame",)
     __copy__ = twin
 
     def __init__(self, recogniser: Recogniser) -> None:

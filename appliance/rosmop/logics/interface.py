@@ -46,7 +46,7 @@ class RunFaultError(Exception):
 
 class Run(Protocol):
     """One run of a property over a trace; see the head of this module for the contract. A copy (`copy.copy`) goes on
-    by itself; a run that has no `__copy__` has none.
+    by itself; a run that has no `__copy__` has none. `keeps` names the attributes that change (`kept_runs.py`).
     """
 
     @property
@@ -186,6 +186,7 @@ class FiniteRun(UntimedRun):
     """A run over the tables of an automaton."""
 
     __slots__ = ("_automaton", "state")
+    keeps = ("state",)
 
     def __init__(self, automaton: Automaton) -> None:
         self._automaton = automaton
@@ -241,6 +242,7 @@ class ClockedRun:
     """A run over such tables: the state, when its clock began, and the time."""
 
     __slots__ = ("_tables", "now", "since", "state")
+    keeps = ("state", "since", "now")
     __copy__ = twin
 
     def __init__(self, tables: ClockedProperty, time_ns: int) -> None:

@@ -64,6 +64,7 @@ class Frame:
     """An Earley set. ``depth`` counts the frames that wait below."""
 
     __slots__ = ("conts", "depth", "shape")
+    keeps = __slots__
 
     def __init__(self, shape: Shape, conts: "Conts", depth: int) -> None:
         self.shape = shape
@@ -170,6 +171,10 @@ class Recogniser:
         return self._shape(tuple(entries), (), len(number)), chosen, accepted
 
     # ---- tables
+
+    def shape(self, items: tuple[Entry, ...], done: tuple[int, ...], width: int) -> Shape:
+        """The shape of these items."""
+        return self._shape(items, done, width)
 
     def _shape(self, items: tuple[Entry, ...], done: tuple[int, ...], width: int) -> Shape:
         if width > KEPT_SHAPE_WIDTH or len(items) > KEPT_SHAPE_ITEMS:

@@ -371,6 +371,7 @@ class Window:
     """
 
     __slots__ = ("_high", "_intervals", "_low")
+    keeps = ("_high", "_intervals", "_low")
 
     def __init__(self, low: int, high: int | None) -> None:
         self._low = low
@@ -408,6 +409,7 @@ class PastRun(UntimedRun):
     """A run of a past formula: its values, and the time."""
 
     __slots__ = ("_residues", "now", "values")
+    keeps = ("now", "values")
 
     def __init__(self, folded: Folded, time_ns: int) -> None:
         self._residues = folded.residues

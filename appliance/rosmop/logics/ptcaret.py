@@ -84,6 +84,7 @@ class CaretRun(UntimedRun):
     """A run: its values, and those about the abstract past before each open call."""
 
     __slots__ = ("_compiled", "_stack", "_values")
+    keeps = ("_stack", "_values")
 
     def __init__(self, compiled: CaretProperty) -> None:
         self._compiled = compiled

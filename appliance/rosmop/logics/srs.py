@@ -65,6 +65,7 @@ class RewritingRun(UntimedRun):
     """A run: its string, to which no rule applies between two events, or the verdict that it came to."""
 
     __slots__ = ("_property", "string", "verdict")
+    keeps = ("string", "verdict")
     __copy__ = twin
 
     def __init__(self, compiled: RewritingProperty) -> None:

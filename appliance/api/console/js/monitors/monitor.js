@@ -36,7 +36,8 @@ export function MonitorPage({ name, row, monitors }) {
       <div class="head-actions">${row.held && html`<${Resume} row=${row} monitors=${monitors} />`}${(row.trial || !row.enabled) && html`<${Promote} row=${row} monitors=${monitors} />`}<span class="row"><span class="small muted">Enabled</span><${MonitorSwitch} row=${row} monitors=${monitors} /></span>
         <${Button} role="admin" tone="danger" onClick=${() => setRemoving(true)}>Remove</${Button}></div>`}</div>`;
   if (!row) return html`${head}<section class="panel"><${Empty} icon="monitors" title="This monitor is not loaded">It may have been removed. What it did is still in the <${Link} to=${`/console/audit?category=monitor&text=${encodeURIComponent(name)}`}>audit log</${Link}>.</${Empty}></section>`;
-  return html`${head}
+  const held = row.why_held && html`<p role="status">It holds its topics: ${row.why_held}. When that is safe, resume it (<code>rosrv monitor resume ${name}</code>).</p>`;
+  return html`${head}${held}
     <div class="policy-grid"><div class="stack"><${Verdicts} name=${name} row=${row} />${error ? html`<${Failure} error=${error} retry=${again} />` : !value ? html`<section class="panel"><${Loading} /></section>` : html`<${Specification} key=${value.revision} monitor=${value} monitors=${monitors} />`}</div>
       <div class="stack">${value && html`<${About} monitor=${value} path=${path} />`}<${Margins} row=${row} /><${History} path=${path} row=${row} /></div></div>
     ${removing && html`<${Remove} name=${name} row=${row} path=${path} monitors=${monitors} close=${() => setRemoving(false)} />`}`;

@@ -1,0 +1,202 @@
+"""Keeps the state of a relay's monitors in memory that outlives the process, and finds what an earlier process left.
+
+Invariants:
+- The state after a batch is written before a message of the batch is passed on, and before a monitor's message is
+  published: a subscriber never sees an effect of a state that is lost.
+- State that did not change is not written.
+- A state is used again only where nothing can have happened in between: it was written since the machine started, or
+  before the appliance ended in order; and the machine's clock was not set meanwhile. Otherwise it is `lost`, and why.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from appliance.channel.messages import StateGiven
+from appliance.relay.monitors.state_memory import Memory, StateMemory, read
+
+if TYPE_CHECKING:
+    from appliance.rosmop.engine import MonitorSet
+    from appliance.rosmop.monitor import Group
+    from appliance.rosmop.remembered import KeptGroup
+
+_UNREADABLE = "the memory of its state cannot be read"
+_NO_ROOM = "the states of all monitors together are more than is kept"
+_STEP = 1_000_000_000  # nanoseconds: a clock that is further off was set
+
+
+class _GroupHead(msgspec.Struct, array_like=True):
+    """The monitors of a section, and what its cells are (`CellNames`)."""
+
+    monitors: list[str]
+    cells: msgspec.Raw
+
+
+class _Head(msgspec.Struct, array_like=True):
+    """Who wrote a memory: since which start of the machine, by which clock, and when (ns)."""
+
+    boot: str
+    offset: int
+    written: int
+    groups: list[_GroupHead]
+    lost: str = ""
+    """Why the state of no monitor is kept."""
+
+
+@dataclass(slots=True)
+class Recovered:
+    """The states that earlier processes left, the newest last, and why the others are lost ("": those of all)."""
+
+    groups: "list[KeptGroup]" = field(default_factory=list)
+    lost: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(eq=False, slots=True)
+class _Entry:
+    """A group of monitors and its section; `base` and `cells` are what was written last."""
+
+    group: "Group"
+    section: int
+    base: bytes = b""
+    cells: bytes | None = None
+
+
+class Keeper:
+    """The memory of one relay; `earlier` are those of the appliance's life before, read while `own` has nothing."""
+
+    def __init__(self, given: StateGiven, own: Memory, earlier: Sequence[Memory] = ()) -> None:
+        self._given = given
+        self._memory = StateMemory(own)
+        self._left = [own] if _has_head(own) else [*earlier]
+        self._monitors: MonitorSet | None = None
+        self._entries: list[_Entry] = []
+        self._by_way: dict[str, _Entry] = {}
+
+    @property
+    def offset(self) -> int:
+        """The clock of monitors: this and the machine's monotonic clock, in nanoseconds."""
+        return self._given.offset
+
+    # --- what an earlier process left ---
+
+    def recovered(self) -> Recovered | None:
+        """What earlier processes left; None: nothing was kept before."""
+        found = Recovered()
+        heads = sorted(self._readable(found), key=lambda each: each[0].written)
+        for head, sections in heads:
+            reason = self._distrust(head)
+            if head.lost:
+                found.lost[""] = head.lost
+            for group, (base, cells) in zip(head.groups, sections, strict=False):
+                if not reason:
+                    found.groups.append((group.monitors, bytes(group.cells), base, cells))
+                found.lost |= dict.fromkeys(group.monitors, reason or _UNREADABLE)
+        return found if heads or found.lost else None
+
+    def _readable(self, found: Recovered) -> Iterator[tuple[_Head, list[tuple[bytes, bytes | None]]]]:
+        for memory in self._left:
+            try:
+                kept = read(memory)
+                if kept is not None:
+                    yield _HEADS.decode(kept.head), kept.sections
+            except (ValueError, msgspec.MsgspecError) as error:
+                found.lost[""] = f"{_UNREADABLE}: {error}"
+
+    def _distrust(self, head: _Head) -> str:
+        """Why a state cannot be used again; empty if it can."""
+        given = self._given
+        if head.boot == given.boot:
+            set_by = abs(head.offset - given.offset)
+            return "" if set_by <= _STEP else "the machine's clock was set while the appliance did not run"
+        if head.boot != given.ended_boot:
+            return "the machine stopped (a power cut, a reset) before the appliance had ended"
+        if given.offset + time.monotonic_ns() < given.ended_at:
+            return "the machine's clock was set back while the appliance did not run"
+        return ""
+
+    # --- what is kept ---
+
+    def take(self, monitors: "MonitorSet") -> None:
+        """Keep the state of these from now on."""
+        self._monitors = monitors
+        self._entries = [_Entry(group, number) for number, group in enumerate(monitors.groups)]
+        self._by_way = {way: entry for entry in self._entries for way in entry.group.ways}
+        self._lay_out()
+
+    def take_nothing(self) -> None:
+        """There are no monitors: what was kept of others is not theirs when they come again."""
+        self._monitors, self._entries, self._by_way = None, [], {}
+        self._lay_out()
+
+    def keep(self, way: str) -> None:
+        """Keep the state of those that have judged messages on a topic (`EventCode.way`)."""
+        entry = self._by_way.get(way)
+        if entry is not None:
+            self._keep(entry)
+
+    def keep_all(self) -> None:
+        """Keep the state of all."""
+        for entry in self._entries:
+            self._keep(entry)
+
+    def _keep(self, entry: _Entry) -> None:
+        group = entry.group
+        home = group.home
+        if not group.changed:
+            if home is None:
+                return
+            cells = home.cells()
+            if cells is not None:
+                if cells and cells != entry.cells:
+                    entry.cells = cells
+                    self._memory.write_cells(entry.section, cells)
+                return
+        base = self._base(group)
+        if base != entry.base or entry.cells is not None:
+            entry.base, entry.cells = base, None
+            if not self._memory.write_base(entry.section, base):
+                self._lay_out()
+
+    def _base(self, group: "Group") -> bytes:
+        assert self._monitors is not None  # noqa: S101  the group is of its
+        return self._monitors.state_of(group)
+
+    def _lay_out(self) -> None:
+        for entry in self._entries:
+            entry.base, entry.cells = self._base(entry.group), None
+        largest = sorted(self._entries, key=lambda entry: -len(entry.base))
+        while not self._memory.lay_out(self._head(), [self._section(entry) for entry in self._entries]):
+            if not largest:
+                self._entries, self._by_way = [], {}
+                self._memory.lay_out(self._head(_NO_ROOM), [])
+                return
+            largest.pop(0).base = msgspec.msgpack.encode(_NO_ROOM)
+
+    @staticmethod
+    def _section(entry: _Entry) -> tuple[bytes, int]:
+        home = entry.group.home
+        return entry.base, 0 if home is None else home.size
+
+    def _head(self, lost: str = "") -> bytes:
+        groups = [
+            _GroupHead(
+                [monitor.name for monitor in entry.group.monitors],
+                msgspec.Raw(msgspec.msgpack.encode(home.names if (home := entry.group.home) else None)),
+            )
+            for entry in self._entries
+        ]
+        head = _Head(self._given.boot, self.offset, self.offset + time.monotonic_ns(), groups, lost)
+        return msgspec.msgpack.encode(head)
+
+
+_HEADS = msgspec.msgpack.Decoder(_Head)
+
+
+def _has_head(memory: Memory) -> bool:
+    try:
+        return read(memory) is not None
+    except ValueError:
+        return True

@@ -1,0 +1,177 @@
+"""A memory of fixed size that keeps the state of monitors over the death of a relay: a file that the supervisor opened.
+
+Layout: the magic, a byte that says which half is valid (1, 2; 0: none), and the two halves. A half has a `head` (the
+writer's data), a table and *sections*: two places for the `base` state of a group of monitors and two for its `cells`,
+with one byte that says which are valid. `lay_out` writes the half that is not valid and then the one byte; `write_base`
+and `write_cells` write the place that is not valid and then the one byte of their section. So a process that is killed
+anywhere leaves the state before or after, and nothing between: stores of one thread become visible in their order, and
+a byte is stored as a whole.
+
+A power cut keeps no order: whoever reads asks the head whether the machine has started again since.
+"""
+
+import mmap
+import os
+import struct
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+MAGIC = b"rosrvMS1"
+MOST_SECTIONS = 100_000
+
+_START = 16
+_ROOT = len(MAGIC)
+_HEAD = struct.Struct("<II")  # length of the head, number of sections
+_ROW = struct.Struct("<III")  # of a section: where it begins in its half, room of `base`, bytes of `cells`
+_LENGTH = struct.Struct("<I")
+_FLAGS = 16  # bytes before the places of a section: its byte, and the lengths of both bases from byte 8 on
+_BASE, _CELLS, _HAS_CELLS = 1, 2, 4
+_LEAST_ROOM = 256
+
+Memory = Any
+"""What is read and written by slices: a view of a mapped file."""
+
+
+class Kept(NamedTuple):
+    """What a memory has: the head, and of each section the base and, if they are later, the cells."""
+
+    head: bytes
+    sections: list[tuple[bytes, bytes | None]]
+
+
+class StateMemory:
+    """Writes into a memory; what was there stays valid until the first `lay_out` is complete."""
+
+    def __init__(self, memory: Memory) -> None:
+        self._memory = memory
+        self._valid = 0 if bytes(memory[:_ROOT]) != MAGIC else memory[_ROOT]
+        self._sections: list[_Section] = []
+
+    def lay_out(self, head: bytes, sections: Sequence[tuple[bytes, int]]) -> bool:
+        """Begin a half with these bases, each with room for so many bytes of cells.
+
+        False: there is no room for all of them, and nothing has changed.
+        """
+        half = (len(self._memory) - _START) // 2
+        rows, at = [], _HEAD.size + len(head) + _ROW.size * len(sections)
+        for base, cells in sections:
+            at = _even(at)
+            room = max(_LEAST_ROOM, _even(2 * len(base)))
+            rows.append((at, room, cells))
+            at += _size(room, cells)
+        if at > half or len(sections) > MOST_SECTIONS:
+            return False
+        memory, into = self._memory, 2 if self._valid == 1 else 1
+        first = _START + (into - 1) * half
+        table = _HEAD.pack(len(head), len(sections)) + head + b"".join(_ROW.pack(*row) for row in rows)
+        memory[first : first + len(table)] = table
+        made = [_Section(memory, first + at, room, cells) for at, room, cells in rows]
+        for section, (base, _) in zip(made, sections, strict=True):
+            section.begin(base)
+        if self._valid == 0:
+            memory[:_ROOT] = MAGIC
+        memory[_ROOT] = self._valid = into
+        self._sections = made
+        return True
+
+    def write_base(self, section: int, base: bytes) -> bool:
+        """Keep a whole state of a section; False where it has no room for it."""
+        return self._sections[section].write_base(base)
+
+    def write_cells(self, section: int, cells: bytes) -> None:
+        """Keep the cells of a section, as they have changed since its base."""
+        self._sections[section].write_cells(cells)
+
+
+class _Section:
+    def __init__(self, memory: Memory, at: int, room: int, cells: int) -> None:
+        self._memory = memory
+        self._at = at
+        self._room = room
+        self._flags = 0
+        first = at + _FLAGS
+        self._bases = first, first + room
+        self._cells = first + 2 * room, first + 2 * room + _even(cells)
+        self._size = cells
+
+    def begin(self, base: bytes) -> None:
+        """Write the first base; nobody reads it before the half is valid."""
+        self._put(0, base)
+        self._memory[self._at] = self._flags = 0
+
+    def write_base(self, base: bytes) -> bool:
+        if len(base) > self._room:
+            return False
+        into = self._flags & _BASE ^ _BASE
+        self._put(into, base)
+        self._memory[self._at] = self._flags = into
+        return True
+
+    def write_cells(self, cells: bytes) -> None:
+        into = self._flags & _CELLS ^ _CELLS
+        at = self._cells[into >> 1]
+        self._memory[at : at + self._size] = cells
+        self._memory[self._at] = self._flags = self._flags & _BASE | into | _HAS_CELLS
+
+    def _put(self, place: int, base: bytes) -> None:
+        memory, at = self._memory, self._bases[place]
+        memory[at : at + len(base)] = base
+        length = self._at + 8 + _LENGTH.size * place
+        memory[length : length + _LENGTH.size] = _LENGTH.pack(len(base))
+
+
+def mapped(descriptor: int, *, writable: bool) -> memoryview:
+    """The memory behind a descriptor, which is closed."""
+    access = mmap.PROT_READ | (mmap.PROT_WRITE if writable else 0)
+    memory = mmap.mmap(descriptor, 0, flags=mmap.MAP_SHARED, prot=access)
+    os.close(descriptor)
+    return memoryview(memory)
+
+
+def read(memory: Memory) -> Kept | None:
+    """What a memory has; None for one that has nothing valid. Raises `ValueError` for what nobody has written so."""
+    if len(memory) < _START or bytes(memory[:_ROOT]) != MAGIC or memory[_ROOT] == 0:
+        return None
+    half = (len(memory) - _START) // 2
+    if memory[_ROOT] > 2:
+        raise ValueError("the memory has no such half")
+    first = _START + (memory[_ROOT] - 1) * half
+    view = memoryview(memory)[first : first + half].toreadonly()
+    try:
+        size, count = _HEAD.unpack_from(view)
+        if count > MOST_SECTIONS:
+            raise ValueError(f"the memory has {count} sections")
+        head = bytes(_part(view, _HEAD.size, size))
+        table = _HEAD.size + size
+        return Kept(
+            head, [_read(view, *_ROW.unpack_from(view, table + _ROW.size * row)) for row in range(count)]
+        )
+    except struct.error as error:
+        raise ValueError(f"the memory is cut: {error}") from error
+
+
+def _read(view: memoryview, at: int, room: int, cells: int) -> tuple[bytes, bytes | None]:
+    flags = _part(view, at, _FLAGS)[0]
+    place = flags & _BASE
+    (length,) = _LENGTH.unpack_from(view, at + 8 + _LENGTH.size * place)
+    if length > room:
+        raise ValueError("a state is longer than its place")
+    base = bytes(_part(view, at + _FLAGS + place * room, length))
+    if not flags & _HAS_CELLS:
+        return base, None
+    second = _even(cells) if flags & _CELLS else 0
+    return base, bytes(_part(view, at + _FLAGS + 2 * room + second, cells))
+
+
+def _part(view: memoryview, at: int, size: int) -> memoryview:
+    if at + size > len(view):
+        raise ValueError("a state ends behind the memory")
+    return view[at : at + size]
+
+
+def _size(room: int, cells: int) -> int:
+    return _FLAGS + 2 * room + 2 * _even(cells)
+
+
+def _even(size: int) -> int:
+    return -(-size // 8) * 8

@@ -1,0 +1,143 @@
+"""The files in which relays keep the state of their monitors (`relay/monitors/state_memory.py`).
+
+Nothing is read of them here but whether they have anything.
+
+Each relay writes into a file of its own, `relay-N`. What the kernel has of it outlives every process of the appliance.
+At the start the files of the life before become `relay-N.before`, which every relay may read: a monitor may be on
+another relay now. They are kept until each relay has written its own, so an appliance that is killed while it starts
+loses nothing. At an orderly end all is written to the disk, and then a file that says so and when: only then is a state
+used again after the machine was started again.
+"""
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import structlog
+
+from appliance.channel.messages import StateGiven
+from appliance.whole_files import write_whole
+
+FOLDER = "monitors"
+SIZE = 16 << 20
+"""Bytes of each file."""
+
+_ENDED = "ended"
+_BEFORE = ".before"
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+_HEAD = 9  # bytes: the magic, and whether anything is written behind it
+
+log = structlog.get_logger()
+
+
+class _Ended(msgspec.Struct):
+    """How the appliance ended last: in which start of the machine, and when (ns since the epoch)."""
+
+    boot: str
+    at: int
+
+
+class MonitorMemory:
+    """One file for each relay, and those of the life before."""
+
+    def __init__(self, state: Path, relays: int) -> None:
+        self._folder = state / FOLDER
+        self._boot = _BOOT.read_text("ascii").strip()
+        self._offset = time.time_ns() - time.monotonic_ns()
+        self._own: list[int] = []
+        self._earlier: list[int] = []
+        self._ended = _Ended("", 0)
+        try:
+            self._folder.mkdir(mode=0o700, exist_ok=True)
+            self._ended = self._take_ended()
+            self._set_aside()
+            flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC
+            self._earlier = [os.open(path, flags) for path in sorted(self._folder.glob(f"*{_BEFORE}"))]
+            for index in range(relays):
+                self._own.append(_made(self._folder / f"relay-{index}"))
+        except OSError as error:
+            log.warning(
+                "monitors do not keep their state when the appliance ends: they hold their topics then",
+                reason=f"{self._folder}: {error}",
+            )
+            for index in range(len(self._own), relays):
+                self._own.append(os.memfd_create(f"rosrv-monitors-{index}", os.MFD_CLOEXEC))
+                os.ftruncate(self._own[-1], SIZE)
+
+    def given_to(self, role: str, index: int) -> Iterator[tuple[StateGiven, int]]:
+        """What a process gets at its start."""
+        if role != "relay":
+            return
+        ended = self._ended
+        for descriptor in self._earlier:
+            yield StateGiven(False, self._boot, self._offset, ended.boot, ended.at), descriptor
+        yield StateGiven(True, self._boot, self._offset, ended.boot, ended.at), self._own[index]
+
+    def close(self) -> None:
+        """All relays have ended: see that what they kept outlives the machine's power."""
+        try:
+            for descriptor in self._own:
+                os.fsync(descriptor)
+            write_whole(self._folder / _ENDED, msgspec.json.encode(_Ended(self._boot, time.time_ns())), 0o600)
+        except OSError as error:
+            log.warning("the state of monitors is not on the disk", reason=str(error))
+        for descriptor in (*self._own, *self._earlier):
+            os.close(descriptor)
+        self._own, self._earlier = [], []
+
+    def _take_ended(self) -> _Ended:
+        """How the life before ended; what is kept from now on is not of that."""
+        path = self._folder / _ENDED
+        try:
+            ended = msgspec.json.decode(path.read_bytes(), type=_Ended)
+        except FileNotFoundError:
+            return _Ended("", 0)
+        except msgspec.MsgspecError:
+            ended = _Ended("", 0)
+        path.unlink()
+        _sync(self._folder)
+        return ended
+
+    def _set_aside(self) -> None:
+        """What the relays of the life before wrote last is `.before`; a relay that had written nothing has what was
+        that, until all have.
+        """
+        found = [path for path in sorted(self._folder.glob("relay-*")) if path.suffix != _BEFORE]
+        written = [path for path in found if _is_written(path)]
+        if found and written == found:
+            for path in self._folder.glob(f"*{_BEFORE}"):
+                path.unlink()
+        for path in found:
+            if path in written:
+                path.rename(path.with_name(path.name + _BEFORE))
+            else:
+                path.unlink()
+        _sync(self._folder)
+
+
+def _is_written(path: Path) -> bool:
+    with path.open("rb") as file:
+        return any(file.read(_HEAD)[_HEAD - 1 :])
+
+
+def _made(path: Path) -> int:
+    """A new file, all of whose bytes have a place. Raises `OSError`."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    descriptor = os.open(path, flags, 0o600)
+    try:
+        os.posix_fallocate(descriptor, 0, SIZE)
+    except OSError:
+        os.close(descriptor)
+        path.unlink()
+        raise
+    return descriptor
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

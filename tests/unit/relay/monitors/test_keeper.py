@@ -1,0 +1,184 @@
+"""The state of monitors outlives the relay: one that is killed after any batch goes on where it was."""
+
+import time
+from dataclasses import replace
+from random import Random
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from appliance.channel.messages import StateGiven
+from appliance.relay.monitors.keeper import Keeper
+from appliance.ros.standard import standard_definitions
+from appliance.rosmop.engine import MonitorSet
+from appliance.rosmop.outcomes import Outcome
+from appliance.rosmop.syntax.errors import SpecificationError
+from tests.support.examples import examples
+from tests.unit.rosmop.interpreted import check_same
+from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
+
+FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck), deadline=None)
+SIZE = 1 << 20
+GIVEN = StateGiven(True, "boot", time.time_ns() - time.monotonic_ns())
+
+STOP = """{modifier} stop() {{
+    bool pressed = false; {more}
+    event button(bool on) /stop std_msgs/Bool '{{data:on}}' {{ pressed = on; }}
+    event drive() /drive std_msgs/Bool '{{}}' {{ if (pressed) {{ return; }} }}
+}}"""
+
+
+def begun(monitors: MonitorSet, memory: bytearray, given: StateGiven = GIVEN) -> Keeper:
+    """A process begins with this memory, as `Middle` does."""
+    keeper = Keeper(given, memory)
+    left = keeper.recovered()
+    if left is None:
+        monitors.start(0)
+    else:
+        monitors.recover(left.groups, left.lost, 0)
+    keeper.take(monitors)
+    return keeper
+
+
+def again(monitors: MonitorSet) -> MonitorSet:
+    """The same specifications in another process."""
+    following = MonitorSet.of(monitors.compiled, monitors.on_fault)
+    following.write_module()
+    return following
+
+
+def unexplained(outcome: Outcome) -> Outcome:
+    """Without what only explains, which is not kept, and output that a throttle may let through once more."""
+    outcome.verdicts = tuple(replace(verdict, why=None) for verdict in outcome.verdicts)
+    outcome.log = []
+    outcome.before = [unexplained(before) for before in outcome.before]
+    return outcome
+
+
+@FEW
+@given(seed=st.integers(0, 1 << 30), step_ns=st.sampled_from([1, 700_000]))
+def test_random_specifications_go_on_where_a_killed_process_was(seed: int, step_ns: int) -> None:
+    """Of every logic, with variables of every type, timers and deadlines: cut at random points, nothing differs."""
+    random = Random(seed)  # noqa: S311  draws examples, not keys
+    sources = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
+    messages = Messages(seed)
+    traffic = [(one.topic, body) for one in (messages.traffic() for _ in range(6)) for body in one.bodies()]
+    try:
+        monitors = MonitorSet.load(sources, definitions())
+    except SpecificationError:
+        return  # a draw that means nothing
+    whole, memory = again(monitors), bytearray(SIZE)
+    whole.start(0)
+    monitors.write_module()
+    keeper = begun(monitors, memory)
+    for number, (topic, body) in enumerate(traffic):
+        now = number * step_ns
+        if random.random() < 0.2:
+            monitors = again(monitors)
+            keeper = begun(monitors, memory)
+            assert monitors.began == ()
+        mine, other = (one.judge(topic, bytearray(body), now) for one in (monitors, whole))
+        keeper.keep_all() if mine.before else keeper.keep(topic)
+        check_same(unexplained(mine), unexplained(other))
+    for one in monitors.compiled.specifications:
+        for variable in one.variables:
+            known, found = (each.value(one.name, variable) for each in (monitors, whole))
+            assert repr(known) == repr(found)
+
+
+def stop(modifier: str = "", more: str = "") -> MonitorSet:
+    """An emergency stop that is latched."""
+    text = STOP.format(modifier=modifier, more=more)
+    monitors = MonitorSet.load({"stop.rv": text}, standard_definitions())
+    monitors.write_module()
+    return monitors
+
+
+def press(monitors: MonitorSet, keeper: Keeper) -> None:
+    """The button is pressed twice: the first message of a monitor is the engine's, the second the module's."""
+    for on in (b"\x00", b"\x01"):
+        monitors.judge("/stop", on, 1)
+        keeper.keep("/stop")
+
+
+def drives(monitors: MonitorSet) -> str:
+    """What becomes of a command to drive."""
+    return monitors.judge("/drive", b"\x01", 2).result
+
+
+OTHERS = {
+    "a power cut": StateGiven(True, "another boot", GIVEN.offset),
+    "the clock was set": StateGiven(True, "boot", GIVEN.offset + 3_000_000_000),
+    "the clock was set back": StateGiven(True, "next", GIVEN.offset, "boot", time.time_ns() + 10**12),
+}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+@pytest.mark.parametrize("modifier", ["", "hold", "begin"])
+def test_a_state_that_may_be_stale_is_not_used(other: str, modifier: str) -> None:
+    """After it a monitor that acts by a state holds its topics, and says why; one declared `begin` begins."""
+    memory = bytearray(SIZE)
+    first = stop(modifier)
+    press(first, begun(first, memory))
+    second = stop(modifier)
+    begun(second, memory, OTHERS[other])
+    assert second.began == ("stop",)
+    assert drives(second) == ("passed" if modifier == "begin" else "dropped")
+    assert bool(second.monitor("stop").why_held) is (modifier != "begin")
+
+
+def test_an_orderly_end_outlives_the_machine() -> None:
+    """After an orderly end and a start of the machine the state is used again."""
+    memory = bytearray(SIZE)
+    first = stop()
+    press(first, begun(first, memory))
+    second = stop()
+    begun(second, memory, StateGiven(True, "next", GIVEN.offset, "boot", time.time_ns()))
+    assert second.began == ()
+    assert drives(second) == "dropped"
+    assert not second.monitor("stop").held
+
+
+def test_another_text_loses_the_state_and_says_so() -> None:
+    """A specification that was changed while nothing ran holds its topics; one that was never loaded begins."""
+    memory = bytearray(SIZE)
+    first = stop()
+    press(first, begun(first, memory))
+    second = stop(more="int other = 1;")
+    begun(second, memory)
+    assert drives(second) == "dropped"
+    assert "changed" in second.monitor("stop").why_held
+    new = MonitorSet.load(
+        {"other.rv": STOP.format(modifier="", more="").replace("stop()", "other()")}, standard_definitions()
+    )
+    begun(new, memory)
+    assert drives(new) == "passed"
+
+
+def test_what_was_held_is_held_by_the_next_process() -> None:
+    """No death of a process lets go of topics that are held; only an operator does."""
+    memory = bytearray(SIZE)
+    first = stop()
+    press(first, begun(first, memory))
+    for _ in range(3):
+        second = stop()
+        keeper = begun(second, memory, OTHERS["a power cut"])
+        assert second.monitor("stop").held
+    second.resume("stop")
+    keeper.keep_all()
+    third = stop()
+    begun(third, memory, OTHERS["a power cut"])
+    assert not third.monitor("stop").held
+
+
+def test_a_memory_that_cannot_be_read_is_no_reason_to_begin() -> None:
+    """Of a damaged memory it is not known which monitors were there: all that act by a state hold their topics."""
+    memory = bytearray(SIZE)
+    first = stop()
+    press(first, begun(first, memory))
+    memory[16:40] = b"\xff" * 24
+    second = stop()
+    begun(second, memory)
+    assert drives(second) == "dropped"
+    assert "cannot be read" in second.monitor("stop").why_held

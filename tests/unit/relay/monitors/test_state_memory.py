@@ -1,0 +1,114 @@
+"""What is in the memory after a process was killed anywhere: the state before or after, and never anything else."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from appliance.relay.monitors.state_memory import Kept, StateMemory, read
+
+SIZE = 8192
+
+
+class Written:
+    """A memory that notes each byte that is stored, in order."""
+
+    def __init__(self, data: bytearray) -> None:
+        self.data = data
+        self.stores: list[tuple[int, int]] = []
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.data[index]
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        if isinstance(index, slice):
+            self.stores += zip(range(*index.indices(len(self.data))), value, strict=True)
+        else:
+            self.stores.append((index, value))
+        self.data[index] = value
+
+
+def killed_anywhere(data: bytearray, act: Callable[[Any], object]) -> list[Kept | None]:
+    """What is read after each prefix of the stores of an act."""
+    torn, written = bytearray(data), Written(data)
+    act(written)
+    found = [read(torn)]
+    for at, value in written.stores:
+        torn[at] = value
+        found.append(read(torn))
+    assert torn == data
+    return found
+
+
+def write_both(memory: StateMemory) -> None:
+    """First cells of a section, then its base."""
+    memory.write_cells(1, b"........")
+    memory.write_base(1, b"base")
+
+
+ACTS: dict[str, Callable[[StateMemory], object]] = {
+    "a base": lambda memory: memory.write_base(0, b"another state, longer than the one before"),
+    "cells": lambda memory: memory.write_cells(1, b"CELLS..."),
+    "all": lambda memory: memory.lay_out(b"new head", [(b"x" * 300, 16), (b"y", 0), (b"", 8)]),
+    "a base after cells": write_both,
+}
+
+
+@pytest.mark.parametrize("act", ACTS)
+@pytest.mark.parametrize("rounds", [0, 1, 2])
+def test_a_kill_leaves_what_was_before_or_after(act: str, rounds: int) -> None:
+    """After any number of stored bytes: each section is as before or as after, and they change once."""
+    data = bytearray(SIZE)
+    memory = StateMemory(written := Written(data))
+    assert memory.lay_out(b"head", [(b"one", 0), (b"two", 8)])
+    for number in range(rounds):
+        memory.write_base(0, b"one, round %d" % number)
+        memory.write_cells(1, b"cells %2d" % number)
+    before = bytearray(data)
+    written.stores.clear()
+    ACTS[act](memory)
+    torn, states = bytearray(before), [read(before)]
+    for at, value in written.stores:
+        torn[at] = value
+        if (state := read(torn)) != states[-1]:
+            states.append(state)
+    assert torn == data
+    steps = 3 if act == "a base after cells" else 2
+    assert len(states) == steps
+    assert states[-1] == read(data)
+
+
+def test_the_first_kill_leaves_nothing_or_all() -> None:
+    """A process that is killed while it writes for the first time leaves an empty memory."""
+    found = killed_anywhere(bytearray(SIZE), lambda one: StateMemory(one).lay_out(b"head", [(b"one", 0)]))
+    assert set(map(repr, found)) == {"None", repr(Kept(b"head", [(b"one", None)]))}
+
+
+def test_what_has_no_room_changes_nothing() -> None:
+    """A state beyond its place is refused, and the one before stays; so is a set beyond the memory."""
+    data = bytearray(SIZE)
+    memory = StateMemory(data)
+    assert memory.lay_out(b"head", [(b"one", 0)])
+    before = bytes(data)
+    assert not memory.write_base(0, bytes(2000))
+    assert not memory.lay_out(b"head", [(bytes(2000), 0)])
+    assert bytes(data) == before
+
+
+@pytest.mark.parametrize("place", range(0, 200, 3))
+def test_what_nobody_wrote_is_refused(place: int) -> None:
+    """Any byte may be wrong: what is read is some bytes, or `ValueError`."""
+    data = bytearray(SIZE)
+    StateMemory(data).lay_out(b"head", [(b"one", 8), (b"two", 0)])
+    for value in (0, 1, 3, 0x7F, 0xFF):
+        wrong = bytearray(data)
+        wrong[place] = value
+        try:
+            read(wrong)
+        except ValueError:
+            continue
+    with pytest.raises(ValueError):
+        read(data[:64])
