@@ -153,7 +153,7 @@ class Parts:
         )
         self._watchlist = Watchlist()
         seconds = settings.limits.node_call_seconds
-        self._nodes = NodeApi(self.registry, timeout=seconds, limits=self._limits)
+        self._nodes = NodeApi(self.registry, timeout=seconds)
         self.delivery = Delivery(self._nodes, troubled=self._watchlist.could_not_tell, standing=base.standing)
         self._allocation = Allocation(settings.relays, lambda text: base.store.save_setting(ALLOCATION, text))
         self.relay = RelayControl(

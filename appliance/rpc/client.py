@@ -166,7 +166,7 @@ class _Connection(asyncio.Protocol):
         """Send one request; the future has the response's body."""
         self._answer = asyncio.get_running_loop().create_future()
         self._parser = httptools.HttpResponseParser(self)
-        self._pieces: list[bytes] = []
+        self._body = bytearray()
         self._received = 0
         self._until_end = True
         self.answering = False
@@ -200,8 +200,8 @@ class _Connection(asyncio.Protocol):
             self._disconnected()
         self.alive = False
         if self._answer is not None and not self._answer.done():
-            if self._pieces and self._until_end:
-                self._answer.set_result(b"".join(self._pieces))
+            if self._body and self._until_end:
+                self._answer.set_result(bytes(self._body))
             else:
                 self._fail(ConnectionResetError("the connection was closed before the answer was whole"))
 
@@ -212,7 +212,7 @@ class _Connection(asyncio.Protocol):
             self._until_end = False
 
     def on_body(self, piece: bytes) -> None:
-        self._pieces.append(piece)
+        self._body += piece
 
     def on_message_complete(self) -> None:
         status = self._parser.get_status_code()
@@ -223,7 +223,7 @@ class _Connection(asyncio.Protocol):
         if status != 200:
             self._fail(ConnectionError(f"HTTP status {status}"))
         else:
-            self._answer.set_result(b"".join(self._pieces))
+            self._answer.set_result(bytes(self._body))
 
     def _fail(self, error: OSError) -> None:
         self.alive = False

@@ -300,7 +300,7 @@ class ControlParts:
         self.hidden, self.clients = HiddenMaster(), Clients()
         self.deliveries, self.relay, self.store = Deliveries(), Relays(), idle(StateStore)
         self.faces = Inner(self.registry)
-        self.nodes = NodeApi(self.registry, timeout=3.0, limits=Limits())
+        self.nodes = NodeApi(self.registry, timeout=3.0)
         cast(Any, self.nodes).client = self.clients.client
         self.surround()
         self.mediation, self.addresses, self.parameters = (

@@ -2,12 +2,16 @@
 
 import asyncio
 import contextlib
+import tracemalloc
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
+from appliance.master.reach.node_api import ANSWER, NodeApi
 from appliance.ros.uris import NodeUri
 from appliance.ros.xmlrpc import build_response
-from appliance.rpc.client import UnansweredError, XmlRpcClient
+from appliance.rpc.client import CallFailedError, UnansweredError, XmlRpcClient
 
 
 def test_a_kept_connection_that_does_not_answer_is_given_up_in_time() -> None:
@@ -67,6 +71,65 @@ def test_what_is_large_has_more_time() -> None:
         small_failed.set()
         assert await large == [1, "", 0]
         client.close()
+        server.close()
+
+    asyncio.run(asyncio.wait_for(scene(), 20))
+
+
+@pytest.mark.parametrize(
+    "chunk", [b"1\r\nx\r\n", b"2000\r\n" + b"x" * 0x2000 + b"\r\n"], ids=["bytes", "blocks"]
+)
+def test_an_answer_without_end_is_read_to_its_limit(chunk: bytes) -> None:
+    """A node that answers for ever, in chunks of any size, is cut at the limit; what was kept is that at most."""
+
+    async def scene() -> None:
+        sent = 0
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            nonlocal sent
+            await reader.readuntil(b"\r\n\r\n")
+            writer.write(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n")
+            with contextlib.suppress(ConnectionError):
+                while True:
+                    writer.write(chunk * 100)
+                    await writer.drain()
+                    sent += 100 * len(chunk)
+            writer.close()
+
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        node = SimpleNamespace(call_uri=NodeUri("http", "127.0.0.1", port, "/"))
+        client = NodeApi(cast(Any, None), timeout=20).client(cast(Any, node))
+        with pytest.raises(CallFailedError, match=f"the answer is larger than {ANSWER.body} bytes"):
+            await client.call("getPid", "/me")
+        server.close()
+
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        asyncio.run(asyncio.wait_for(scene(), 20))
+        assert tracemalloc.get_traced_memory()[1] - before < 4 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_deep_answer_of_a_node_is_refused() -> None:
+    """An answer that is deeper than what nodes are asked for is nonsense, and costs the call alone."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        body = build_response([1, "", [[[[0]]]]])
+        writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body))
+        writer.close()
+
+    async def scene() -> None:
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        node = SimpleNamespace(call_uri=NodeUri("http", "127.0.0.1", port, "/"))
+        client = NodeApi(cast(Any, None), timeout=20).client(cast(Any, node))
+        with pytest.raises(CallFailedError, match="nonsense"):
+            await client.call("getPid", "/me")
         server.close()
 
     asyncio.run(asyncio.wait_for(scene(), 20))
