@@ -22,7 +22,7 @@ from appliance.policy.sections import BY_CATEGORY, PARAMETERS
 from appliance.policy.tree import KeyTree
 from appliance.ros.names import is_global_name
 
-DEFAULT_PORTS = range(19001, 21001)
+DEFAULT_PORTS = range(19001, 26001)
 
 _LIMITED = {Category.PUBLISH: Part.PUBLISHER, Category.SUBSCRIBE: Part.SUBSCRIBER}
 _KEPT_DECISIONS = 8192

@@ -315,7 +315,7 @@ AUDIT_RESERVE = Share(
 )
 NODE_PORTS = Share(
     "ports of [Ports] (one for each node and relay, and one more for each node)",
-    Bounds(whole=2000, host=1500, strangers=0, kept=0),
+    Bounds(whole=7000, host=5250, strangers=0, kept=0),
     "a host may have three times as many as are left for all others, and hosts that the policy names as one network are"
     " one; nodes without a registration make room at once; then registering is refused",
     "the refused call's record",

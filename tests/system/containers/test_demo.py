@@ -20,7 +20,7 @@ pytestmark = pytest.mark.timeout(1500)  # of the first test: the images are buil
 MACHINE = "10.79.0.1"
 ROBOT_SIDE, OPERATOR_SIDE, OUTSIDE = "172.29.77.2", "172.29.78.2", "172.29.76.2"
 LANDSHARK, OCU, TABLET = "172.29.77.10", "172.29.78.20", "172.29.78.66"
-NODE_PORTS = range(19001, 21001)
+NODE_PORTS = range(19001, 26001)
 PAGE = ROOT / "docs" / "next-to-your-robot.md"
 LAST_ATTACK = "stop the master"
 
@@ -160,7 +160,7 @@ def test_a_stranger_on_the_outer_network_gets_nothing(demo: Compose) -> None:
         here = namespace_of(demo.engine, name)
         assert ports_open(here, OUTSIDE, range(1, 11311)) == ()
         assert reaches(here, OUTSIDE, 12311) == "ConnectionRefusedError"
-        assert ports_open(here, OUTSIDE, range(21001, 65536)) == ()
+        assert ports_open(here, OUTSIDE, range(26001, 65536)) == ()
         assert reaches(here, LANDSHARK, 22) != "reached"
     finally:
         demo.engine.docker("kill", name)

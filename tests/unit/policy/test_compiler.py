@@ -243,9 +243,9 @@ def test_any_text_is_a_policy_or_a_policy_error(text: str) -> None:
 
 
 def test_options_and_ports_have_their_documented_defaults() -> None:
-    """Without [Ports] and [Options]: 19001-21000, takeover by the same host, no audit-only mode."""
+    """Without [Ports] and [Options]: 19001-26000, takeover by the same host, no audit-only mode."""
     policy = compile_policy("", file="p.ini")
-    assert policy.ports == range(19001, 21001)
+    assert policy.ports == range(19001, 26001)
     assert policy.takeover == "same-host"
     assert policy.monitored_services == frozenset()
     assert compile_policy("[Options]\ntakeover = granted\n", file="p").takeover == "granted"

@@ -12,7 +12,9 @@ from appliance.master.graph.registry import Incarnation
 from appliance.master.reach.places import NoPortError, Places
 from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Address
+from appliance.policy.policy import DEFAULT_PORTS
 from appliance.ros.uris import parse_node_uri
+from appliance.shares.table import NODE_PORTS
 
 
 @pytest.fixture
@@ -184,6 +186,17 @@ def test_no_host_takes_all_ports(monkeypatch: pytest.MonkeyPatch) -> None:
     here.close(incarnation(taken[0], HOSTS[2]))
     assert here.taken.held(NAMING.named_as(HOSTS[2])) == before - 5
     assert here.open(HOSTS[3])
+
+
+def test_a_thousand_nodes_fit_the_default_range(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without `[Ports]`, 1,000 nodes of one network have their ports, with as many relays as any machine starts."""
+    here = Places(
+        "127.0.0.1", DEFAULT_PORTS, keep=lambda *_: None, drop=lambda _: None,
+        named_as=NAMING.named_as, relays=4,
+    )  # fmt: skip
+    monkeypatch.setattr(here, "listen", lambda: Listening(here.unused.popleft()))
+    assert len({here.open(HOSTS[0]) for _ in range(1000)}) == 1000
+    assert (len(DEFAULT_PORTS), DEFAULT_PORTS.stop <= 32768) == (NODE_PORTS.bounds.whole, True)
 
 
 def test_many_addresses_of_one_network_are_one_host(monkeypatch: pytest.MonkeyPatch) -> None:
