@@ -440,7 +440,14 @@ class Settings:
         default=None, description="folder of specifications (.rv) of monitors; read again on reload"
     )
     enable: str = key(
-        default="all", description="monitors enabled at start unless they were switched: all, none, or NAME,…"
+        default="all",
+        description="monitors that no operator has switched, new ones among them: all are enabled, none, NAME,…, or all"
+        " are in shadow mode (shadow)",
+    )
+    forgotten_after: Seconds | None = key(
+        default=86_400.0,
+        description="seconds for which a monitor may be disabled or in shadow mode, or a section of the policy"
+        " audit-only, before that is an alarm; null: never",
     )
     on_fault: Literal["drop", "pass"] = key(
         default="drop", description="what becomes of a message at which an action of a monitor faults"

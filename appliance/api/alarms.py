@@ -1,5 +1,6 @@
 """What stands open now and should be looked at, read from the status: pure, and the same for every page."""
 
+import datetime
 from collections.abc import Iterator
 from typing import Annotated, Literal
 
@@ -23,6 +24,7 @@ def open_alarms(status: Status) -> list[Alarm]:
     """The open conditions, the gravest first."""
     order = ("alarm", "warning", "notice")
     found = [*_system(status), *_audit(status), *_policy(status), *_monitors(status), *_hosts(status)]
+    found += _forgotten(status)
     return sorted(found, key=lambda alarm: order.index(alarm.severity))
 
 
@@ -72,6 +74,17 @@ def _policy(status: Status) -> Iterator[Alarm]:
         yield Alarm(kind="policy-differs", severity="notice", text=text, about="policy")
 
 
+def _forgotten(status: Status) -> Iterator[Alarm]:
+    for off in status.switched_off:
+        if off.forgotten:
+            text = f"{off.what} since {_moment(off.since)}: {off.again}"
+            yield Alarm(kind=f"forgotten:{off.name}", severity="alarm", text=text, about=off.about)
+        elif off.about == "monitors":
+            end = "without an end" if off.until is None else f"until {_moment(off.until)}"
+            text = f"{off.what}, {end}: {off.again}"
+            yield Alarm(kind=f"monitor-off:{off.name}", severity="notice", text=text, about="monitors")
+
+
 def _monitors(status: Status) -> Iterator[Alarm]:
     monitors = status.monitors
     for name in monitors.held:
@@ -96,3 +109,7 @@ def _monitors(status: Status) -> Iterator[Alarm]:
 def _hosts(status: Status) -> Iterator[Alarm]:
     for line in status.ipsec.troubles:
         yield Alarm(kind="ipsec", severity="warning", text=line, about="hosts")
+
+
+def _moment(seconds: float) -> str:
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat(timespec="seconds")

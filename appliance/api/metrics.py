@@ -119,6 +119,14 @@ def _samples(body: Measures) -> dict[str, _Samples]:
         ],
         "rosrv_monitor_slices": [((name,), count) for name, (count, _) in body.slices.items()],
         "rosrv_monitor_slice_limit": [((name,), most) for name, (_, most) in body.slices.items()],
+        "rosrv_switched_off": [
+            (
+                (about, state),
+                sum((off.about, off.forgotten) == (about, forgotten) for off in status.switched_off),
+            )
+            for about in ("monitors", "policy")
+            for state, forgotten in (("recent", False), ("forgotten", True))
+        ],
         "rosrv_monitors": [
             (("enabled",), monitors.enabled),
             (("trial",), len(monitors.trials)),

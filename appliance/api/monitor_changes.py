@@ -30,6 +30,8 @@ from appliance.channel.answers.tokens import may
 
 _COMPILE_SECONDS = 40.0  # of RVMaster and then of the relay
 Prune = Annotated[bool, Query(description="also remove what the folder does not have")]
+Force = Annotated[bool, Query(description="also where that cuts a topic whose publisher has another type")]
+Shadow = Annotated[bool, Query(description="the specifications come into force in shadow mode")]
 _CHANGES: Responses = {
     412: {
         "description": "The monitors were changed, switched or resumed since they had the ETag of If-Match.",
@@ -58,6 +60,8 @@ def _add_texts(router: Routes, control: ControlLink) -> None:
         if_match: IfMatch = None,
         dry_run: DryRun = False,
         confirm_within: Confirm = None,
+        force: Force = False,
+        shadow: Shadow = False,
     ) -> Tagged[Replaced]:
         """Compile and load specifications; those in files of the same name are replaced, in one swap. For admins.
 
@@ -66,9 +70,11 @@ def _add_texts(router: Routes, control: ControlLink) -> None:
         _may_load(bearer, dry_run=dry_run)
         expected = _expected(if_match, dry_run=dry_run)
         if dry_run:
-            tried = admin.MonitorTry(new.files, new.definitions, new.signatures, expected)
+            tried = admin.MonitorTry(new.files, new.definitions, new.signatures, expected, force, shadow)
             return await _tried(control, tried, bearer)
-        order = admin.MonitorLoad(**asdict(new), expected=expected, confirm_within=confirm_within)
+        order = admin.MonitorLoad(
+            **asdict(new), expected=expected, confirm_within=confirm_within, force=force, shadow=shadow
+        )
         return await _replaced(control, order, bearer)
 
     @router.put("/{name}", responses=_CHANGES | UNKNOWN)
@@ -80,6 +86,8 @@ def _add_texts(router: Routes, control: ControlLink) -> None:
         if_match: IfMatch = None,
         dry_run: DryRun = False,
         confirm_within: Confirm = None,
+        force: Force = False,
+        shadow: Shadow = False,
     ) -> Tagged[Replaced]:
         """Load a new text in the place of the file that this monitor stands in (or of the file of this name).
 
@@ -89,12 +97,17 @@ def _add_texts(router: Routes, control: ControlLink) -> None:
         expected = _expected(if_match, dry_run=dry_run)
         if not dry_run:
             order = admin.MonitorReplace(
-                name=name, **asdict(new), expected=expected, confirm_within=confirm_within
+                name=name,
+                **asdict(new),
+                expected=expected,
+                confirm_within=confirm_within,
+                force=force,
+                shadow=shadow,
             )
             return await _replaced(control, order, bearer)
         file = await _file_of(control, name, bearer)
         signatures = {**new.signatures, file: new.signature}
-        tried = admin.MonitorTry({file: new.text}, new.definitions, signatures, expected)
+        tried = admin.MonitorTry({file: new.text}, new.definitions, signatures, expected, force, shadow)
         return await _tried(control, tried, bearer)
 
 
@@ -103,12 +116,18 @@ def _add_revisions(router: Routes, control: ControlLink) -> None:
 
     @router.post("/reload", responses=_CHANGES)
     async def reload_monitors(
-        bearer: Operator, *, if_match: IfMatch = None, prune: Prune = False, confirm_within: Confirm = None
+        bearer: Operator,
+        *,
+        if_match: IfMatch = None,
+        prune: Prune = False,
+        confirm_within: Confirm = None,
+        force: Force = False,
+        shadow: Shadow = False,
     ) -> Tagged[Replaced]:
         """Take what the folder has now; what it does not have stays, unless an admin says `prune`."""
         if prune and not may(bearer.role, "admin"):
             raise problem_of("forbidden", "removing what the folder does not have is for admins")
-        order = admin.MonitorReload(_expected(if_match), prune, confirm_within)
+        order = admin.MonitorReload(_expected(if_match), prune, confirm_within, force, shadow)
         return await _replaced(control, order, bearer)
 
     @router.post("/rollback", responses=_CHANGES)
@@ -151,20 +170,30 @@ def _add_removals(router: Routes, control: ControlLink) -> None:
 def _add_switches(router: Routes, control: ControlLink) -> None:
     @router.patch("/{name}", responses=_CHANGES | UNKNOWN)
     async def switch_monitor(
-        name: OneName, to: Annotated[Switch, body(Switch)], bearer: Operator, if_match: IfMatch = None
+        *,
+        name: OneName,
+        to: Annotated[Switch, body(Switch)],
+        bearer: Operator,
+        if_match: IfMatch = None,
+        force: Force = False,
     ) -> Tagged[Switched]:
-        """Enable or disable a monitor, put it on trial (`{"trial": true}`) or bring it from there into force (`false`).
+        """Enable or disable a monitor, put it into shadow mode (`{"shadow": true}`) or from there into force (`false`).
 
-        `{"held": false}` lets the topics that it holds go on.
+        `{"enabled": false, "for_seconds": 600}` disables it for ten minutes. `{"held": false}` lets the topics that it
+        holds go on.
         """
-        return await _switched(control, [name], to, _expected(if_match), bearer)
+        return await _switched(control, [name], to, _expected(if_match), bearer, force=force)
 
     @router.patch("", responses=_CHANGES | UNKNOWN)
     async def switch_monitors(
-        to: Annotated[SwitchMany, body(SwitchMany)], bearer: Operator, if_match: IfMatch = None
+        *,
+        to: Annotated[SwitchMany, body(SwitchMany)],
+        bearer: Operator,
+        if_match: IfMatch = None,
+        force: Force = False,
     ) -> Tagged[Switched]:
         """The same for several at once."""
-        return await _switched(control, to.names, to, _expected(if_match), bearer)
+        return await _switched(control, to.names, to, _expected(if_match), bearer, force=force)
 
 
 async def _tried(control: ControlLink, order: admin.MonitorTry, bearer: Bearer) -> Tagged[Replaced]:
@@ -183,11 +212,13 @@ async def _replaced(
 
 
 async def _switched(
-    control: ControlLink, names: list[str], to: Switch, expected: str | None, bearer: Bearer
+    control: ControlLink, names: list[str], to: Switch, expected: str | None, bearer: Bearer, *, force: bool
 ) -> Tagged[Switched]:
     order: AdminRequest[Switched] = admin.MonitorResume(names, expected)
     if to.enabled is not None:
-        order = admin.MonitorSwitch(names, to.enabled, expected)
+        order = admin.MonitorSwitch(names, to.enabled, expected, to.for_seconds)
+    elif to.shadow is not None:
+        order = admin.MonitorShadow(names, to.shadow, expected, force)
     elif to.trial is not None:
         order = admin.MonitorTrial(names, to.trial, expected)
     return tagged(await _ordered(control, order, bearer))

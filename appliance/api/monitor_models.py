@@ -131,18 +131,26 @@ class Replaced(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Switch(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is to become of a monitor: exactly one of the three."""
+    """What is to become of a monitor: exactly one of `enabled`, `shadow` and `held` (or `trial`)."""
 
     enabled: bool | None = None
-    held: Annotated[bool | None, told("false: let its topics go on")] = None
-    trial: Annotated[
-        bool | None, told("true: on trial, it does nothing; false: bring it from its trial into force")
+    for_seconds: Annotated[
+        Annotated[float, msgspec.Meta(gt=0, le=2_592_000)] | None,
+        told("with `enabled` false: enable it again by itself after this time"),
     ] = None
+    held: Annotated[bool | None, told("false: let its topics go on")] = None
+    shadow: Annotated[
+        bool | None,
+        told("true: shadow mode, it only records what it would have done; false: from there into force"),
+    ] = None
+    trial: Annotated[bool | None, told("the same as `shadow`; deprecated")] = None
 
     def __post_init__(self) -> None:
         """Raises `ValueError`."""
-        if [self.enabled, self.held, self.trial].count(None) != 2 or self.held is True:
-            raise ValueError("one of `enabled` (true or false), `trial` (true or false) and `held` (false)")
+        if [self.enabled, self.held, self.shadow, self.trial].count(None) != 3 or self.held is True:
+            raise ValueError("one of `enabled` (true or false), `shadow` (true or false) and `held` (false)")
+        if self.for_seconds is not None and self.enabled is not False:
+            raise ValueError("`for_seconds` goes with `enabled`: false")
 
 
 class SwitchMany(Switch, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -40,10 +40,11 @@ EVENTS: dict[str, str] = {
     " the hashes of all of them and of what they were compiled to, which is what relays run.",
     "specifications refused": "Specifications have errors and were refused whole; those before stay in force.",
     "monitor enabled": "A monitor was switched on; `detail` has who.",
-    "monitor disabled": "A monitor was switched off: messages pass it untouched; `detail` has who.",
-    "monitor on trial": "A monitor is on trial: it is given copies of messages, and does nothing; `detail` has who.",
-    "trial observed": "What a monitor on trial would have done; `detail.would` is drop, change, verdict, fault, log,"
-    " publish, or `missed`: what it was not given.",
+    "monitor disabled": "A monitor was switched off: messages pass it untouched; `detail` has who, and `until` if"
+    " it comes back by itself.",
+    "monitor on trial": "A monitor is in shadow mode: it gets copies of messages, and does nothing; `detail` has who.",
+    "trial observed": "What a monitor in shadow mode would have done; `detail.would` is drop, change, verdict, fault,"
+    " log, publish, or `missed`: what it was not given.",
     "monitor resumed": "The topics that a monitor held after a restart go on; `detail` has who.",
     "monitors restarted": "A new relay process: monitors began in their initial state, some hold their topics.",
     "topics held": "A monitor's state was lost, so it holds its topics until an operator resumes it.",
@@ -103,6 +104,8 @@ EVENTS: dict[str, str] = {
     "clock synchronised": "A time service keeps the machine's clock again.",
     "clock set forward": "The machine's clock went further than time has passed; `detail` has by how many seconds.",
     "clock set back": "The machine's clock stands before the last record; `detail` has by how many seconds.",
+    "protection forgotten": "A monitor is disabled or in shadow mode, or a section of the policy audit-only, for longer"
+    " than `forgotten_after`; `resource` names it, `reason` says what brings it back.",
     "log failed": "The log could not be written for a time, and can be again; `reason` says why.",
 }
 
@@ -123,8 +126,8 @@ SEVERITIES: dict[str, Severity] = {
             "recording missed", "renewal refused", "specifications refused", "tunnel refused",
         ),
         Severity.ALARM: (
-            "forwarding gap", "monitors restarted", "probe failed", "publication refused", "records lost",
-            "topics held",
+            "forwarding gap", "monitors restarted", "probe failed", "protection forgotten", "publication refused",
+            "records lost", "topics held",
         ),
     }.items()
     for name in names

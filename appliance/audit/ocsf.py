@@ -158,6 +158,7 @@ KINDS: dict[str, Kind] = {
     "clock synchronised": Kind(FINDING, _CLOSED, about="the clock is not synchronised"),
     "clock set forward": Kind(FINDING, _FOUND, _DETECTED),
     "clock set back": Kind(FINDING, _FOUND, _DETECTED),
+    "protection forgotten": Kind(FINDING, _FOUND, _DETECTED),
     "log failed": Kind(LOG, _LOG_RESTART),
 }
 

@@ -34,6 +34,7 @@ PARAMETERS = {"names": "name", "topics": "topic"}
 """What a field is called in a query, where it may stand there several times."""
 
 _WITHIN = ("confirm_within",)
+_LOADED = (*_WITHIN, "force", "shadow")
 
 
 class AdminRequest(msgspec.Struct, Generic[A], frozen=True, tag_field="verb", forbid_unknown_fields=True):
@@ -190,13 +191,14 @@ class MonitorsWanted(AdminRequest[monitors.Monitors], frozen=True, tag="monitors
     texts: bool = False
 
 
-@rest("admin", "POST", "/v1/monitors", _WITHIN)
+@rest("admin", "POST", "/v1/monitors", _LOADED)
 class MonitorLoad(AdminRequest[monitors.Replaced], frozen=True, tag="monitor load"):
     """Add or replace files of specifications, and the message definitions they need (`package/Type.msg`).
 
     `signatures` are the site's, by the names of both.
     Of this and every change below, `expected` is the tag of the monitors that it is meant for; None for any. What is
-    loaded or removed goes back by itself after `confirm_within` seconds unless confirmed.
+    loaded or removed goes back by itself after `confirm_within` seconds unless confirmed. With `shadow` the
+    monitors come into force in shadow mode; with `force` also where that cuts a topic whose publisher has another type.
     """
 
     files: dict[str, str]
@@ -205,6 +207,8 @@ class MonitorLoad(AdminRequest[monitors.Replaced], frozen=True, tag="monitor loa
     expected: str | None = None
     confirm_within: float | None = None
     signatures: dict[str, str] = {}
+    force: bool = False
+    shadow: bool = False
 
 
 @rest("operator")
@@ -215,9 +219,11 @@ class MonitorTry(WaitingRequest[monitors.Tried], frozen=True, tag="monitor try")
     definitions: dict[str, str] = {}
     signatures: dict[str, str] = {}
     expected: str | None = None
+    force: bool = False
+    shadow: bool = False
 
 
-@rest("admin", "PUT", "/v1/monitors/{name}", _WITHIN)
+@rest("admin", "PUT", "/v1/monitors/{name}", _LOADED)
 class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor replace"):
     """Put a text in the place of the file that the monitor `name` stands in, or of the file of this name.
 
@@ -232,15 +238,19 @@ class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor 
     confirm_within: float | None = None
     signature: str = ""
     signatures: dict[str, str] = {}
+    force: bool = False
+    shadow: bool = False
 
 
-@rest("operator", "POST", "/v1/monitors/reload", ("prune", "confirm_within"))
+@rest("operator", "POST", "/v1/monitors/reload", ("prune", *_LOADED))
 class MonitorReload(AdminRequest[monitors.Replaced], frozen=True, tag="monitor reload"):
     """Take what the folder of specifications has now; what it does not have stays, unless `prune`."""
 
     expected: str | None = None
     prune: bool = False
     confirm_within: float | None = None
+    force: bool = False
+    shadow: bool = False
 
 
 @rest("admin", "DELETE", "/v1/monitors", ("names", "confirm_within"))
@@ -283,17 +293,29 @@ class MonitorRevisionWanted(AdminRequest[monitors.RevisionTexts], frozen=True, t
 @rest("operator", "PATCH", "/v1/monitors")
 @rest("operator", "PATCH", "/v1/monitors/{names}")
 class MonitorSwitch(AdminRequest[monitors.Switched], frozen=True, tag="monitor switch"):
-    """Let the events of these monitors happen, or not."""
+    """Let the events of these monitors happen, or not: for `for_seconds`, or (None) until they are enabled again."""
 
     names: list[str]
     enabled: bool
     expected: str | None = None
+    for_seconds: float | None = None
+
+
+@rest("operator", "PATCH", "/v1/monitors", ("force",))
+@rest("operator", "PATCH", "/v1/monitors/{names}", ("force",))
+class MonitorShadow(AdminRequest[monitors.Switched], frozen=True, tag="monitor shadow"):
+    """Put these monitors into shadow mode, or (false) bring those in shadow mode into force; `force` as of a load."""
+
+    names: list[str]
+    shadow: bool
+    expected: str | None = None
+    force: bool = False
 
 
 @rest("operator", "PATCH", "/v1/monitors")
 @rest("operator", "PATCH", "/v1/monitors/{names}")
 class MonitorTrial(AdminRequest[monitors.Switched], frozen=True, tag="monitor trial"):
-    """Put these monitors on trial, or (false) bring those that are on trial into force."""
+    """The same under the name of earlier versions; deprecated."""
 
     names: list[str]
     trial: bool

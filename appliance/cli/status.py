@@ -14,7 +14,7 @@ from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.hosts import PortsSeen
 from appliance.channel.answers.status import FirewallState, IpsecState, PolicyState, Status
 from appliance.channel.health import no_relay, probe_failed
-from appliance.cli.output import counted, say_json
+from appliance.cli.output import counted, moment, say_json
 from appliance.cli.status_view import age, doubted_clock, lacking_walls, processes_table, shortened
 from appliance.cli.target import Appliance, speaks
 
@@ -68,6 +68,9 @@ def troubles_of(body: Status) -> list[str]:
         found.append(f"topics are held{why}: rosrv monitor resume {' '.join(monitors.held)}")
     if monitors.failing:
         found.append(f"monitors fail: {', '.join(monitors.failing)}; their messages are dropped")
+    found += [
+        f"{off.what} since {moment(off.since)}: {off.again}" for off in body.switched_off if off.forgotten
+    ]
     relay = no_relay(body.relay)
     if relay is not None:
         found.append(relay)
@@ -107,10 +110,13 @@ def show(body: Status, troubles: list[str]) -> None:
     loaded = counted(monitors.loaded, "monitor")
     shown = f"revision {monitors.revision}, {monitors.enabled} of {loaded} enabled"
     if monitors.trials:
-        shown += f", {len(monitors.trials)} on trial"
+        shown += f", {len(monitors.trials)} in shadow mode"
     if monitors.differs_from_folder:
         shown += f"; loaded by {monitors.who}, not what the folder has"
     grid.add_row("monitors", shown)
+    for off in body.switched_off:
+        end = "without an end" if off.until is None else f"until {moment(off.until)}"
+        grid.add_row("switched off", Text(f"{off.what} since {moment(off.since)}, {end}", style=_YELLOW))
     shadows = f" ({body.shadows} lost, awaited)" if body.shadows else ""
     grid.add_row(
         "graph",

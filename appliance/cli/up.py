@@ -51,7 +51,8 @@ def up(  # noqa: PLR0917  typer gives every flag by its name
         Path | None, typer.Option(help="Folder of specifications (.rv); read again by `rosrv monitor reload`")
     ] = None,
     enable: Annotated[
-        str | None, typer.Option(help="Monitors enabled at start: all, none, or NAME,…")
+        str | None,
+        typer.Option(help="Monitors enabled at start: all, none, NAME,…, or all in shadow mode: shadow"),
     ] = None,
     state: Annotated[
         Path | None, typer.Option(help="Directory of everything that survives a restart")

@@ -18,6 +18,7 @@ from appliance.channel import messages
 from appliance.config import Settings
 from appliance.control.doors import Doors, value_limits
 from appliance.control.lifeline import ControlLifeline
+from appliance.control.monitor_states import published_now
 from appliance.control.policies import Policies
 from appliance.control.recording_orders import RecordingOrders
 from appliance.control.standing import HostStanding
@@ -280,6 +281,7 @@ class Parts:
             check=base.compiler.check,
             try_out=base.compiler.try_out,
             parts=base.compiler.parts,
+            live=lambda: published_now(self.registry),
         )
 
     def _make_calls(self) -> None:

@@ -14,7 +14,14 @@ from appliance.channel.answers.graph import Graph, Registration, Registrations, 
 from appliance.channel.answers.inventory import InUse, Inventory
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.monitors import Monitors
-from appliance.channel.answers.status import AuditState, ClockState, PolicyState, RecorderState, Status
+from appliance.channel.answers.status import (
+    AuditState,
+    ClockState,
+    PolicyState,
+    RecorderState,
+    Status,
+    SwitchedOff,
+)
 from appliance.control.assembly import Parts
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.lifeline import Surroundings
@@ -42,7 +49,7 @@ class Looks:
     """Each method answers the request that it takes.
 
     `audit()` is how the audit log stands, `clock()` the machine's clock, `recorder()` the flight recorder, `live()`
-    what a change of the policy may end.
+    what a change of the policy may end, `switched_off()` what does not act.
     """
 
     parts: Parts
@@ -54,6 +61,7 @@ class Looks:
     recorder: Callable[[], RecorderState | None]
     queued_deliveries: Callable[[], int]
     live: Callable[[], list[Live]]
+    switched_off: Callable[[], list[SwitchedOff]]
     started: float = field(default_factory=time.time)
     _shown: dict[tuple[str, str], float] = field(default_factory=dict)
 
@@ -169,6 +177,7 @@ class Looks:
             audit=self.audit(),
             clock=self.clock(),
             recorder=self.recorder(),
+            switched_off=self.switched_off(),
         )
 
     def _policy(self) -> PolicyState:

@@ -5,7 +5,9 @@ import msgspec
 from appliance.channel.answers import monitors as answers
 from appliance.channel.answers.status import MonitorsState
 from appliance.channel.messages import Approach, MarginRow
+from appliance.master.graph.registry import Kind, Registry
 from appliance.rosmop.positions import line_of
+from appliance.specifications.live_topics import Published
 from appliance.specifications.monitors import Monitors
 
 
@@ -72,6 +74,8 @@ def _state(monitors: Monitors, name: str) -> answers.MonitorState:
         faults=row.faults if row is not None else 0,
         certificates=checked.certificates.get(name, []),
         trial=monitors.switches.on_trial(name),
+        shadow=monitors.switches.on_trial(name),
+        off_until=monitors.returns.until(name),
         would_drop=drops if tried else 0,
         would_change=changes if tried else 0,
         missed=row.missed if row is not None else 0,
@@ -93,3 +97,14 @@ def _margin(row: MarginRow, text: str) -> answers.MonitorMargin:
     return answers.MonitorMargin(
         row.line, row.column, line_of(text, row.line), row.holds, approach(row.load), today
     )
+
+
+def published_now(registry: Registry) -> Published:
+    """Return the nodes that publish each topic, with their types; without the appliance's own nodes."""
+    found: dict[str, dict[str, str]] = {}
+    for kind, topic, nodes in registry.resources():
+        if kind is Kind.PUBLICATION:
+            for node in nodes:
+                if not node.own:
+                    found.setdefault(topic, {})[node.name] = node.registrations[kind, topic].detail
+    return found

@@ -43,6 +43,7 @@ from appliance.control.robot import master_address, robot_addresses
 from appliance.control.signing import Signing
 from appliance.control.spare_memory import SpareMemory
 from appliance.control.standing import HostStanding
+from appliance.control.switched_off import SwitchedOffWatch
 from appliance.control.tokens import Tokens
 from appliance.hosts.authority import Authority
 from appliance.hosts.certification import Certification
@@ -236,6 +237,9 @@ class _Control:
             self._tokens.told()
         self._clock = Clock(base.trail, lambda: self._audit.ids.ahead)
         self._forwarded = Forwarded(self._settings.audit.syslog, base.trail)
+        self._switched_off = SwitchedOffWatch(
+            parts.monitors, base.policies, base.store, base.trail, self._settings.forgotten_after
+        )
         looks = Looks(
             parts,
             base.policies,
@@ -246,6 +250,7 @@ class _Control:
             recorder=parts.recordings.state,
             queued_deliveries=lambda: parts.delivery.waiting,
             live=parts.revocation.live,
+            switched_off=self._switched_off.rows,
         )
         administration = Administration(
             looks,
@@ -290,6 +295,7 @@ class _Control:
             base.doors.sweep(),
             SpareMemory().watch(),
             self._clock.watch(),
+            self._switched_off.watch(),
             self._save_parameters(),
             self._tunnels.run(self._certification.each_hour),
             parts.publisher.run(parts.reconciler.ready),

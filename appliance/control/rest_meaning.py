@@ -23,7 +23,7 @@ _TAG = re.compile(r'"([\x21\x23-\x7e]{1,90})"')
 _NO = frozenset({"0", "false", "off", "no", "f", "n"})
 _READ: Mapping[str, Callable[[list[str]], Any]] = {
     "confirm_within": lambda said: float(said[-1]),
-    "prune": lambda said: said[-1].lower() not in _NO,
+    **dict.fromkeys(("prune", "force", "shadow"), lambda said: said[-1].lower() not in _NO),
     "names": list,
 }
 

@@ -53,7 +53,20 @@ def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
         {name: monitors.published_by(name) for name in files},
         certificates,
         _bounded(encoded(monitors.compiled)),
+        _places(monitors),
     )
+
+
+def _places(monitors: MonitorSet) -> dict[str, str]:
+    """Return where each topic is first named."""
+    named = [
+        (event.position, event.topic) for monitor in monitors.monitors for event in monitor.code.events
+    ] + [(publication.position, publication.topic) for publication in monitors.compiled.publications]
+    places: dict[str, str] = {}
+    for position, topic in sorted(named, key=lambda one: one[0]):
+        if topic is not None:
+            places.setdefault(topic, str(position))
+    return places
 
 
 def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:

@@ -8,8 +8,8 @@ Invariants:
    the store (`revisions.py`) and survives a restart, as the switches (`switches.py`) do.
 2. New specifications are compiled before anything changes, by the process that `check` asks; bad ones change nothing
    and say everything that is wrong with them. The relays are given what was compiled, and have the last word.
-3. What is loaded joins monitors on trial that it shares variables with; no load and no switch takes one that is in
-   force along.
+3. What is loaded joins monitors in shadow mode that it shares variables with; no load and no switch takes a monitor
+   that is in force along.
 4. A reload takes what the folder has, and leaves what the folder does not have in force unless it is told to remove
    that: nobody's protection ends because a file is not where it was.
 5. Every change can be made on trial (`store/revisions.py`), and every revision is kept with the switches that it had
@@ -20,6 +20,7 @@ Invariants:
 
 import asyncio
 import contextlib
+import datetime
 import json
 import time
 from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
@@ -38,8 +39,10 @@ from appliance.fingerprints import fingerprint, fingerprint_of_all
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError
 from appliance.specifications.folder import SpecificationFolder
+from appliance.specifications.live_topics import Published, judge_topics
 from appliance.specifications.records import MonitorRecords
 from appliance.specifications.relays import Relays
+from appliance.specifications.returns import LONGEST, Returns
 from appliance.specifications.revisions import (
     DISK,
     NOTHING,
@@ -64,6 +67,14 @@ _NO_FOLDER = (
     "no folder of specifications is configured, so there is nothing to reload, and nothing was changed: start with"
     " --monitors DIR (monitors: DIR in appliance.yaml), or load files: rosrv monitor load FILE"
 )
+
+
+_EVENTS: dict[Switch, str] = {
+    True: "monitor enabled",
+    False: "monitor disabled",
+    TRIAL: "monitor on trial",
+}
+_WORDS: dict[Switch, str] = {True: "enabled", False: "disabled", TRIAL: "in shadow mode"}
 
 
 class UnknownMonitorError(Exception):
@@ -110,13 +121,15 @@ class Monitors:
         check: Check,
         try_out: Check,
         parts: Parts,
+        live: Callable[[], Published],
     ) -> None:
-        """`check` compiles for an order, `try_out` for a dry run."""
+        """`check` compiles for an order, `try_out` for a dry run; `live()` is what nodes publish now."""
         self.folder = folder
         self._folder = SpecificationFolder(folder)
         self.site_keys = site_keys
         self._check = check
         self._try_out = try_out
+        self._live = live
         self._store = store
         self._trail = trail
         self.switches = Switches(enable)
@@ -127,6 +140,7 @@ class Monitors:
         self._one_change = asyncio.Lock()
         self._attempting: set[str] = set()  # who has a dry run under way
         self._trial = Trial(store, "confirm monitors", self._go_back, (SpecificationsRefusedError,))
+        self.returns = Returns(store, self._come_back)
         self.in_force = NOTHING  # until `start`
         self.sources = Sources()
         self.checked = Checked()
@@ -162,6 +176,7 @@ class Monitors:
                     self._keep(sources, checked, who=DISK, note="read at start")
         now = self._revision(self.revision, self.sources, self.checked)
         await self.rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
+        self.returns.start(self._disabled())
         unknown = sorted(self.switches.named - self.checked.monitors.keys())
         if unknown and self.in_force.who == DISK and not restarted:
             raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
@@ -240,9 +255,11 @@ class Monitors:
         async with self._changing(request.expected):
             new = Sources(request.files, request.definitions, request.signatures)
             sources = self.sources.with_files(new)
-            if self.in_force.who != DISK and sources == self.sources:  # the same texts twice are one revision
-                return self._replaced(self.revision, ([], [], []))
-            return await self._change(sources, who, who, request.note or "loaded", request.confirm_within)
+            shadow = frozenset(new.files) if request.shadow else frozenset()
+            if self.in_force.who != DISK and sources == self.sources and not shadow:
+                return self._replaced(self.revision, ([], [], []))  # the same texts twice are one revision
+            note, within = request.note or "loaded", request.confirm_within
+            return await self._change(sources, who, who, note, within, shadow=shadow, forced=request.force)
 
     async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
         """Return what a load would do. Raises as `load`, and `DryRunUnderWayError`."""
@@ -257,8 +274,10 @@ class Monitors:
             checked = await self._try_out(following, self.site_keys)
         finally:
             self._attempting.discard(who)
+        shadow = self._in_shadow(checked, request.files if request.shadow else ())
+        warnings = self._judged(checked, shadow, forced=request.force)
         files = following.difference(present)
-        return answers.Tried(revision, tag, *files, [*checked.warnings], [*checked.monitors])
+        return answers.Tried(revision, tag, *files, [*checked.warnings, *warnings], [*checked.monitors])
 
     async def replace(self, request: admin.MonitorReplace, who: str) -> Replaced:
         """Put a text in the place of a monitor's file. Raises `UnknownMonitorError`, and as `load`."""
@@ -270,6 +289,8 @@ class Monitors:
             request.expected,
             request.confirm_within,
             {**request.signatures, file: request.signature},
+            request.force,
+            request.shadow,
         )
         return await self.load(load, who)
 
@@ -286,8 +307,12 @@ class Monitors:
             if kept:
                 sources = self.sources.with_files(sources)
             keeper = who if kept else DISK  # else the next start would read the folder, and nothing else
-            within = request.confirm_within
-            return await self._change(sources, keeper, who, "reloaded from disk", within, kept=kept)
+            added, changed, _removed = sources.difference(self.sources)
+            shadow = frozenset([*added, *changed]) if request.shadow else frozenset()
+            within, note = request.confirm_within, "reloaded from disk"
+            return await self._change(
+                sources, keeper, who, note, within, kept=kept, shadow=shadow, forced=request.force
+            )
 
     async def remove(self, request: admin.MonitorRemove, who: str) -> Replaced:
         """Remove files, by their names or those of their monitors.
@@ -326,7 +351,7 @@ class Monitors:
                 except UnknownRevisionError as error:
                     raise SpecificationsRefusedError([str(error)]) from error
             note, switches = f"rolled back to revision {row.revision}", kept_in(row).switches
-            return await self._change(sources_of(row), who, who, note, switches=switches)
+            return await self._change(sources_of(row), who, who, note, switches=switches, forced=True)
 
     async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
         """Keep an unconfirmed change, if there is one."""
@@ -345,39 +370,66 @@ class Monitors:
             return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
     async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
-        """Enable or disable monitors; those that were not so already.
+        """Enable or disable monitors, for `for_seconds` or until further notice; return those that were not so already.
 
-        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for one that is to be enabled but is on trial, or
-        shares variables with one that is.
+        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for a monitor that is to be enabled but is in
+        shadow mode, or shares variables with one that is.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
+            seconds = request.for_seconds
+            if seconds is not None and (request.enabled or not 0 < seconds <= LONGEST):
+                text = f"a monitor may be disabled for up to {LONGEST / 86_400:g} days; it is not enabled for a time"
+                raise SpecificationsRefusedError([text])
             tried = [name for name in request.names if request.enabled and self.switches.on_trial(name)]
             if tried:
-                text = f"{', '.join(tried)} is on trial: rosrv monitor promote brings it into force"
+                text = f"{', '.join(tried)} is in shadow mode: rosrv monitor promote brings it into force"
                 raise SpecificationsRefusedError([text])
-            return self._switched(await self._switch(request.names, request.enabled, who))
+            return self._switched(await self._switch(request.names, request.enabled, who, seconds))
 
-    async def trial(self, request: admin.MonitorTrial, who: str) -> Switched:
-        """Put monitors on trial, or bring those on trial into force; those that were not so already.
+    async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
+        """Put monitors into shadow mode, or from there into force; return those that were not so already.
 
-        The same errors, and for a disabled one that is to be brought into force.
+        Raises as `switch`, for a disabled monitor that is to be brought into force, and for one that would cut a topic.
         """
         async with self._changing(request.expected):
             self._all_known(request.names)
             disabled = [name for name in request.names if self.switches.states[name] is False]
-            if disabled and not request.trial:
-                text = f"{', '.join(disabled)} is disabled, not on trial: rosrv monitor enable"
+            if disabled and not request.shadow:
+                text = f"{', '.join(disabled)} is disabled, not in shadow mode: rosrv monitor enable"
                 raise SpecificationsRefusedError([text])
-            names = await self._switch(request.names, TRIAL if request.trial else True, who)
+            if not request.shadow:
+                others = set(self.switches.tried()) - set(request.names)
+                self._judged(self.checked, others, forced=request.force, promoted=request.names)
+            names = await self._switch(request.names, TRIAL if request.shadow else True, who)
             return self._switched(names, self.rollout.began(names))
+
+    async def trial(self, request: admin.MonitorTrial, who: str) -> Switched:
+        """Do as `shadow`: the request under its name of earlier versions."""
+        return await self.shadow(admin.MonitorShadow(request.names, request.trial, request.expected), who)
+
+    async def _come_back(self, back: Mapping[str, Switch]) -> None:
+        """Switch monitors back whose time off is over. Raises `SpecificationsRefusedError`."""
+        async with self._one_change:
+            for to in (True, TRIAL):
+                names = [name for name in self._disabled() if back.get(name) == to]
+                await self._switch(names, to, "its time off is over")
+
+    def _disabled(self) -> list[str]:
+        return [name for name, state in self.switches.states.items() if state is False]
 
     def _switched(self, names: list[str], began: Sequence[str] = ()) -> Switched:
         return Switched(names, self.revision, self.tag, [*began])
 
-    async def _switch(self, names: list[str], to: Switch, who: str) -> list[str]:
+    async def _switch(
+        self, names: Sequence[str], to: Switch, who: str, seconds: float | None = None
+    ) -> list[str]:
         switches = self.switches
-        changed = [name for name in dict.fromkeys(names) if switches.states[name] != to]
+        changed = [
+            name
+            for name in dict.fromkeys(names)
+            if switches.states[name] != to or (to is False and (seconds is not None or name in self.returns))
+        ]
         if not changed:
             return changed
         before, others = switches.said, dict.fromkeys(changed, to)
@@ -391,20 +443,31 @@ class Monitors:
             except SpecificationsRefusedError:
                 switches.said = before
                 raise
-        word = "on trial" if to == TRIAL else "enabled" if to else "disabled"
+        if seconds is None:
+            self.returns.end(changed)
+        else:
+            self.returns.begin({name: switches.states[name] or True for name in changed}, seconds)
         for name in changed:
             switches.states[name] = to
             if not retried:
                 self.rollout.tell(name, messages.MonitorSwitched(name, to is True))
-            self._say_switched(name, word, who, f"{name} is {word}")
+            self._say_switched(name, to, who)
         self._store.save_setting(_SWITCHES, json.dumps(switches.said))
         await self._store.settled()
         await self.rollout.carried_out()
         return changed
 
-    def _say_switched(self, name: str, word: str, who: str, text: str) -> None:
+    def _say_switched(self, name: str, to: Switch, who: str, why: str = "") -> None:
+        until = self.returns.until(name)
+        end = "" if until is None else f" until {_moment(until)}"
         self._trail.happened(
-            f"monitor {word}", text, severity=Severity.NOTICE, category="monitor", resource=name, who=who
+            _EVENTS[to],
+            f"{name} is {_WORDS[to]}{end}{why}",
+            severity=Severity.NOTICE,
+            category="monitor",
+            resource=name,
+            who=who,
+            more=None if until is None else {"until": _moment(until)},
         )
 
     async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
@@ -492,8 +555,13 @@ class Monitors:
         *,
         kept: Sequence[str] = (),
         switches: Mapping[str, Switch] = {},
+        shadow: Collection[str] = (),
+        forced: bool = False,
     ) -> Replaced:
-        """`switches` are for monitors that are not in force yet."""
+        """`switches` are for monitors that are not in force yet; those of the files `shadow` come in shadow mode.
+
+        `forced`: topics are cut whose publishers have another type.
+        """
         before, previous, switched = self.revision, self.sources, self.switches.said
         self.switches.said = {
             **{monitor: to for monitor, to in switches.items() if monitor not in self.checked.monitors},
@@ -501,7 +569,10 @@ class Monitors:
         }
         try:
             checked = await self._check(sources, self.site_keys)
-            in_force = {name: True for name in checked.monitors if self.switches.enabled(name)}
+            put = {name: TRIAL for name, file in checked.monitors.items() if file in shadow}
+            in_force = {name: True for name in checked.monitors if self.switches.enabled(name)} | put
+            self.switches.said |= put
+            warnings = self._judged(checked, self._in_shadow(checked), forced=forced)
             require_whole(self.switches.states_of(checked) | in_force, checked)
             moved = await self.rollout.take(self._revision(before + 1, sources, checked))
         except SpecificationsRefusedError as error:
@@ -517,13 +588,32 @@ class Monitors:
             raise SpecificationsRefusedError(findings) from error
         began = self.rollout.began(checked.monitors)
         self._trial.announce(before, confirm_within)
-        self._keep(sources, checked, who=keeper, note=note, by=who, began=began)
+        self._keep(sources, checked, who=keeper, note=note, by=who, began=began, warnings=warnings)
+        for name in put:
+            self._say_switched(name, TRIAL, who, ", as it was loaded")
         self._trial.changed(before, confirm_within)
         await self._store.settled()
         await self.rollout.all_taken()
         self._published()
         began = self.rollout.began(checked.monitors)  # by those that have it only now, too
-        return self._replaced(before, sources.difference(previous), moved, began, kept)
+        done = self._replaced(before, sources.difference(previous), moved, began, kept)
+        return msgspec.structs.replace(done, warnings=[*done.warnings, *warnings])
+
+    def _in_shadow(self, checked: Checked, files: Collection[str] = ()) -> set[str]:
+        """Return which of these monitors are, or would be, in shadow mode: also those of the `files`."""
+        states = self.switches.states_of(checked)
+        return {name for name, file in checked.monitors.items() if states[name] == TRIAL or file in files}
+
+    def _judged(
+        self, coming: Checked, shadow: Collection[str], *, forced: bool, promoted: Collection[str] = ()
+    ) -> list[str]:
+        """Return warnings about topics. Raises `SpecificationsRefusedError` where one would be cut."""
+        found = judge_topics(
+            coming, self.checked, self._live(), shadow=shadow, forced=forced, promoted=promoted
+        )
+        if found.conflicts:
+            raise SpecificationsRefusedError([*found.conflicts, *found.warnings])
+        return found.warnings
 
     def _replaced(
         self,
@@ -533,7 +623,7 @@ class Monitors:
         began: Sequence[str] = (),
         kept: Sequence[str] = (),
     ) -> Replaced:
-        """What a change did; `files` are those added, changed and removed."""
+        """Describe a change; `files` are those added, changed and removed."""
         warnings = list(self.checked.warnings)
         return Replaced(
             self.revision, self.tag, before, *files, warnings, [*moved], [*began], [*kept], self.confirm_by
@@ -548,6 +638,7 @@ class Monitors:
         note: str,
         by: str | None = None,
         began: Sequence[str] = (),
+        warnings: Sequence[str] = (),
     ) -> None:
         last, before = self.in_force, sources_of(self.in_force)
         if last.revision:
@@ -573,13 +664,16 @@ class Monitors:
             began=list(began),
             signed_by=checked.signed_by,
             certificates=checked.certificates,
-            warnings=list(checked.warnings)[:100],
+            warnings=[*checked.warnings, *warnings][:100],
         )
 
     def _enforce(self, sources: Sources, checked: Checked, row: MonitorRevisionRow) -> None:
         self.sources, self.checked, self.in_force = sources, checked, row
         for name in self.switches.enforce(checked):
-            self._say_switched(
-                name, TRIAL, row.who, f"{name} is on trial: it shares variables with one that is"
-            )
+            self._say_switched(name, TRIAL, row.who, ": it shares variables with one that is")
+        self.returns.keep(self._disabled())
         self._store.save_setting(_SWITCHES, json.dumps(self.switches.said))
+
+
+def _moment(seconds: float) -> str:
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat(timespec="seconds")

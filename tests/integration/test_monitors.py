@@ -157,7 +157,7 @@ def test_a_monitor_on_trial_says_what_it_would_do_until_it_is_promoted(
     appliance: Appliance, ros: RosSession
 ) -> None:
     """No message is lost meanwhile, and the first changed one follows the last untouched one."""
-    assert appliance.rosrv("monitor", "enable", "words", "--trial").stdout == "on trial: words\n"
+    assert appliance.rosrv("monitor", "enable", "words", "--shadow").stdout == "shadow mode: words\n"
     listener = ros.listener("roscpp", "/chatter")
     ros.talker("roscpp", "/chatter", name="voice")
     rude = ros.talker("rospy", "/chatter", "--text", "bad", name="rude")
@@ -184,7 +184,7 @@ def test_a_monitor_on_trial_says_what_it_would_do_until_it_is_promoted(
     )
     status = appliance.status()["monitors"]
     assert (status["enabled"], status["trials"]) == (0, ["words"])
-    assert "1 on trial" in appliance.rosrv("status").stdout
+    assert "1 in shadow mode" in appliance.rosrv("status").stdout
     assert "rosrv monitor promote" in appliance.rosrv("monitor", "enable", "words", check=False).stderr
     assert appliance.rosrv("monitor", "promote", "words").stdout == "enabled: words\n"
     listener.wait_for(lambda event: event.get("data", "").startswith("checked hello"))

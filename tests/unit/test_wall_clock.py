@@ -20,7 +20,7 @@ READERS = {
         "hosts/revoked_certificates.py", "hosts/tunnels.py", "hosts/view.py", "ipsec/authority.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
-        "hosts/self_service.py", "store/revisions.py",
+        "control/switched_off.py", "hosts/self_service.py", "specifications/returns.py", "store/revisions.py",
     ],
     "whether the wall clock can be believed": ["ages.py", "control/clock.py", "shipped.py"],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [

@@ -46,7 +46,7 @@ class MonitorState(msgspec.Struct, frozen=True):
 
     name: str
     file: Annotated[str, told("the specification file it stands in; a file may have several monitors")]
-    enabled: Annotated[bool, told("what it does is done; false while it is on trial")]
+    enabled: Annotated[bool, told("what it does is done; false while it is in shadow mode")]
     held: Annotated[bool, told("blocks its topics until it is resumed")]
     failing: bool
     topics: list[str]
@@ -60,11 +60,12 @@ class MonitorState(msgspec.Struct, frozen=True):
         list[str],
         told("of each property: whether its automaton was proved to be what is written, or why not"),
     ]
-    trial: Annotated[bool, told("on trial: given copies of messages, to say what it would have done")] = False
-    would_drop: Annotated[int, told("messages that it would have dropped since it is on trial")] = 0
+    trial: Annotated[bool, told("the same as `shadow`; deprecated")] = False
+    would_drop: Annotated[int, told("messages that it would have dropped since it is in shadow mode")] = 0
     would_change: Annotated[int, told("the same of changes")] = 0
     missed: Annotated[
-        int, told("messages that it was not given on trial, or not to the end: its counts are not complete")
+        int,
+        told("messages that it was not given in shadow mode, or not to the end: its counts are not complete"),
     ] = 0
     slices: Annotated[
         int, told("bindings of its parameters that are monitored now; 0 of one without parameters")
@@ -74,6 +75,12 @@ class MonitorState(msgspec.Struct, frozen=True):
         list[MonitorMargin], told("of its comparisons of numbers that came up, in the order of the text")
     ] = []
     why_held: Annotated[str, told("why its state was lost, if it holds its topics for that")] = ""
+    shadow: Annotated[
+        bool, told("in shadow mode: given copies of messages, to record what it would have done")
+    ] = False
+    off_until: Annotated[Moment | None, told("disabled, and enabled again by itself then; null: no end")] = (
+        None
+    )
 
 
 class Monitors(msgspec.Struct, frozen=True):
@@ -172,5 +179,5 @@ class Switched(msgspec.Struct, frozen=True):
     revision: int
     tag: Tag
     began: Annotated[
-        list[str], told("of those that are on trial now or were: which are in their initial state")
+        list[str], told("of those that are in shadow mode now or were: which are in their initial state")
     ] = []

@@ -95,7 +95,7 @@ class MonitorsState(msgspec.Struct, frozen=True):
     who: str
     differs_from_folder: bool
     confirm_by: Moment | None
-    trials: Annotated[list[str], told("monitors on trial")] = []
+    trials: Annotated[list[str], told("monitors in shadow mode")] = []
     why_held: Annotated[
         dict[str, str], told("why the state of those was lost that hold their topics for that")
     ] = {}
@@ -152,6 +152,18 @@ class RecorderState(msgspec.Struct, frozen=True):
     bytes: int
 
 
+class SwitchedOff(msgspec.Struct, frozen=True):
+    """A monitor that an order disabled or put into shadow mode, or a section of the policy that is audit-only."""
+
+    about: Annotated[Literal["monitors", "policy"], told("what it belongs to")]
+    name: Annotated[str, told("of the monitor, or of the section")]
+    what: Annotated[str, told("a sentence: what is off, and how")]
+    again: Annotated[str, told("what brings it back")]
+    since: Moment
+    until: Annotated[Moment | None, told("when it comes back by itself; null: never")]
+    forgotten: Annotated[bool, told("off for longer than `forgotten_after`: an alarm")]
+
+
 class Status(msgspec.Struct, frozen=True):
     """The running appliance, as `rosrv status --json` shows it; `since` is seconds since the epoch."""
 
@@ -181,3 +193,4 @@ class Status(msgspec.Struct, frozen=True):
     audit: AuditState
     clock: ClockState
     recorder: Annotated[RecorderState | None, told("null: nothing is recorded")] = None
+    switched_off: Annotated[list[SwitchedOff], told("what an operator switched off")] = []

@@ -10,7 +10,8 @@ class Contents(msgspec.Struct, frozen=True):
 
     `uses` are the other monitors whose variables a monitor uses, `published_by` the topics each file publishes.
     `types` has the message type of each topic, `texts` the full text of each such type. `certificates` says of each
-    property of a monitor whether its automaton was proved to be what is written. Of `compiled` each relay runs its part
+    property of a monitor whether its automaton was proved to be what is written. `places` has where each topic is
+    first named (`file:line:column`). Of `compiled` each relay runs its part
     (`PartsWanted`).
     """
 
@@ -25,6 +26,7 @@ class Contents(msgspec.Struct, frozen=True):
     published_by: dict[str, frozenset[str]] = {}
     certificates: dict[str, list[str]] = {}
     compiled: bytes = b""
+    places: dict[str, str] = {}
 
 
 class ContentsWanted(Message):

@@ -14,13 +14,25 @@ from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitors import MonitorState, Replaced, Switched
 from appliance.cli import completion
-from appliance.cli.output import counted, printable, say, say_json, usage_error
+from appliance.cli.output import counted, moment, printable, say, say_json, usage_error
+from appliance.cli.spans import span_given
 from appliance.cli.tables import say_table, table_of
 from appliance.cli.target import Appliance, speaks
 from appliance.cli.trials import ConfirmWithin, say_deadline, seconds_within
 
 _Names = Annotated[
     list[str], typer.Argument(metavar="MONITOR…", show_default=False, autocompletion=completion.monitors)
+]
+
+_SHADOW = "shadow mode"
+_Shadow = Annotated[
+    bool,
+    typer.Option(
+        "--shadow", help="In shadow mode: change and drop nothing, record what they would have done"
+    ),
+]
+_Force = Annotated[
+    bool, typer.Option("--force", help="Even if a topic is cut whose publisher has another type")
 ]
 
 
@@ -52,7 +64,7 @@ def list_monitors(appliance: Appliance) -> None:
     else:
         say("no monitor is loaded: rosrv monitor load FILE…")
     if any(row.trial for row in body.monitors):
-        say("(in brackets: what a monitor on trial would have dropped and changed)", "dim")
+        say("(in brackets: what a monitor in shadow mode would have dropped and changed)", "dim")
     source = f" ({body.folder})" if body.folder else ""
     differs = (
         "; not what the folder has (rosrv monitor reload takes that, and removes nothing)"
@@ -107,37 +119,59 @@ def enable(
     appliance: Appliance,
     names: _Names,
     *,
-    trial: Annotated[
+    shadow: Annotated[
         bool,
-        typer.Option("--trial", help="On trial: change and drop nothing, record what they would have done"),
+        typer.Option(
+            "--shadow", help="Shadow mode: change and drop nothing, record what they would have done"
+        ),
     ] = False,
+    trial: Annotated[bool, typer.Option("--trial", hidden=True)] = False,
 ) -> None:
-    """Let the events of these monitors happen again, or first on trial.
+    """Enable monitors. With --shadow they only record what they would have done.
 
-    Example: rosrv monitor enable safeTrigger --trial
+    Example: rosrv monitor enable safeTrigger --shadow
     """
-    order = admin.MonitorTrial(names, True) if trial else admin.MonitorSwitch(names, True)
-    _switch(appliance, order, "on trial" if trial else "enabled")
+    if trial:
+        typer.echo("rosrv: --trial is deprecated: say --shadow", err=True)
+    if shadow or trial:
+        _switch(appliance, admin.MonitorShadow(names, True), _SHADOW)
+    else:
+        _switch(appliance, admin.MonitorSwitch(names, True), "enabled")
 
 
 @speaks
-def promote(appliance: Appliance, names: _Names) -> None:
-    """Bring monitors that are on trial into force, with the state that they have.
+def promote(appliance: Appliance, names: _Names, *, force: _Force = False) -> None:
+    """Bring monitors from shadow mode into force, with the state that they have.
 
-    One that was not given all messages on trial begins in its initial state, and that is said.
+    A monitor that was not given all messages in shadow mode begins in its initial state; the answer names it.
 
     Example: rosrv monitor promote safeTrigger
     """
-    _switch(appliance, admin.MonitorTrial(names, False), "enabled")
+    _switch(appliance, admin.MonitorShadow(names, False, force=force), "enabled")
 
 
 @speaks
-def disable(appliance: Appliance, names: _Names) -> None:
+def disable(
+    appliance: Appliance,
+    names: _Names,
+    *,
+    time_off: Annotated[
+        str | None,
+        typer.Option("--for", metavar="TIME", help="Enable them again after this time (30s, 10m, 2h, 1d)"),
+    ] = None,
+) -> None:
     """Let messages pass these monitors untouched; their variables stay.
 
-    Example: rosrv monitor disable safeTrigger
+    With --for they are enabled again automatically, whatever is restarted meanwhile.
+
+    Example: rosrv monitor disable safeTrigger --for 10m
     """
-    _switch(appliance, admin.MonitorSwitch(names, False), "disabled")
+    seconds = (
+        None if time_off is None else span_given("--for", time_off, "30s, 10m, 2h or 1d", "rosrv monitor")
+    )
+    _switch(appliance, admin.MonitorSwitch(names, False, for_seconds=seconds), "disabled")
+    if seconds is None and not appliance.as_json:
+        say("without an end: --for TIME enables them again automatically", "yellow")
 
 
 @speaks
@@ -151,13 +185,16 @@ def load(
     *,
     note: Annotated[str, typer.Option(help="Why; kept with the revision")] = "",
     confirm_within: ConfirmWithin = None,
+    shadow: _Shadow = False,
+    force: _Force = False,
 ) -> None:
     """Load specifications while the robot runs; a file of the same name is replaced.
 
-    They are compiled first: with an error nothing changes and the exit status is 1. Definitions of messages are
-    taken from `msg/` beside the files and from --msg.
+    They are compiled first, and compared with the topics of the robot: with an error nothing changes and the exit
+    status is 1. With --shadow their monitors only record what they would have done, from the start. Definitions of
+    messages are taken from `msg/` beside the files and from --msg.
 
-    Example: rosrv monitor load safe_zone.rv
+    Example: rosrv monitor load safe_zone.rv --shadow
     """
     from appliance.cli.monitor.input import read_to_send  # noqa: PLC0415  it takes a while, and is for this verb only
     from appliance.rosmop.syntax.errors import SpecificationError  # noqa: PLC0415  as above
@@ -174,6 +211,8 @@ def load(
         note,
         confirm_within=seconds_within(confirm_within, "monitor"),
         signatures=sent.signatures,
+        force=force,
+        shadow=shadow,
     )
     say_replaced(appliance.answer_or_exit(order))
     _say_idle(appliance, sent.files)
@@ -194,12 +233,16 @@ def reload(
     appliance: Appliance,
     prune: Annotated[bool, typer.Option("--prune", help="Also remove what the folder does not have")] = False,
     confirm_within: ConfirmWithin = None,
+    *,
+    shadow: _Shadow = False,
+    force: _Force = False,
 ) -> None:
     """Take what the folder of specifications has now; what it does not have stays in force, and is named.
 
     Example: rosrv monitor reload
     """
-    order = admin.MonitorReload(prune=prune, confirm_within=seconds_within(confirm_within, "monitor"))
+    within = seconds_within(confirm_within, "monitor")
+    order = admin.MonitorReload(prune=prune, confirm_within=within, force=force, shadow=shadow)
     body = appliance.answer_or_exit(order)
     say_replaced(body)
     if body.kept:
@@ -233,7 +276,14 @@ def rv_state(appliance: Appliance) -> None:
 def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str) -> None:
     body = appliance.ask_or_exit(order)
     if appliance.as_json:
-        say_json({**asdict(body), "enabled": word == "enabled", "trial": word == "on trial"})
+        say_json(
+            {
+                **asdict(body),
+                "enabled": word == "enabled",
+                "trial": word == _SHADOW,
+                "shadow": word == _SHADOW,
+            }
+        )
         return
     say(f"{word}: {', '.join(body.names) or 'nothing, it was so already'}")
     if body.began:
@@ -242,12 +292,14 @@ def _switch(appliance: Appliance, order: admin.AdminRequest[Switched], word: str
 
 def _state(row: MonitorState) -> str:
     if row.trial:
-        return f"on trial, {row.missed} missed" if row.missed else "on trial"
+        return f"shadow mode, {row.missed} missed" if row.missed else _SHADOW
     if row.held:
         return "holds its topics"
     if row.failing:
         return "failing"
-    return "enabled" if row.enabled else "disabled"
+    if row.enabled:
+        return "enabled"
+    return "disabled" if row.off_until is None else f"disabled until {moment(row.off_until)}"
 
 
 def say_replaced(body: Replaced) -> None:
@@ -270,10 +322,13 @@ def say_replaced(body: Replaced) -> None:
 
 
 def _say_idle(appliance: Appliance, files: Collection[str]) -> None:
-    """Print which monitors do not judge messages yet: disabled by `--enable none`, or holding their topics."""
-    rows = appliance.ask_or_exit(admin.MonitorsWanted()).monitors
-    names = [row.name for row in rows if row.file in files and not row.enabled and not row.trial]
-    if names:
-        say(f"disabled (--enable): {', '.join(names)}; rosrv monitor enable {' '.join(names)}", "yellow")
+    """Name the loaded monitors that do not act, and the command that lets them."""
+    rows = [row for row in appliance.ask_or_exit(admin.MonitorsWanted()).monitors if row.file in files]
+    for word, verb, names in (
+        ("disabled", "enable", [row.name for row in rows if not row.enabled and not row.trial]),
+        ("in shadow mode", "promote", [row.name for row in rows if row.trial]),
+    ):
+        if names:
+            say(f"{word}: {', '.join(names)}; rosrv monitor {verb} {' '.join(names)}", "yellow")
     for row in (row for row in rows if row.why_held):
         say(f"{row.name} holds its topics: {row.why_held}; rosrv monitor resume {row.name}", "yellow")

@@ -169,7 +169,7 @@ def test_a_monitor_on_trial_says_what_it_would_drop_and_is_promoted(
     appliance.rosrv("monitor", "disable", "hush")
     page = opened().go("monitors/hush", heading="hush")
     press(page.get_by_role("button", name="Try"))
-    expect(page.get_by_text("on trial", exact=True).first).to_be_visible()
+    expect(page.get_by_text("shadow mode", exact=True).first).to_be_visible()
     with RosSession(appliance.master_uri, tmp_path) as ros:
         ear = ros.listener("rospy", "/loud", name="neighbour")
         ros.talker("rospy", "/loud", name="shouter")

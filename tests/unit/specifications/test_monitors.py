@@ -14,6 +14,7 @@ from appliance.audit.log import AuditLog
 from appliance.channel import admin, messages
 from appliance.specifications.allocation import Allocation, Move, Resource
 from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError, check
+from appliance.specifications.live_topics import Published
 from appliance.specifications.monitors import (
     DryRunUnderWayError,
     Monitors,
@@ -54,6 +55,7 @@ class Desk:
         self.carried_out = asyncio.Event()
         self.carried_out.set()
         self.try_out: Check = here
+        self.live: Published = {}
 
     async def monitors(
         self,
@@ -80,6 +82,7 @@ class Desk:
             check=here,
             try_out=self.try_out,
             parts=parts_here,
+            live=lambda: self.live,
         )
         await relay.monitors.start(restarted=restarted)
         return relay.monitors
@@ -134,6 +137,134 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
     yield desk
     desk.store.close()
     desk.log.close()
+
+
+async def test_a_topic_whose_publisher_has_another_type_is_not_cut_by_mistake(desk: Desk) -> None:
+    """Load, dry run and reload name topic, types and node and change nothing; what is forced says it as a warning."""
+    desk.live = {"/other": {"/talker": "std_msgs/Int32"}, "/chatter": {"/talker": "std_msgs/String"}}
+    monitors = await desk.monitors()
+    found = (
+        r"b\.rv:1:12: error: /talker publishes /other as std_msgs/Int32, not as std_msgs/String: .*--force"
+    )
+    (desk.folder / "b.rv").write_text(B)
+    for refused in (
+        monitors.load(admin.MonitorLoad({"b.rv": B}), "eve"),
+        monitors.attempt(admin.MonitorTry({"b.rv": B}), "eve"),
+        monitors.reload(admin.MonitorReload(), "eve"),
+    ):
+        with pytest.raises(SpecificationsRefusedError, match=found):
+            await refused
+    assert (monitors.revision, monitors.names()) == (1, ["a"])
+    tried = await monitors.attempt(admin.MonitorTry({"b.rv": B}, force=True), "eve")
+    forced = await monitors.load(admin.MonitorLoad({"b.rv": B}, force=True), "eve")
+    assert [tried.warnings, forced.warnings] == [[found_line] for found_line in forced.warnings] * 2
+    assert "b.rv:1:12: warning: /talker publishes /other as std_msgs/Int32" in forced.warnings[0]
+    assert (await monitors.load(admin.MonitorLoad({"c.rv": C}), "eve")).added == [
+        "c.rv"
+    ]  # /other is not judged again
+
+
+async def test_a_topic_that_no_node_publishes_is_named_with_the_nearest(desk: Desk) -> None:
+    """A wrong letter in a topic is a warning of the load, with the topic that was probably meant."""
+    desk.live = {"/thirds": {"/talker": "std_msgs/String"}}
+    monitors = await desk.monitors()
+    loaded = await monitors.load(admin.MonitorLoad({"c.rv": C}), "eve")
+    assert loaded.warnings == ["c.rv:1:7: warning: no node publishes /third now; did you mean /thirds?"]
+
+
+async def test_a_monitor_in_shadow_mode_cuts_nothing_until_it_is_promoted(desk: Desk) -> None:
+    """A type conflict in shadow mode is a warning; promoting the monitor is refused as a load would be."""
+    desk.live = {"/other": {"/talker": "std_msgs/Int32"}}
+    monitors = await desk.monitors()
+    loaded = await monitors.load(admin.MonitorLoad({"b.rv": B}, shadow=True), "eve")
+    assert "monitors in shadow mode are not given its messages" in loaded.warnings[0]
+    with pytest.raises(SpecificationsRefusedError, match="error: /talker publishes /other"):
+        await monitors.shadow(admin.MonitorShadow(["b"], False), "eve")
+    assert monitors.switches.on_trial("b")
+    await monitors.shadow(admin.MonitorShadow(["b"], False, force=True), "eve")
+    assert monitors.switches.enabled("b")
+
+
+async def test_an_untried_monitor_never_acts_when_it_is_loaded_in_shadow_mode(desk: Desk) -> None:
+    """With `shadow` a load brings its files into force in shadow mode in the same step; the others stay."""
+    monitors = await desk.monitors()
+    desk.sent.clear()
+    await monitors.load(admin.MonitorLoad({"b.rv": B}, shadow=True), "eve")
+    stated = [one for one in desk.sent if isinstance(one, messages.SpecificationsStated)]
+    assert stated
+    assert all(one.trials == ("b",) for one in stated if "b" in one.enabled)
+    assert (monitors.switches.enabled("a"), monitors.switches.on_trial("b")) == (True, True)
+    (desk.folder / "c.rv").write_text(C)
+    await monitors.reload(admin.MonitorReload(shadow=True), "eve")
+    assert monitors.switches.states == {"a": True, "b": "on trial", "c": "on trial"}
+    await monitors.load(admin.MonitorLoad({"a.rv": A}, shadow=True), "eve")  # the same text
+    assert monitors.switches.on_trial("a")
+    assert (await desk.monitors(restarted=True)).switches.states == dict.fromkeys("abc", "on trial")
+
+
+async def test_what_is_in_force_is_not_taken_into_shadow_mode_by_a_load(desk: Desk) -> None:
+    """A load in shadow mode is refused where its monitors share variables with some that are in force."""
+    monitors = await desk.monitors()
+    sharing = "d() { event said() /chatter std_msgs/String '{}' { shared = 1; } }"
+    with pytest.raises(SpecificationsRefusedError, match="share variables"):
+        await monitors.load(admin.MonitorLoad({"d.rv": sharing}, shadow=True), "eve")
+    assert (monitors.names(), monitors.switches.enabled("a")) == (["a"], True)
+
+
+async def test_new_monitors_may_begin_in_shadow_mode_by_configuration(desk: Desk) -> None:
+    """With `enable: shadow` every monitor that no operator has switched is in shadow mode, and promoted ones stay."""
+    monitors = await desk.monitors("shadow")
+    assert monitors.switches.states == {"a": "on trial"}
+    await monitors.shadow(admin.MonitorShadow(["a"], False), "eve")
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
+    again = await desk.monitors("shadow", restarted=True)
+    assert again.switches.states == {"a": True, "b": "on trial"}
+    assert again.switches.switched_off() == {}
+
+
+async def test_a_monitor_that_is_disabled_for_a_time_comes_back(desk: Desk) -> None:
+    """It is enabled again by itself, as it was before, and both are recorded."""
+    monitors = await desk.monitors()
+    await monitors.shadow(admin.MonitorShadow(["a"], True), "eve")
+    for state, seconds in (("on trial", 0.05), (True, 0.05)):
+        await monitors.shadow(admin.MonitorShadow(["a"], state is not True), "eve")
+        tag = monitors.tag
+        await monitors.switch(admin.MonitorSwitch(["a"], False, for_seconds=seconds), "eve")
+        assert monitors.returns.until("a") is not None
+        async with asyncio.timeout(30):
+            while monitors.switches.states["a"] is False:
+                await asyncio.sleep(0.01)
+        assert (monitors.switches.states["a"], monitors.returns.until("a")) == (state, None)
+        assert monitors.tag != tag
+    rows = [row for row in desk.trail.heard if row[0] in {"monitor disabled", "monitor enabled"}]
+    assert [row[0] for row in rows] == [
+        "monitor disabled", "monitor enabled", "monitor disabled", "monitor enabled"
+    ]  # fmt: skip
+
+
+async def test_a_time_off_survives_restarts_and_ends_when_somebody_switches(desk: Desk) -> None:
+    """After a restart the monitor comes back; an operator's switch, or a removal, ends the time."""
+    monitors = await desk.monitors()
+    await monitors.load(admin.MonitorLoad({"b.rv": B}), "eve")
+    await monitors.switch(admin.MonitorSwitch(["a", "b"], False, for_seconds=3600), "eve")
+    again = await desk.monitors()
+    assert again.returns.until("a") == pytest.approx(monitors.returns.until("a"), abs=5)
+    await again.switch(admin.MonitorSwitch(["a"], False, for_seconds=0.05), "eve")  # shorter than before
+    await again.remove(admin.MonitorRemove(["b"]), "eve")
+    assert again.returns.until("b") is None
+    later = await desk.monitors(restarted=True)
+    async with asyncio.timeout(30):
+        while not later.switches.enabled("a"):
+            await asyncio.sleep(0.01)
+    await later.switch(admin.MonitorSwitch(["a"], False, for_seconds=3600), "eve")
+    assert (await later.switch(admin.MonitorSwitch(["a"], False), "eve")).names == ["a"]  # now without an end
+    assert (later.switches.states["a"], later.returns.until("a")) == (False, None)
+    for wrong in (
+        admin.MonitorSwitch(["a"], True, for_seconds=9),
+        admin.MonitorSwitch(["a"], False, for_seconds=1e9),
+    ):
+        with pytest.raises(SpecificationsRefusedError, match="for up to 30 days"):
+            await later.switch(wrong, "eve")
 
 
 async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:
@@ -631,7 +762,7 @@ async def test_a_trial_is_told_kept_and_promoted(desk: Desk) -> None:
     assert monitors.statement(0).trials == ()
     assert (await monitors.trial(admin.MonitorTrial(["a"], False), "adam")).names == []
     await monitors.switch(admin.MonitorSwitch(["a"], False), "eve")
-    with pytest.raises(SpecificationsRefusedError, match="a is disabled, not on trial"):
+    with pytest.raises(SpecificationsRefusedError, match="a is disabled, not in shadow mode"):
         await monitors.trial(admin.MonitorTrial(["a"], False), "eve")
     said = [(event, fields["who"]) for event, fields in desk.trail.heard if event.startswith("monitor ")]
     assert said == [("monitor on trial", "eve"), ("monitor enabled", "adam"), ("monitor disabled", "eve")]
@@ -672,7 +803,9 @@ async def test_what_shares_variables_is_on_trial_together(desk: Desk) -> None:
     """All are named, by who puts them there and by who promotes them; what is loaded joins, what is in force never."""
     (desk.folder / "u.rv").write_text(USER)
     monitors = await desk.monitors()
-    with pytest.raises(SpecificationsRefusedError, match="u on trial and a in force do not go together"):
+    with pytest.raises(
+        SpecificationsRefusedError, match="u in shadow mode and a in force do not go together"
+    ):
         await monitors.trial(admin.MonitorTrial(["u"], True), "eve")
     assert (await monitors.trial(admin.MonitorTrial(["u", "a"], True), "eve")).names == ["u", "a"]
     with pytest.raises(SpecificationsRefusedError, match="share variables"):
@@ -682,7 +815,7 @@ async def test_what_shares_variables_is_on_trial_together(desk: Desk) -> None:
     assert (await desk.monitors(restarted=True)).switches.on_trial("v")
     await monitors.load(admin.MonitorLoad({"c.rv": C}), "eve")
     uses_both = C.replace("{ }", "{ shared = 2; }")
-    with pytest.raises(SpecificationsRefusedError, match="a, u, v on trial and c in force"):
+    with pytest.raises(SpecificationsRefusedError, match="a, u, v in shadow mode and c in force"):
         await monitors.load(admin.MonitorLoad({"c.rv": uses_both}), "eve")
     assert monitors.switches.enabled("c")
     assert (await monitors.switch(admin.MonitorSwitch(["v"], False), "eve")).names == ["v"]

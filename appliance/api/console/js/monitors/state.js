@@ -13,7 +13,7 @@ import { useStore } from "../store.js";
 export function useMonitors() {
   const [state, setState] = useState({ body: /** @type {any} */ (null), etag: "", error: /** @type {unknown} */ (null) });
   const mark = useStore(live, (one) => JSON.stringify(one.status?.monitors ?? null));
-  // What one on trial would have done is in no sample: it is fetched with each.
+  // What one in shadow mode would have done is in no sample: it is fetched with each.
   const trying = state.body?.monitors.some((/** @type {any} */ row) => row.trial);
   const counted = useStore(live, (one) => JSON.stringify([one.samples.at(-1)?.monitors ?? null, trying && one.samples.at(-1)?.time]));
   const shown = useRef({ etag: "", changes: 0, last: /** @type {Promise<unknown>} */ (Promise.resolve()) });
@@ -48,7 +48,7 @@ export function useMonitors() {
 
 /** In one word. @param {any} row */
 export function stateOf(row) {
-  return row.trial ? "on trial" : row.held ? "held" : row.failing ? "failing" : row.enabled ? "enabled" : "disabled";
+  return row.trial ? "shadow mode" : row.held ? "held" : row.failing ? "failing" : row.enabled ? "enabled" : "disabled";
 }
 
 /** How a monitor's counter grew, out of the samples. @param {any[]} samples @param {string} name @param {number} place */

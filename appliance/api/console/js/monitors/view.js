@@ -53,7 +53,7 @@ function MonitorTable(/** @type {{monitors: any}} */ { monitors }) {
     <tbody>${monitors.body.monitors.map((/** @type {any} */ one) => html`<tr key=${one.name} data-monitor=${one.name}>
       <td data-label="On"><${MonitorSwitch} row=${one} monitors=${monitors} /></td>
       <td class="first"><${Link} to=${`/console/monitors/${encodeURIComponent(one.name)}`}><strong><${Given} value=${one.name} most=${60} /></strong></${Link}><div class="muted small"><${Given} value=${one.file} most=${60} /></div></td>
-      <td data-label="State"><${Badge} word=${stateOf(one)} />${one.trial && html`<div class="held"><${Promote} row=${one} monitors=${monitors} /></div>`}${one.held && html`<div class="held"><${Resume} row=${one} monitors=${monitors} /></div>`}</td>
+      <td data-label="State"><${Badge} word=${stateOf(one)} />${one.off_until && html`<div class="small muted">until <${Moment} at=${one.off_until} /></div>`}${one.trial && html`<div class="held"><${Promote} row=${one} monitors=${monitors} /></div>`}${one.held && html`<div class="held"><${Resume} row=${one} monitors=${monitors} /></div>`}</td>
       <td data-label="Watches"><div>${[...one.topics, ...one.services].slice(0, 3).map((/** @type {string} */ name) => html`<div key=${name}><${Given} value=${name} mono most=${60} /></div>`)}${one.topics.length + one.services.length > 3 && html`<div class="muted small">and ${one.topics.length + one.services.length - 3} more</div>`}</div></td>
       <td class="number" data-label="Events">${count(one.events)}</td><td class="number" data-label="Verdicts">${count(one.verdicts)}</td><td class="number" data-label="Dropped">${one.trial ? html`<span class="muted" title="would have dropped">(${count(one.would_drop)})</span>` : count(one.drops)}</td><td class="number" data-label="Changed">${one.trial ? html`<span class="muted" title="would have changed">(${count(one.would_change)})</span>` : count(one.changes)}</td>
       <td class="number" data-label="Faults">${one.faults ? html`<${Badge} word=${count(one.faults)} tone="deny" />` : "0"}</td>
@@ -81,12 +81,12 @@ export function MonitorSwitch({ row, monitors }) {
   return html`<${Switch} role="operator" on=${on} label=${`${row.name} enabled`} change=${change} />`;
 }
 
-/** From its trial into force, or (disabled) on trial. @param {{row: any, monitors: any}} given */
+/** From shadow mode into force, or (disabled) into shadow mode. @param {{row: any, monitors: any}} given */
 export function Promote({ row, monitors }) {
   const change = async () => {
     try {
-      await monitors.change(row.name, { trial: !row.trial });
-      done(row.trial ? `${row.name} is promoted` : `${row.name} is on trial`, row.trial ? "What it does is done from now on." : "It changes and drops nothing; what it would have done is recorded.");
+      await monitors.change(row.name, { shadow: !row.trial });
+      done(row.trial ? `${row.name} is promoted` : `${row.name} is in shadow mode`, row.trial ? "What it does is done from now on." : "It changes and drops nothing; what it would have done is recorded.");
     } catch (failure) {
       failed(failure);
     }

@@ -1,0 +1,122 @@
+"""Monitors that are disabled for a while, and come back by themselves.
+
+Invariants:
+
+1. A return is in the store before its monitor is disabled, and survives restarts of control and of the appliance.
+2. A monitor is never off for longer than it was disabled for, plus the time for which the appliance did not run: a
+   clock that was set back since does not count.
+3. A return that is refused (the monitor shares variables with others that are in shadow mode now) is tried again until
+   it succeeds, or an operator switches the monitor.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+
+import msgspec
+import structlog
+
+from appliance.specifications.files import SpecificationsRefusedError
+from appliance.specifications.rollout import Switch
+from appliance.store.database import StoreError
+from appliance.store.state import StateStore
+
+LONGEST = 30 * 86_400.0
+"""Seconds for which a monitor may be disabled with a return."""
+
+_SETTING = "monitor returns"
+_AGAIN_SECONDS = 5.0
+_log = structlog.get_logger()
+
+
+class _Return(msgspec.Struct, frozen=True):
+    """`until` is seconds since the epoch, `seconds` the whole length, `back` how the monitor is switched then."""
+
+    until: float
+    seconds: float
+    back: Switch
+
+
+class Returns:
+    """`come_back(names)` switches monitors back; it calls `end` for them, as every other switch does."""
+
+    def __init__(
+        self, store: StateStore, come_back: Callable[[Mapping[str, Switch]], Awaitable[None]]
+    ) -> None:
+        self._store = store
+        self._come_back = come_back
+        self._kept: dict[str, _Return] = {}
+        self._changed = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._kept
+
+    def until(self, name: str) -> float | None:
+        """When a monitor comes back, in seconds since the epoch; None: not by itself."""
+        found = self._kept.get(name)
+        return found.until if found is not None else None
+
+    def start(self, disabled: Collection[str]) -> None:
+        """Go on after a start, for the monitors that are still disabled."""
+        text = self._store.settings().get(_SETTING, "{}")
+        kept = msgspec.json.decode(text, type=dict[str, _Return])
+        now = time.time()
+        self._kept = {
+            name: msgspec.structs.replace(one, until=min(one.until, now + one.seconds))
+            for name, one in kept.items()
+            if name in disabled
+        }
+        self._save()
+
+    def begin(self, back: Mapping[str, Switch], seconds: float) -> None:
+        """These monitors come back after so many seconds, switched as `back` says."""
+        until = time.time() + seconds
+        self._kept |= {
+            name: _Return(until, seconds, self._kept[name].back if name in self._kept else to)
+            for name, to in back.items()
+        }
+        self._save()
+
+    def end(self, names: Iterable[str]) -> None:
+        """These monitors were switched, or are gone."""
+        ended = self._kept.keys() & set(names)
+        if ended:
+            self._kept = {name: one for name, one in self._kept.items() if name not in ended}
+            self._save()
+
+    def keep(self, disabled: Collection[str]) -> None:
+        """Only these monitors are disabled now."""
+        self.end(self._kept.keys() - set(disabled))
+
+    def _save(self) -> None:
+        self._store.save_setting(_SETTING, msgspec.json.encode(self._kept).decode())
+        self._changed.set()
+        if self._kept and (self._task is None or self._task.done()):
+            self._task = asyncio.get_running_loop().create_task(self._run())
+
+    async def _run(self) -> None:
+        while self._kept:
+            now = time.time()
+            due = {name: one.back for name, one in self._kept.items() if one.until <= now}
+            if due:
+                await self._bring_back(due)
+                continue
+            self._changed.clear()
+            left = min(one.until for one in self._kept.values()) - now
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._changed.wait(), left)
+
+    async def _bring_back(self, due: Mapping[str, Switch]) -> None:
+        try:
+            await self._come_back(due)
+        except SpecificationsRefusedError as error:
+            _log.error("a monitor cannot be enabled again yet", monitors=list(due), error=str(error))
+            await asyncio.sleep(_AGAIN_SECONDS)
+            return
+        except StoreError as error:
+            _log.error(
+                "a monitor is enabled again, and this is not kept", monitors=list(due), reason=str(error)
+            )
+        self.end(due)
