@@ -1,7 +1,8 @@
 """Accepts the connections of a listening socket, several in a turn of the loop.
 
-The kernel's queue is one for all hosts. It is emptied quickly, and cheaply: whether a connection has a place, and when
-it is its turn, is decided behind it, by host. So a host that connects without end fills no queue that others need.
+The kernel's queue is one for all hosts, first come, first served. It is emptied quickly and cheaply: whether a
+connection may wait, and when it is opened, is decided behind it, by host. So a host that connects without end fills
+no queue that others need.
 """
 
 import asyncio
@@ -11,8 +12,12 @@ from collections.abc import Callable
 
 import structlog
 
+from appliance.policy.model import Address
+from appliance.rpc.front import plain_address
+from appliance.rpc.processor_time import ProcessorTime
+
 BACKLOG = 4096
-_AT_ONCE = 64  # connections in one turn of the loop
+_AT_ONCE = 128  # connections in one turn of the loop
 _GONE = frozenset({errno.ECONNABORTED, errno.EINTR, errno.EPROTO})
 _PAUSE_SECONDS = 0.2  # when the process has no descriptor left
 
@@ -20,10 +25,13 @@ _log = structlog.get_logger()
 
 
 class Acceptor:
-    """Hands each connection, and the peer's address, to `accepted`, which owns the socket then."""
+    """Hands each connection, and its host, to `accepted`, which owns the socket then; the time is the host's."""
 
-    def __init__(self, sock: socket.socket, accepted: Callable[[socket.socket, str], None]) -> None:
+    def __init__(
+        self, sock: socket.socket, time: ProcessorTime, accepted: Callable[[socket.socket, Address], None]
+    ) -> None:
         self._sock = sock
+        self._time = time
         self._accepted = accepted
         self._pause: asyncio.TimerHandle | None = None
         self._loop = asyncio.get_running_loop()
@@ -40,8 +48,13 @@ class Acceptor:
 
     def _accept(self) -> None:
         for _ in range(_AT_ONCE):
+            host = None
+            self._time.begin()
             try:
                 sock, address = self._sock.accept()
+                sock.setblocking(False)
+                host = plain_address(address[0])
+                self._accepted(sock, host)
             except BlockingIOError:
                 return
             except OSError as error:
@@ -53,5 +66,5 @@ class Acceptor:
                     _PAUSE_SECONDS, self._loop.add_reader, self._sock, self._accept
                 )
                 return
-            sock.setblocking(False)
-            self._accepted(sock, address[0])
+            finally:
+                self._time.end(host)

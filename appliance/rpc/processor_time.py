@@ -13,9 +13,10 @@ Invariants:
 """
 
 import asyncio
+import heapq
 import time
-from collections import OrderedDict, deque
-from collections.abc import Callable, Coroutine, Generator, Hashable, Iterable
+from collections import deque
+from collections.abc import Callable, Coroutine, Generator, Hashable
 from typing import Any, Generic, TypeVar
 
 from appliance.policy.model import Address
@@ -25,43 +26,68 @@ TURN_SECONDS = RVMASTER_TIME.bounds.whole / 1e6
 _MOST_KEPT = 1024  # entries of what was used, before those that owe nothing are removed
 
 Key = TypeVar("Key", bound=Hashable)
+Item = TypeVar("Item")
 T = TypeVar("T")
 Work = Callable[[], None]
 Steps = Generator[Any, Any, T]
 
 
-class Usage(Generic[Key]):
-    """What each key has used, in seconds, and who is next; `start` is where a key without an entry begins."""
+class Line(Generic[Key, Item]):
+    """Items that wait, by key: the next is of the key that has used least. All in seconds.
+
+    `start` is what the key that was next last had used, and where a key begins that comes back.
+    """
 
     def __init__(self) -> None:
         self.start = 0.0
         self._used: dict[Key, float] = {}
+        self._items: dict[Key, deque[Item]] = {}
+        self._order: list[tuple[float, int, Key]] = []  # a heap; what a key has used may be more by now
+        self._count = 0
+
+    def __len__(self) -> int:
+        return sum(map(len, self._items.values()))
+
+    def __bool__(self) -> bool:
+        return bool(self._items)
+
+    def used(self, key: Key) -> float:
+        """What a key has used; at least what those have used that wait."""
+        return max(self._used.get(key, self.start), self.start)
 
     def charge(self, key: Key, seconds: float) -> None:
         """Add to what a key has used."""
-        self._used[key] = self.of(key) + seconds
+        self._used[key] = self.used(key) + seconds
         if len(self._used) > _MOST_KEPT:
             self._used = {one: used for one, used in self._used.items() if used > self.start}
 
-    def of(self, key: Key) -> float:
-        """What a key has used; at least what all that wait have used."""
-        return max(self._used.get(key, self.start), self.start)
+    def put(self, key: Key, item: Item) -> None:
+        """The item waits, the last one of its key."""
+        queue = self._items.get(key)
+        if queue is None:
+            self._items[key] = deque([item])
+            heapq.heappush(self._order, self._entry(key))
+        else:
+            queue.append(item)
 
-    def next(self, waiting: Iterable[Key]) -> Key:
-        """The one that has used least of those that wait, the longest waiting of equal ones."""
-        key = min(waiting, key=self.of)
-        self.start = self.of(key)
-        return key
+    def pop(self) -> tuple[Key, Item]:
+        """The next item, and its key; of keys that have used the same, that which waits longest."""
+        while self._order[0][0] < self.used(self._order[0][2]):
+            heapq.heapreplace(self._order, self._entry(self._order[0][2]))
+        key = self._order[0][2]
+        self.start = self.used(key)
+        queue = self._items[key]
+        item = queue.popleft()
+        if queue:
+            heapq.heapreplace(self._order, self._entry(key))
+        else:
+            heapq.heappop(self._order)
+            del self._items[key]
+        return key, item
 
-
-class _Class:
-    """Hosts that share as one: their work that waits, by host, and what each has used."""
-
-    __slots__ = ("usage", "waiting")
-
-    def __init__(self) -> None:
-        self.waiting: OrderedDict[Address, deque[Work]] = OrderedDict()
-        self.usage: Usage[Address] = Usage()
+    def _entry(self, key: Key) -> tuple[float, int, Key]:
+        self._count += 1
+        return self.used(key), self._count, key
 
 
 class ProcessorTime:
@@ -74,8 +100,8 @@ class ProcessorTime:
     ) -> None:
         self._kind = kind
         self._clock = clock
-        self._usage: Usage[Hashable] = Usage()
-        self._waiting: OrderedDict[Hashable, _Class] = OrderedDict()
+        self._classes: Line[Hashable, None] = Line()  # an item for each piece of work
+        self._hosts: dict[Hashable, Line[Address, Work]] = {}  # of classes that wait
         self._spent = 0.0  # in this turn of the loop
         self._since: float | None = None  # when the piece began that runs now
         self._turn_ends = False  # whether the end of this turn is scheduled
@@ -84,12 +110,12 @@ class ProcessorTime:
     @property
     def waiting(self) -> int:
         """The pieces of work that wait."""
-        return sum(len(queue) for each in self._waiting.values() for queue in each.waiting.values())
+        return len(self._classes)
 
     @property
     def free(self) -> bool:
         """Whether work may run at once: nobody waits, and this turn has time left."""
-        return not self._waiting and not self._granted and self._left > 0
+        return not self._classes and not self._granted and self._left > 0
 
     @property
     def _left(self) -> float:
@@ -116,9 +142,9 @@ class ProcessorTime:
         """Count time that was used for a host, in this turn."""
         kind = self._kind(host)
         self._spent += seconds
-        self._usage.charge(kind, seconds)
-        if (line := self._waiting.get(kind)) is not None:
-            line.usage.charge(host, seconds)
+        self._classes.charge(kind, seconds)
+        if (hosts := self._hosts.get(kind)) is not None:
+            hosts.charge(host, seconds)
         self._end_turn_later()
 
     def begin(self) -> bool:
@@ -128,11 +154,12 @@ class ProcessorTime:
         self._since = self._clock()
         return True
 
-    def end(self, host: Address) -> None:
-        """The piece that began has ended; it was for this host."""
+    def end(self, host: Address | None) -> None:
+        """The piece that began has ended; it was for this host (None: there was nothing to do)."""
         assert self._since is not None  # noqa: S101  by `begin`
         seconds, self._since = self._clock() - self._since, None
-        self.charge(host, seconds)
+        if host is not None:
+            self.charge(host, seconds)
 
     def turn_of(self, host: Address) -> "asyncio.Future[None]":
         """A future that is done when it is the host's turn; whoever has it calls `taken`, also if it is cancelled."""
@@ -165,8 +192,9 @@ class ProcessorTime:
                 self.end(host)
 
     def _queue(self, host: Address, work: Work) -> None:
-        line = self._waiting.setdefault(self._kind(host), _Class())
-        line.waiting.setdefault(host, deque()).append(work)
+        kind = self._kind(host)
+        self._classes.put(kind, None)
+        self._hosts.setdefault(kind, Line()).put(host, work)
         self._end_turn_later()
 
     def _end_turn_later(self) -> None:
@@ -178,22 +206,17 @@ class ProcessorTime:
         self._turn_ends = False
         self._spent = 0.0
         self._go_on()
-        if self._waiting:
+        if self._classes:
             self._end_turn_later()
 
     def _go_on(self) -> None:
         """Run what waits, as long as this turn has time left; of granted steps one at a time."""
-        while self._waiting and not self._granted and self._left > 0:
-            kind = self._usage.next(self._waiting)
-            line = self._waiting[kind]
-            host = line.usage.next(line.waiting)
-            queue = line.waiting[host]
-            work = queue.popleft()
-            if not queue:
-                del line.waiting[host]
-            self._do(host, work)
-            if not line.waiting:
-                del self._waiting[kind]
+        while self._classes and not self._granted and self._left > 0:
+            kind, _ = self._classes.pop()
+            hosts = self._hosts[kind]
+            self._do(*hosts.pop())
+            if not hosts:
+                del self._hosts[kind]
 
 
 class _InSteps(Generic[T]):

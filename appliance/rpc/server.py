@@ -21,6 +21,7 @@ import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from typing import NamedTuple, cast
 
 import structlog
@@ -41,6 +42,7 @@ _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: what is closed is reset
 _MOST_PIPELINED = 512
 # What a request counts beside its body and its path: ten times its memory, because thousands of small ones take time.
 _REQUEST_BYTES = 4096
+_OPENING_SECONDS = 50e-6  # of processor time, that the loop takes to open and close a transport
 _READ_AT_ONCE = 8192  # bytes that are read and parsed in one piece
 _BEGINNING = 4096  # bytes of a body that are looked at to say what was refused
 _BEGINNING_SECONDS = 1.0  # that they are waited for
@@ -111,35 +113,47 @@ class HttpServer:
     connections: "set[_Connection]" = field(default_factory=set, init=False)
     _acceptor: Acceptor | None = field(default=None, init=False)
     _opening: set[asyncio.Task[None]] = field(default_factory=set, init=False)
+    _complaining: set[Address] = field(default_factory=set, init=False)  # hosts of which a record waits
+    _closed: bool = field(default=False, init=False)
 
     async def start(self) -> None:
         """Begin to accept."""
-        self._acceptor = Acceptor(self.sock, self._accepted)
+        self._acceptor = Acceptor(self.sock, self.time, self._accepted)
 
     def close(self) -> None:
         """Stop accepting and cut what is connected; the listening socket is closed with it."""
+        self._closed = True
         if self._acceptor is not None:
             self._acceptor.close()
         for connection in list(self.connections):
             connection.abort()
 
-    def _accepted(self, sock: socket.socket, address: str) -> None:
-        """A place for the connection, and its transport when it is its host's turn."""
-        outermost = self.time.begin()
-        host = plain_address(address)
-        try:
-            connection = _Connection(self, sock, host)
-            if not connection.enter():
-                sock.close()
-            else:
-                task = asyncio.get_running_loop().create_task(
-                    self.time.spend(host, self._open(connection, sock))
-                )
-                self._opening.add(task)
-                task.add_done_callback(self._opening.discard)
-        finally:
-            if outermost:
-                self.time.end(host)
+    def _accepted(self, sock: socket.socket, host: Address) -> None:
+        """The connection waits until it is its host's turn to be opened; one too many is closed."""
+        too_many = self.visitors.arriving.take(host)
+        if not too_many:
+            self.time.run(host, partial(self._admit, sock, host))
+            return
+        sock.close()
+        if host not in self._complaining:
+            self._complaining.add(host)
+            self.time.run(host, partial(self._complain, host, too_many))
+
+    def _admit(self, sock: socket.socket, host: Address) -> None:
+        """A place for the connection, and its transport."""
+        self.visitors.arriving.give_back(host)
+        connection = _Connection(self, sock, host)
+        if self._closed or not connection.enter():
+            sock.close()
+            return
+        task = asyncio.get_running_loop().create_task(self._open(connection, sock))
+        self._opening.add(task)
+        task.add_done_callback(self._opening.discard)
+        self.time.charge(host, _OPENING_SECONDS)
+
+    def _complain(self, host: Address, too_many: str) -> None:
+        self._complaining.discard(host)
+        self.troubled(Peer(host, str(host), ""), too_many)
 
     async def _open(self, connection: "_Connection", sock: socket.socket) -> None:
         try:

@@ -21,7 +21,7 @@ from typing import Generic, Protocol
 
 from appliance.shares.pool import Bounds, Holder, Pool, Standing
 from appliance.shares.queue import Queue
-from appliance.shares.table import RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_FAREWELLS
+from appliance.shares.table import RVMASTER_ARRIVALS, RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_FAREWELLS
 
 
 class Stage(StrEnum):
@@ -73,6 +73,7 @@ class Visitors(Generic[Holder]):
         connections: Bounds = RVMASTER_CONNECTIONS.bounds,
         held: Bounds = RVMASTER_BYTES.bounds,
         farewells: Bounds = RVMASTER_FAREWELLS.bounds,
+        arriving: Bounds = RVMASTER_ARRIVALS.bounds,
         patience: Patience = _of_ros,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -82,6 +83,7 @@ class Visitors(Generic[Holder]):
         self.connected: Pool[Holder] = Pool("connections open", connections, standing)
         self.held: Pool[Holder] = Pool("bytes in requests and answers under way", held, standing)
         self.farewells: Pool[Holder] = Pool("connections that are turned away", farewells, standing)
+        self.arriving: Pool[Holder] = Pool("connections that wait to be opened", arriving, standing)
         self._of: dict[Connection, tuple[Holder, Pool[Holder]]] = {}
         self._queues: dict[Stage, Queue[Holder, Connection]] = {stage: Queue(standing) for stage in Stage}
         self._stages: dict[Connection, Stage] = {}

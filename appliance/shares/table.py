@@ -37,6 +37,13 @@ RVMASTER_CONNECTIONS = Share(
     ("integration/master/test_shares.py::test_connections_of_two_hundred_addresses",),
     setting="limits.connections",
 )
+RVMASTER_ARRIVALS = Share(
+    "connections to RVMaster and the nodes' faces that are accepted and not opened yet",
+    Bounds(whole=2048, host=512, strangers=64, kept=1024),
+    "closed at once, without a word; a connection is opened when it is its host's turn",
+    "`limit exceeded`, one for many",
+    ("unit/rpc/test_server.py::test_connections_that_come_faster_than_they_are_opened",),
+)
 RVMASTER_BYTES = Share(
     "bytes of requests and answers under way, RVMaster and faces",
     Bounds(whole=512 << 20, host=64 << 20, strangers=1 << 20, kept=192 << 20),

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from appliance.policy.model import Address
-from appliance.rpc.processor_time import TURN_SECONDS, ProcessorTime, Usage
+from appliance.rpc.processor_time import TURN_SECONDS, Line, ProcessorTime
 
 ROBOT, GUEST = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.66")
 UNKNOWN = [ipaddress.ip_address(f"10.9.0.{number}") for number in range(200)]
@@ -106,14 +106,19 @@ def test_time_counts_and_not_the_number_of_requests(factor: float) -> None:
 
 def test_nobody_saves_up_and_a_debt_stays() -> None:
     """A host that did nothing for long begins where the others are; one that took a long piece waits for it."""
-    usage: Usage[str] = Usage()
-    for _ in range(100):
-        usage.charge(usage.next(["guest"]), 1.0)
-    usage.charge("robot", 5.0)
+    line: Line[str, int] = Line()
+    for number in range(100):
+        line.put("guest", number)
+        assert line.pop() == ("guest", number)
+        line.charge("guest", 1.0)
+    line.charge("robot", 5.0)
+    for number in range(8):
+        line.put("guest", number)
+        line.put("robot", number)
     order = []
     for _ in range(8):
-        order.append(usage.next(["guest", "robot"]))
-        usage.charge(order[-1], 1.0)
+        order.append(line.pop()[0])
+        line.charge(order[-1], 1.0)
     assert 4 <= order.count("guest") <= 6
     assert order[0] == "guest"
 

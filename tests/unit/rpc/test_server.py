@@ -30,6 +30,7 @@ from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Visitors
 from appliance.shares.pool import Bounds, Standing
 from appliance.shares.table import (
+    RVMASTER_ARRIVALS,
     RVMASTER_BYTES,
     RVMASTER_CONNECTIONS,
     RVMASTER_FAREWELLS,
@@ -58,6 +59,8 @@ class Shares:
     held: Bounds = RVMASTER_BYTES.bounds
     farewells: Bounds = RVMASTER_FAREWELLS.bounds
     requests: Bounds = RVMASTER_REQUESTS.bounds
+    arriving: Bounds = RVMASTER_ARRIVALS.bounds
+    clock: Callable[[], float] = time.thread_time
 
 
 def post(body: bytes, *headers: str, path: str = "/", length: int | None = None) -> bytes:
@@ -122,10 +125,14 @@ class Server:
         self.at_once: AtOnce = not_at_once
         self.troubles: list[str] = []
         self.visitors: Visitors[Address] = Visitors(
-            _named, connections=shares.connections, held=shares.held, farewells=shares.farewells
+            _named,
+            connections=shares.connections,
+            held=shares.held,
+            farewells=shares.farewells,
+            arriving=shares.arriving,
         )
         self.turns = Turns(shares.requests, _named)
-        self.time = ProcessorTime(lambda host: host)
+        self.time = ProcessorTime(lambda host: host, shares.clock)
         self._handler = handler
         self.socket = listen("127.0.0.1", 0)
         self.port: int = self.socket.getsockname()[1]
@@ -344,8 +351,7 @@ def test_requests_of_a_host_that_used_much_wait_for_another_hosts() -> None:
             now += 0.01
             return b""
 
-        async with serving(costly) as server:
-            server.http.time = ProcessorTime(lambda host: host, lambda: now)
+        async with serving(costly, shares=Shares(clock=lambda: now)) as server:
             guests = [await server.connect() for _ in range(20)]
             robot = await server.connect("127.0.0.2")
             await until(lambda: len(server.http.connections) == 21)
@@ -374,6 +380,30 @@ def test_many_connections_are_accepted_in_one_turn() -> None:
             assert turns <= 5
             for client in clients:
                 client.close()
+
+    run(test())
+
+
+def test_connections_that_come_faster_than_they_are_opened() -> None:
+    """A host that floods with connections fills its own part of those that wait; another host's is opened at once."""
+
+    async def test() -> None:
+        now = 0.0
+
+        def tick() -> float:
+            nonlocal now
+            now += 0.001
+            return now
+
+        async with serving(shares=Shares(arriving=Bounds(40, 20, 10, 10), clock=tick)) as server:
+            flood = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(100)]
+            robot = await server.connect("127.0.0.2")
+            await robot.send(post(b"x"))
+            await robot.response()
+            assert "the share of one host is 20" in await server.trouble()
+            assert server.visitors.connected.held(ipaddress.ip_address("127.0.0.1")) < 100
+            for sock in flood:
+                sock.close()
 
     run(test())
 
