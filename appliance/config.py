@@ -65,6 +65,7 @@ def _section(cls: type[T]) -> type[T]:
 
 
 Seconds = Annotated[float, Read(lambda its: its.Field(gt=0, le=86_400 * 365, allow_inf_nan=False))]
+Milliseconds = Annotated[float, Read(lambda its: its.Field(ge=1.0, le=1000.0, allow_inf_nan=False))]
 Count = Annotated[int, Read(lambda its: its.Field(gt=0))]
 Size = Annotated[int, Read(lambda its: its.Field(gt=0), "ByteSize")]
 SizeOfMebibytes = Annotated[int, Read(lambda its: its.Field(ge=1 << 20), "ByteSize")]  # one at least
@@ -298,6 +299,10 @@ class Relay:
     memory_bytes: Size = key(
         default=1 << 30,
         description="of one relay: half for unfinished messages, a quarter each for queues and latched ones",
+    )
+    budget: Milliseconds = key(
+        default=10.0,
+        description="processor time that monitors may take for one message; one that takes longer is a fault",
     )
 
 

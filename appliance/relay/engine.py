@@ -57,6 +57,7 @@ class Engine:
         self.middle = Middle(
             loop,
             self._reporter,
+            budget=limits.budget / 1000,
             publish=lambda published: self._publish(published.topic, published.data),
             changed=self._monitors_changed,
         )

@@ -45,6 +45,9 @@ class Limits:
     header_memory_bytes: int = 64 * MIB
     """Headers that are not whole, or wait for a grant, of the whole process; the first 4 KiB of each do not count."""
 
+    budget: float = 10.0
+    """Milliseconds of processor time that monitors may take for one message, request or reply."""
+
     stall_seconds: float = 10.0
     """A connection in the middle of a large message, of which nothing comes (or goes) for so long, is cut."""
 

@@ -310,6 +310,24 @@ class MonitorSet:
         for group in self.groups:
             group.home = group.monitors[0].home
 
+    def limit_time(self, clock: Callable[[], float], seconds: float) -> None:
+        """Bound the processor time that a message may take, over all monitors, by a clock that shows it (seconds).
+
+        The message that takes longer is cut off: that is a fault. The same holds for a tick, a deadline, and for the
+        monitors on trial.
+        """
+        for part in (self, *self.trials):
+            part.interpreter.turn.limit(clock, seconds)
+
+    def hurry(self, part: float) -> None:
+        """Let messages take this part of the time that `limit_time` gives them."""
+        self.interpreter.turn.part = part
+
+    @property
+    def late(self) -> bool:
+        """Whether the last message, tick or deadline took all of its time."""
+        return self.interpreter.turn.late()
+
     def explain_when(self, asked: Asked, tried: Asked) -> None:
         """Explain only verdicts that are asked for, by themselves and the source of the message; and those on trial."""
         self._execution.asked = asked

@@ -12,6 +12,7 @@ seen is the trace that subscribers saw. Variables, output and the other properti
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from math import inf
 from typing import Literal
 
 from appliance.rosmop.faults import explain
@@ -53,7 +54,7 @@ class Execution:
     def begin(self, monitors: Sequence[Monitor], time_ns: int) -> Outcome:
         """Constants, first values, `init`: each for all before the next, as one may read another's variables."""
         outcome = Outcome(time=time_ns)
-        self._turn.now = time_ns
+        self._turn.now, self._turn.until = time_ns, inf  # operators wait for it; instructions bound it
         for monitor in monitors:
             monitor.context.begin()
             for running in monitor.properties:
@@ -71,6 +72,7 @@ class Execution:
         steps[0].monitor.come_home()
         steps[0].monitor.touch()
         self._turn.now = outcome.time
+        self._turn.begin()
         self._sender = sender
         self._taking_back.clear()
         self._trailed.clear()
@@ -79,7 +81,7 @@ class Execution:
         for step in steps:
             if step.first:
                 monitor = step.monitor
-                monitor.context.budget = monitor.context.most
+                monitor.context.begin()
                 if (not monitor.seen or monitor.held) and self._first(monitor, message, outcome):
                     outcome.dropped_by = monitor.name
                     break
@@ -101,6 +103,7 @@ class Execution:
         outcome = Outcome(time=time_ns)
         outcome.timer = step.name
         self._turn.now = time_ns
+        self._turn.begin()
         step.monitor.context.begin()
 
         def act(outcome: Outcome, message: Message | None) -> bool:
@@ -131,6 +134,7 @@ class Execution:
         outcome = Outcome(time=deadline)
         outcome.timer = f"{monitor.name}.{word}"
         self._turn.now = deadline
+        self._turn.begin()
         monitor.context.begin()
         categories = running.history.expire(running.run)
         self._tell(monitor, running, categories, None, outcome, in_order_told=True)
@@ -409,6 +413,8 @@ class Execution:
         binding = {} if slices is None or slice_ is None else slices.binding(slice_)
         verdict = Verdict(monitor.name, index, source.logic, category, source, binding=binding)
         if self.asked is not None and not self.asked(verdict, self._sender.source):
+            return verdict
+        if self._turn.late():
             return verdict
         if slices is None or slice_ is None:
             return replace(verdict, why=running.history.explain(category))

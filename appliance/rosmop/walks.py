@@ -11,7 +11,7 @@ Invariants:
 """
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
@@ -39,22 +39,26 @@ from appliance.rosmop.machine import Machine, MachineTrap
 from appliance.rosmop.monitor import CellNames, Monitor, RunningProperty
 from appliance.rosmop.outcomes import Outcome, Verdict
 from appliance.rosmop.program import groups
-from appliance.rosmop.runtime.context import Context, LogLine, Published
+from appliance.rosmop.runtime.context import FUEL_PER_SECOND, Context, LogLine, Published
 from appliance.rosmop.runtime.wire import Buffer
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
 from appliance.rosmop.why import ClockedSteps, Exits
 
-FUEL = 50_000_000
-"""Instructions of one call at most: some hundredths of a second. What a call leaves is for the next ones: setting it
-costs a quarter of a call. Where it ends the message at hand is left, and there is so much again.
+FUEL = FUEL_PER_SECOND // 1000
+"""Instructions of one call at most: about a millisecond. What a call leaves is for the next ones: setting it costs a
+quarter of a call. Where it ends, the walk pauses before the message at hand.
 """
+
+MESSAGE_FUEL = 10 * FUEL
+"""Instructions of one message at most, unless a caller of `walk_one` has others."""
 
 BEGINNING = 8192
 """Bytes that are looked at of a frame that was not received into the module's memory."""
 
 _FIRST = 512  # that are shown if they suffice: caches are cold when a large frame has gone through them
 
+_NO_FUEL = "out of fuel"
 _ADDRESS = 0xFFFFFFFF
 _LENGTH = struct.Struct("<I")
 _POSITION = struct.Struct("<II")
@@ -75,8 +79,8 @@ class Walked(NamedTuple):
     `position` is where the first message begins that is left; `run` where what goes on in its buffer begins (behind the
     last dropped message). `dropped` are counts for each of the walker's events, if any was, `told` for each of its
     verdicts, if there was any. `sooner`: something is due earlier than it was. `output` are the lines that were put out
-    and the messages that were published, in order, each with where the frame begins of the message that it is about; to
-    make them took so many `seconds` (`Prepared.clock`).
+    and the messages that were published, in order, each with where the frame begins of the message that it is about.
+    `paused`: the walk used up its fuel, and the message at `position` may be walked next.
     """
 
     position: int
@@ -85,14 +89,14 @@ class Walked(NamedTuple):
     told: Sequence[int] = ()
     sooner: bool = False
     output: Sequence[tuple[int, Output]] = ()
-    seconds: float = 0.0
+    paused: bool = False
 
 
 class Prepared(NamedTuple):
     """What holds for all walks of a topic until the engine, or anything else, has done something: the sender of
     the messages; bits of `told` (and whether no message may be changed), `enabled` and `counted`, as the module takes
-    them; where walks add up how many messages a set of events (see `Walker.writers`) has changed; what tells seconds of
-    processor time; and where is said which publications may be made, for each whether it may.
+    them; where walks add up how many messages a set of events (see `Walker.writers`) has changed; and
+    where is said which publications may be made, for each whether it may.
     """
 
     source: int
@@ -100,7 +104,6 @@ class Prepared(NamedTuple):
     enabled: int
     counted: int
     changed: dict[int, int]
-    clock: Callable[[], float]
     publishes: Sequence[tuple[int, bool]] = ()
 
 
@@ -271,8 +274,6 @@ class Walker:
         """Whether messages may be dropped."""
         self.changes = feed.changes
         """Whether messages may be changed."""
-        self.brief = feed.brief
-        """Whether the time that a message takes is little enough not to be counted, but for that of its lines."""
         self._lines = [(line, home.named(line.context)) for line in module.lines] if feed.says else []
         self._said = module.said
         self.publishes = tuple((home.named(context), topic) for context, topic in feed.publishes)
@@ -324,7 +325,6 @@ class Walker:
         source: int = 0,
         changed: dict[int, int] | None = None,
         published: Sequence[bool] = (),
-        clock: Callable[[], float] = lambda: 0.0,
     ) -> Prepared:
         """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none,
         `counted` for each verdict whether there may be more, `published` the same of what it `publishes`. Good until
@@ -334,9 +334,9 @@ class Walker:
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
         only = sum(1 << number for number, silent in enumerate(counted) if silent)
         publishes = [*zip_longest(self._publications, published, fillvalue=False)]
-        return Prepared(source, bits, enabled, only, {} if changed is None else changed, clock, publishes)
+        return Prepared(source, bits, enabled, only, {} if changed is None else changed, publishes)
 
-    def walk(  # noqa: PLR0917  called for every batch: keywords would cost a tenth of it
+    def walk(  # noqa: PLR0912, PLR0917  called for every batch: calls and keywords would cost a tenth of it
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
     ) -> Walked | None:
         """Take messages from `position` on, as many as need nothing special. None: all, and all go on in their buffer.
@@ -352,14 +352,16 @@ class Walker:
         end = frames + len(view)
         begun, said = run, 0
         output: list[tuple[int, Output]] = []
-        seconds = 0.0
+        paused = False
         while True:
             try:
                 answer = self._call(frames + position, end, time_ns) or 0
-            except MachineTrap:
+            except MachineTrap as trap:
+                paused = trap.reason == _NO_FUEL
                 answer = self._stopped(frames + position, end, time_ns)
             said |= answer
-            seconds += self._put_out(output, prepared.clock) if self._lines else 0
+            if self._lines:
+                self._put_out(output)
             if answer >= LEFT:
                 self._undo()
             effects = (answer >> 32 & 0xFFFFFF) * _EFFECT.size
@@ -380,7 +382,26 @@ class Walker:
                 if sooner:
                     self._home.hasten()
                 dropped, told = self._counted() if run != begun or said & TOLD else ((), ())
-                return Walked(position, run, dropped, told, sooner, output, seconds)
+                return Walked(position, run, dropped, told, sooner, output, paused and answer >= LEFT)
+
+    def walk_one(  # noqa: PLR0917  as `walk`
+        self,
+        view: memoryview,
+        position: int,
+        run: int,
+        pieces: list[Any],
+        time_ns: int,
+        prepared: Prepared,
+        fuel: int = MESSAGE_FUEL,
+    ) -> Walked:
+        """As `walk`, but only the message at `position`, with so much fuel; `paused`: it was not enough."""
+        following = position + 4 + _LENGTH.unpack_from(view, position)[0]
+        if self._home.prepared is not prepared:
+            self._home.prepare(prepared)
+        self._machine.refuel(fuel)
+        walked = self.walk(view[:following], position, run, pieces, time_ns, prepared)
+        self._machine.refuel(FUEL)
+        return Walked(following, run, ()) if walked is None else walked
 
     def take(self, message: Buffer, time_ns: int, prepared: Prepared) -> Outcome | None:
         """What is to be done with one message; None if it is left. Verdicts are not explained, and it is not said where
@@ -395,7 +416,7 @@ class Walker:
         _LENGTH.pack_into(frame, 0, len(message))
         frame[4:] = message
         prepared.changed.clear()
-        walked = self.walk(frame, 0, 0, [], time_ns, prepared)
+        walked = self.walk_one(frame, 0, 0, [], time_ns, prepared)
         if walked is not None and not walked.position:
             return None
         outcome = Outcome(message, time_ns)
@@ -420,30 +441,33 @@ class Walker:
         dropped: Sequence[int] = ()
         told: Sequence[int] = ()
         output: list[tuple[int, Output]] = []
-        seconds = 0.0
-        sooner = False
+        sooner = paused = False
         while position < len(view) and not sooner:
             following = position + 4 + _LENGTH.unpack_from(view, position)[0]
             frame = view[position:following]
             walked = self._walk_beginning(frame, self._shown, time_ns, prepared)
-            if walked is not None and not walked.position and self._shown < min(len(frame), BEGINNING):
+            if (
+                walked is not None
+                and not (walked.position or walked.paused)
+                and self._shown < min(len(frame), BEGINNING)
+            ):
                 walked = self._walk_beginning(frame, BEGINNING, time_ns, prepared)
                 if walked is None or walked.position:
                     self._shown = BEGINNING
             if walked is not None:
                 if not walked.position:
+                    paused = walked.paused
                     break
                 sooner = walked.sooner
                 told = _sums(told, walked.told)
                 output += [(position, each) for _, each in walked.output]
-                seconds += walked.seconds
                 if walked.run:
                     if position > run:
                         pieces.append(view[run:position])
                     run = following
                     dropped = _sums(dropped, walked.dropped)
             position = following
-        return Walked(position, run, dropped, told, sooner, output, seconds)
+        return Walked(position, run, dropped, told, sooner, output, paused)
 
     def _walk_beginning(
         self, frame: memoryview, shown: int, time_ns: int, prepared: Prepared
@@ -462,18 +486,14 @@ class Walker:
             frame[4:size] = area[4:]
         return walked
 
-    def _put_out(self, output: list[tuple[int, Output]], clock: Callable[[], float]) -> float:
-        """Append what is put out and published, each with where its frame begins; the seconds that it took."""
+    def _put_out(self, output: list[tuple[int, Output]]) -> None:
+        """Append what is put out and published, each with where its frame begins."""
         at, end = self._said, _LENGTH.unpack_from(self._memory, SURE)[0]
-        if at == end:
-            return 0.0
-        began = clock()
         while at < end:
             number, frame = HEAD.unpack_from(self._memory, at)
             line, monitor = self._lines[number]
             output.append((frame - self._frames, line.put_out(self._memory, at, monitor)))
             at += line.size
-        return clock() - began
 
     def _stopped(self, *call: int) -> int:
         """What the module would have answered where it was stopped: the message that it looked at is left.

@@ -203,6 +203,20 @@ LIMITED_TOPIC = Share(
     ),
     setting="[Limits] of the policy",
 )
+RELAY_MESSAGE = Share(
+    "microseconds of processor time that monitors take for one message, request or reply",
+    Bounds(10_000, 10_000, 0, 0),
+    "the message is cut off, which is a fault of the specification (`on_fault` decides whether it is dropped); for a"
+    " second after one, messages of that publication have a tenth; the messages behind it wait for their host's next"
+    " turn",
+    "`monitor fault`",
+    (
+        "unit/relay/monitors/test_middle.py::test_a_message_that_takes_longer_than_the_budget_is_a_fault",
+        "unit/relay/monitors/test_middle.py::test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn",
+        "unit/rosmop/test_budget.py::test_every_walk_of_a_message_ends_with_its_time",
+    ),
+    setting="relay.budget (milliseconds)",
+)
 RECORDER_MEMORY = Share(
     "bytes of messages that the flight recorder remembers (divided among the relays)",
     Bounds(whole=64 << 20, host=32 << 20, strangers=0, kept=0),

@@ -3,6 +3,8 @@
 A frame is a 4-byte little-endian length and that many bytes. `FrameReceiver` hands out the buffer to receive
 into and returns all frames that are whole after each read as one `Batch`, walked once and not copied:
 
+- A batch has at most `MOST` frames of unequal length, since whoever takes it walks them; the rest of a read follows
+  (`FrameReceiver.more`), at once or when it is the publisher's turn again.
 - Small frames are received into a scratch area that all receivers of the process share, in the memory of the
   monitors' module where there is one; only the torn frame at the end of a read, if there is one, is set aside until
   the rest arrives.
@@ -32,7 +34,11 @@ _KEEP_AREA = 8 << 20  # a frame of a camera: memory that is new for each one cos
 LITTLE = 8
 """Little is an eighth of what it stands in: it is copied rather than that the whole is held for it."""
 
+MOST = 4096
+"""Frames of unequal length in one batch."""
+
 _MANY = 4  # frames
+_FAR = 4096  # bytes
 _COLUMNS: dict[int, Literal["B", "H", "I"]] = {1: "B", 2: "H", 4: "I"}  # formats of so many bytes
 
 _LENGTH = struct.Struct("<I")
@@ -44,10 +50,11 @@ class Batch:
 
     `last` is where the last of the `messages` frames begins, None if that has to be looked for; `stride` the bytes of
     each of the frames if they are known to be equally long, else 0. `first` is the number of the first frame among
-    those of its publication. `judged` is when monitors were given them, by their clock; 0: they were not.
+    those of its publication. `judged` is when monitors were given them, by their clock; 0: they were not. `left` is the
+    number of messages at the end that monitors had no time for.
     """
 
-    __slots__ = ("_kept", "_owned", "first", "judged", "last", "messages", "stride", "view")
+    __slots__ = ("_kept", "_owned", "first", "judged", "last", "left", "messages", "stride", "view")
 
     def __init__(
         self, view: memoryview, messages: int, last: int | None, *, owned: bool = False, stride: int = 0
@@ -58,6 +65,7 @@ class Batch:
         self.stride = stride
         self.first = 1
         self.judged = 0
+        self.left = 0
         self._owned = owned
         self._kept: memoryview | None = None
 
@@ -100,6 +108,15 @@ class Batch:
         head.first = self.first
         return head
 
+    def tail(self, count: int) -> "Batch":
+        """Return the last frames, in memory of their own."""
+        view = self.view[len(self.head(self.messages - count).view) :]
+        tail = Batch(
+            view if self._owned else memoryview(bytearray(view)), count, None, owned=True, stride=self.stride
+        )
+        tail.first = self.first + self.messages - count
+        return tail
+
     def find_last(self) -> int:
         """Where the last frame begins."""
         if self.last is None:
@@ -130,6 +147,16 @@ class Scratch:
         """From the next read on use this area, or (None) one of its own."""
         self.area = memoryview(mmap.mmap(-1, SCRATCH)) if area is None else area
 
+    def hold(self, batch: Batch) -> Batch:
+        """Return the batch in the area, if it is large enough: monitors are faster there."""
+        size = len(batch.view)
+        if size > len(self.area):
+            return batch
+        self.area[:size] = batch.view
+        held = Batch(self.area[:size], batch.messages, batch.last, stride=batch.stride)
+        held.first = batch.first
+        return held
+
 
 class FrameReceiver:
     """Finds the frames of one connection: `buffer()`, receive into it, `received(count)`, deliver, again."""
@@ -145,6 +172,8 @@ class FrameReceiver:
         self._target = 0
         self._delivered: Batch | None = None
         self._idle = True
+        self._unwalked: memoryview | None = None
+        self._aside = 0
 
     def buffer(self) -> memoryview:
         """Where the next bytes of the connection go."""
@@ -172,6 +201,32 @@ class FrameReceiver:
         return self._walk(self._scratch.area, len(self._torn) + count, owned=False)
 
     @property
+    def more(self) -> bool:
+        """Whether there is more in what has been received: it is taken by `following`, before `buffer` is called."""
+        return self._unwalked is not None
+
+    def following(self) -> Batch | None:
+        """Return the next frames of what has been received; raises as `received`."""
+        unwalked, self._unwalked = self._unwalked, None
+        if unwalked is None:
+            return None
+        if self._aside:
+            self._share.add(-self._aside)
+            self._aside = 0
+        size, area = len(unwalked), self._scratch.area
+        if size > len(area):
+            return self._walk(unwalked, size, owned=True)
+        area[:size] = unwalked
+        return self._walk(area, size, owned=False)
+
+    def set_aside(self) -> None:
+        """Keep what `following` takes in memory of its own, as other connections are read before that."""
+        if self._unwalked is not None and not self._aside:
+            self._unwalked = memoryview(bytearray(self._unwalked))
+            self._aside = len(self._unwalked)
+            self._share.add(self._aside)
+
+    @property
     def unfinished(self) -> int:
         """The bytes that have come of a large frame that is not whole."""
         return self._filled
@@ -185,6 +240,8 @@ class FrameReceiver:
     def abandon(self) -> None:
         """The connection is gone: nothing unfinished counts any more."""
         self._count(0)
+        self._share.add(-self._aside)
+        self._unwalked, self._aside = None, 0
         self._area, self._delivered, self._filled, self._torn = None, None, 0, b""
 
     def _count(self, size: int) -> None:
@@ -208,7 +265,12 @@ class FrameReceiver:
             position += need
             messages += 1
             stride = 0
+            if messages >= MOST:
+                break
         self._torn = b""
+        if messages >= MOST and not stride and position < end:
+            self._unwalked = buffer[position:end]
+            return Batch(buffer[:position], messages, last, owned=owned)
         if position < end:
             if position + 4 <= end and need > LARGE:
                 if need - 4 > limit:
@@ -294,6 +356,9 @@ def boundary_at(view: memoryview, offset: int) -> tuple[int, int]:
 
     `view` begins with a frame. When `offset` is exactly between two frames, the end is `offset` itself.
     """
+    stride, count = equal_frames(view, len(view)) if offset > _FAR else (0, 0)
+    if stride and stride * count == len(view):
+        return offset // stride, -(-offset // stride) * stride
     position = frames = 0
     while position < offset:
         position += _unpack_length(view, position)[0] + 4

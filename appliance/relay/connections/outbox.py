@@ -11,8 +11,9 @@ Invariants:
 """
 
 from collections import deque
+from math import ceil
 
-from appliance.relay.connections.frames import LITTLE, boundary_at
+from appliance.relay.connections.frames import LITTLE, boundary_at, equal_frames
 from appliance.relay.connections.memory import HostShare
 from appliance.relay.limits import Limits
 
@@ -130,6 +131,11 @@ class Outbox:
             view, messages = self._waiting.popleft()
             self._count(-messages, -len(view))
             dropped = end = 0
+            stride, count = equal_frames(view, len(view))
+            if stride and count == messages:
+                dropped = max(self._messages + messages - limit_messages, 0)
+                dropped = min(messages, max(dropped, ceil((self._size + len(view) - limit_size) / stride)))
+                end = dropped * stride
             while dropped < messages and (
                 self._messages + messages - dropped > limit_messages
                 or self._size + len(view) - end > limit_size

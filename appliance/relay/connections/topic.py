@@ -271,39 +271,60 @@ class RelayedTopic:
             self._recording.close()
             self._recording = None
 
-    def received(self, batch: Batch, since: float) -> None:
-        """Frames have come from the publisher (`since`: when, by the clock): through the middle, to the subscribers."""
+    def received(self, batch: Batch, since: float) -> Batch | None:
+        """Frames have come from the publisher (`since`: when, by the clock): through the middle, to the subscribers.
+
+        Returns those that monitors leave for the publisher's next turn (`go_on`).
+        """
         self._messages += batch.messages
         self._bytes += len(batch.view)
         self._reported = False
         batch.first = self._next
         self._next += batch.messages
+        passing: Batch | None = batch
+        if self.flow.limits:
+            passing = self.flow.passing(batch, self._clock(), latching=self._latching)
+        return self._take(batch, passing, since)
+
+    def go_on(self, rest: Batch, since: float) -> Batch | None:
+        """Go on with frames that were left for later; as `received`."""
+        return self._take(rest, rest, since)
+
+    def _take(self, batch: Batch, passing: Batch | None, since: float) -> Batch | None:
+        """Record a batch, of which this passes."""
         recording = self._recording
         if recording is None:
-            (self._pass if self.flow.limits else self._admit)(batch, since)
-            return
+            return None if passing is None else self._admit(passing, since)
         # Recorded when subscribers have it, so that nothing is later; monitors may change it in place meanwhile.
-        view = batch.view if self.through is None else memoryview(bytes(batch.view))
-        messages, first = batch.messages, batch.first
-        self._pass(batch, since)
+        whole = batch
+        if self.through is not None:
+            whole = Batch(memoryview(bytes(batch.view)), batch.messages, batch.last, stride=batch.stride)
+            whole.first = batch.first
+        passes = 0 if passing is None else passing.messages
+        rest = None if passing is None else self._admit(passing, since)
         if recording is self._recording:
-            recording.write(view, messages, first, batch.judged)
+            judged = 0 if passing is None else passing.judged
+            taken = passes - (0 if rest is None else rest.messages)
+            if rest is None:
+                taken = whole.messages
+            elif passes < whole.messages:  # limits have dropped the others
+                dropped = whole.tail(whole.messages - passes)
+                recording.write(dropped.view, dropped.messages, dropped.first)
+            head = whole if taken == whole.messages else whole.head(taken)
+            recording.write(head.view, head.messages, head.first, judged)
+        return rest
 
-    def _pass(self, batch: Batch, since: float) -> None:
-        """What a limit lets pass goes on."""
-        passing = self.flow.passing(batch, self._clock(), latching=self._latching)
-        if passing is not None:
-            self._admit(passing, since)
-            batch.judged = passing.judged
-
-    def _admit(self, batch: Batch, since: float) -> None:
+    def _admit(self, batch: Batch, since: float) -> Batch | None:
+        """Give a batch to monitors and subscribers; returns what monitors had no time for."""
         left = batch if self.through is None else self.through(batch)
+        rest = batch.tail(batch.left) if batch.left else None
         if left is None:
             self._withheld = True
         else:
             self._pass_on(left)
             if self._served:
                 self._delays.add(self._clock() - since, left.messages)
+        return rest
 
     def published(self, batch: Batch) -> None:
         """A monitor publishes: to the subscribers, and to no monitor."""

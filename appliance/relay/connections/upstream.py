@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from appliance.channel.messages import PublicationRefused, UpstreamLost, UpstreamWanted
 from appliance.channel.messages.relay import Violation
-from appliance.relay.connections.frames import SMALL, FrameReceiver
+from appliance.relay.connections.frames import SMALL, Batch, FrameReceiver
 from appliance.relay.connections.headers import size_of
 from appliance.relay.connections.memory import Stall, Weight
 from appliance.relay.connections.presence import Presences, looks_for_names
@@ -58,6 +58,13 @@ class Publisher:
         self._linger: Timer | None = None
         self._pause: Timer | None = None
         self._announcing: Timer | None = None
+        self._rest: Batch | None = None
+        self._left = False  # whether something that has come is left for the next turn
+        self._scheduled = False
+        self._since = 0.0
+        self._early = b""
+        self._scratch = context.scratch
+        self._rest_weight = Weight(context.memory.frames.of(topic.host))
         self._stream: Stream | None = None
         self._socket: socket.socket | None = None
         self._recv_into: Callable[[memoryview], int]
@@ -143,13 +150,15 @@ class Publisher:
         if self._pause is not None:
             self._pause.cancel()
             self._pause = None
-            if self._socket is not None:
+            if self._left:
+                self._go_on_later()
+            elif self._socket is not None:
                 self._loop.watch(self._socket.fileno(), READ, self._ready, self._payer)
 
     def look(self) -> None:
         """A second is over: a publisher that keeps memory for a message and sends nothing of it is cut."""
         self._receiver.rest()
-        held = self._receiver.unfinished if self._pause is None else 0
+        held = self._receiver.unfinished if self._pause is None and not self._left else 0
         if self._stall.seen(held, self._clock()):
             self._lose(
                 f"{held} bytes of a message have come, and nothing for {self._limits.stall_seconds:g} s",
@@ -240,12 +249,8 @@ class Publisher:
         self._loop.watch(sock.fileno(), READ, self._ready, self._payer)
         self._recv_into = sock.recv_into
         self._topic.upstream_opened(header)
-        while rest and self._socket is sock:
-            buffer = self._buffer()
-            count = min(len(rest), len(buffer))
-            buffer[:count] = rest[:count]
-            rest = rest[count:]
-            self._take(count)
+        self._early = rest
+        self._take_early()
 
     def _ready(self, _events: int) -> None:
         try:
@@ -268,7 +273,71 @@ class Publisher:
             self._lose(str(error), _violation(error))
             return
         if batch is not None:
-            self._topic.received(batch, since)
+            rest = self._topic.received(batch, since)
+            if rest is not None or self._receiver.more:
+                self._since = since
+                self._continue(rest)
+
+    def _continue(self, rest: Batch | None) -> None:
+        """Go on with what has come, while there is time; nothing else is read before that is done."""
+        sock = self._socket
+        while sock is not None and self._socket is sock:
+            receiver = self._receiver
+            if rest is not None or (receiver.more and (self._pause is not None or self._loop.over())):
+                self._leave(rest)
+                return
+            if not receiver.more:
+                self._read_on()
+                return
+            try:
+                batch = receiver.following()
+            except PeerError as error:
+                self._lose(str(error), _violation(error))
+                return
+            rest = None if batch is None else self._topic.received(batch, self._since)
+
+    def _leave(self, rest: Batch | None) -> None:
+        """Leave this, and what else has come, for the publisher's next turn."""
+        self._rest = rest
+        self._rest_weight.set(0 if rest is None else len(rest.view))
+        self._receiver.set_aside()
+        if not self._left and self._socket is not None:
+            self._left = True
+            self._loop.unwatch(self._socket.fileno())
+        self._go_on_later()
+
+    def _go_on_later(self) -> None:
+        if self._pause is None and not self._scheduled:
+            self._scheduled = True
+            self._loop.later(self._go_on, self._payer)
+
+    def _go_on(self) -> None:
+        """It is the publisher's turn again."""
+        self._scheduled = False
+        if not self._left or self._pause is not None:
+            return
+        rest, self._rest = self._rest, None
+        self._rest_weight.set(0)
+        if rest is not None:
+            rest = self._topic.go_on(self._scratch.hold(rest), self._since)
+        self._continue(rest)
+
+    def _read_on(self) -> None:
+        """All that has come is done."""
+        if self._left and self._socket is not None:
+            self._left = False
+            if self._pause is None:
+                self._loop.watch(self._socket.fileno(), READ, self._ready, self._payer)
+            self._take_early()
+
+    def _take_early(self) -> None:
+        """Take the frames that came with the header."""
+        while self._early and self._socket is not None and not self._left:
+            buffer = self._buffer()
+            count = min(len(self._early), len(buffer))
+            buffer[:count] = self._early[:count]
+            self._early = self._early[count:]
+            self._take(count)
 
     def _broken(self, reason: str) -> None:
         self._lose(f"no connection to the publisher: {reason}")
@@ -310,6 +379,8 @@ class Publisher:
                 self.failures = 0
             self._loop.discard(self._socket)
             self._socket = None
+            self._rest, self._left, self._early = None, False, b""
+            self._rest_weight.set(0)
             self._weight.set(0)
             self._receiver.abandon()
             self._topic.upstream_closed()

@@ -7,12 +7,13 @@ A message that comes alone costs little work and much fetching: at a thousand a 
 the caches since the last one. So while nothing happens that could matter (`Middle.sight` is the same), all that a
 batch has to be asked is prepared once (`_prepare`), and what it adds to the counters is added up here, until the
 second is over.
+
+What does not fit into the publisher's quantum (`Monitors.over`) is left for its next turn (`Batch.left`).
 """
 
 from __future__ import annotations
 
 import struct
-import time
 from typing import TYPE_CHECKING, Protocol
 
 from appliance.relay.connections.frames import Batch
@@ -23,21 +24,17 @@ from appliance.relay.monitors.passage import Passage
 from appliance.relay.monitors.places import HEAD, Place, Senders, Sighting
 from appliance.relay.monitors.trials import Trials
 from appliance.rosmop.outcomes import Outcome
-from appliance.rosmop.runtime.context import BUDGET, Published
+from appliance.rosmop.runtime.context import FUEL_PER_SECOND, Published
 
 if TYPE_CHECKING:
     from appliance.rosmop.engine import MonitorSet
     from appliance.rosmop.walks import Prepared, Walked, Walker
 
-LONGEST = 2.0
-"""Seconds of processor time that monitors may take until the loop comes to its timers again."""
-
-TOO_LONG = "the monitors take too long for their messages"
+AGAIN = 0.1
+"""The part of the budget that messages of a publication have for a second after one that took longer."""
 
 _unpack_length = struct.Struct("<I").unpack_from
-_LOOK_EVERY = 16  # messages
-_COSTLY = BUDGET - 50_000  # what is left of a budget after a message that took some milliseconds
-_MANY = 256  # messages
+_SECOND = 1_000_000_000
 _NEVER = 1 << 63
 
 
@@ -49,9 +46,6 @@ class Monitors(Protocol):
 
     blocked: str
     """Why everything is blocked, if it is."""
-
-    spent: float
-    """Seconds of processor time since the loop last came to its timers."""
 
     sight: object
     """Another one whenever something has happened that changes what may be prepared."""
@@ -67,6 +61,12 @@ class Monitors(Protocol):
 
     def now(self) -> int:
         """Nanoseconds."""
+
+    budget: float
+    """Seconds of processor time that a message may take."""
+
+    def over(self) -> bool:
+        """Whether the publisher's quantum is used up."""
 
     def keep(self, way: str) -> None:
         """Keep the state of those that judge messages on a topic."""
@@ -91,6 +91,7 @@ class Lane:
         self._counts: Counts | None = None
         self._defect: Walker | None = None
         self._source = middle.senders.number(place)
+        self._hurried_until = 0
 
     def through(self, batch: Batch) -> Batch | None:
         """The frames that go on, as the monitors leave them; None when none does. Their state is kept before that."""
@@ -101,7 +102,7 @@ class Lane:
     def _judged(self, batch: Batch) -> Batch | None:
         middle = self._middle
         now = batch.judged = middle.now()
-        if self._sight is not middle.sight or now >= self._until or batch.messages > _MANY:
+        if self._sight is not middle.sight or now >= self._until:
             return self._through(batch, Passage(batch, now))
         assert self._walker is not None  # noqa: S101  `_prepare` has found one
         assert self._prepared is not None  # noqa: S101  and prepared it
@@ -121,7 +122,6 @@ class Lane:
             return batch
         passage = Passage(batch, now)
         if walked.output:
-            middle.spent += walked.seconds
             self._say(walked, passage)
         passage.pieces = pieces
         passage.walked(walked.position, walked.run, gone)
@@ -141,32 +141,30 @@ class Lane:
             return self._block(batch, passage)
         walker = monitors.walker(self._place[1])
         while passage.position < passage.end:
-            if walker is None:
+            if passage.position and middle.over():
+                passage.stop()
+            elif walker is None:
                 self._one_by_one(monitors, passage, batch.messages)
-            elif middle.spent > LONGEST or not self._walk(monitors, walker, passage):
+            elif not self._walk(monitors, walker, passage):
                 self._one_by_one(monitors, passage, passage.turns())
         middle.schedule()
         return passage.result()
 
     def _walk(self, monitors: MonitorSet, walker: Walker, passage: Passage) -> bool:
-        """Take the messages that need nothing but the common; False if the next one needs more."""
+        """Take messages that need nothing but the common, for a quantum; False if the next one needs more."""
         middle = self._middle
         if walker is self._defect or not monitors.walks(walker, passage.time):
             return False
         prepared, counts = self._prepare(monitors, walker)
-        counted = passage.messages > _MANY or not walker.brief  # else it is too little
-        began = time.thread_time() if counted else None
         try:
-            walked = walker.walk(
-                passage.view, passage.position, passage.run, passage.pieces, passage.time, prepared
-            )
+            given = passage.view, passage.position, passage.run, passage.pieces, passage.time, prepared
+            walked = walker.walk(*given)
+            alone = walked is not None and walked.paused and walked.position == passage.position
+            if alone:
+                walked = walker.walk_one(*given, self._fuel(passage.time))
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, walker, passage.time)
             return False
-        if began is not None:
-            middle.spent += time.thread_time() - began
-        elif walked is not None:
-            middle.spent += walked.seconds
         if walked is not None and walked.output:
             self._say(walked, passage)
         if not counts.begun:
@@ -174,14 +172,23 @@ class Lane:
         if walked is None:
             passage.walked(passage.end, passage.run, 0)
             return True
+        begun = passage.position
         passage.walked(walked.position, walked.run, counts.add(walked, passage.time))
         if walked.sooner:
             middle.look_again()
-        return passage.position == passage.end
+        if alone:
+            if walked.paused:  # the engine would take much longer
+                self._hurried_until = passage.time + _SECOND
+            return passage.position > begun
+        return walked.paused or passage.position == passage.end
+
+    def _fuel(self, now: int) -> int:
+        part = AGAIN if now < self._hurried_until else 1.0
+        return int(FUEL_PER_SECOND * self._middle.budget * part)
 
     def _say(self, walked: Walked, passage: Passage) -> None:
         """Tell what was put out, and publish what was published."""
-        middle, monitors, began = self._middle, self._middle.monitors, time.thread_time()
+        middle, monitors = self._middle, self._middle.monitors
         assert monitors is not None  # noqa: S101  they have put it out
         head = HEAD if monitors.stamped(self._place[1]) else 0
         published = [said for _, said in walked.output if isinstance(said, Published)]
@@ -194,9 +201,6 @@ class Lane:
             size = _unpack_length(passage.view, position)[0]
             sighting = Sighting(passage, position, bytes(passage.view[first : first + min(size, head)]))
             middle.observer.said(said, self._place, passage.time, sighting)
-        middle.spent += time.thread_time() - began
-        if middle.spent > LONGEST:
-            middle.look_again()
 
     def _prepare(self, monitors: MonitorSet, walker: Walker) -> tuple[Prepared, Counts]:
         """Ask once what holds for all batches until something happens."""
@@ -214,36 +218,30 @@ class Lane:
                 source=self._source,
                 changed=counts.changed,
                 published=[observer.hides_publication(*each, place) for each in walker.publishes],
-                clock=time.thread_time,
             )
         self._walker, self._sight = walker, self._middle.sight
-        self._until = (_NEVER if monitors.next_due is None else monitors.next_due) if walker.brief else 0
+        self._until = _NEVER if monitors.next_due is None else monitors.next_due
         return prepared, counts
 
     def _one_by_one(self, monitors: MonitorSet, passage: Passage, count: int) -> None:
-        """Give so many messages to the engine."""
+        """Give so many messages to the engine, or as many as there is time for."""
         middle, place, now, observer = self._middle, self._place, passage.time, self._middle.observer
         view, position, end = passage.view, passage.position, passage.end
         process, topic = monitors.process, place[1]
         shows = observer.shows(place)
-        contexts = monitors.contexts(topic)
         head = HEAD if monitors.stamped(topic) else 0
         number = passage.number_at(position) if monitors.taps(topic) else 0
         looked = 0
         middle.look_again()
-        spent = middle.spent - time.thread_time()
         while position < end and looked < count:
             first = position + 4
             following = first + _unpack_length(view, position)[0]
             body = view[first:following]
             before = bytes(body[:SHOWN]) if shows else b""
             sighting = Sighting(passage, position, bytes(body[:head]))
+            monitors.hurry(AGAIN if now < self._hurried_until else 1.0)
             try:
-                outcome = (
-                    process(topic, body, now, sighting.sender(self._source))
-                    if middle.spent <= LONGEST
-                    else dropped(body, now, TOO_LONG)
-                )
+                outcome = process(topic, body, now, sighting.sender(self._source))
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
                 outcome = dropped(body, now, observer.defect(error, place, now, sighting))
             if monitors.tapped:
@@ -263,14 +261,11 @@ class Lane:
                     passage.replace(position, following, outcome.buffer)
             position = following
             looked += 1
-            if not looked % _LOOK_EVERY or outcome.faults or outcome.before:
-                middle.spent = spent + time.thread_time()
-            for context in contexts:
-                if context.budget < _COSTLY:
-                    middle.spent = spent + time.thread_time()
-                    break
+            if outcome.faults and monitors.late:
+                self._hurried_until = now + _SECOND
+            if middle.over():
+                break
         passage.position = position
-        middle.spent = spent + time.thread_time()
 
     def _block(self, batch: Batch, passage: Passage) -> Batch | None:
         if not self._middle.blocked:

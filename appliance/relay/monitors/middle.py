@@ -10,9 +10,8 @@ Invariants:
 - One swap is between two messages. What monitors publish is not given to monitors.
 - The clock of monitors never goes back and makes no leap: it is the time of the day when the relay started, and
   from there the monotonic clock. The messages of one batch have come at the same time.
-- The relay always answers its supervisor: when monitors have taken `lane.LONGEST` seconds of processor time since the
-  loop last came to its timers (they never do unless messages take them long), the messages until then are dropped.
-  Ticks that are late and take long are left out.
+- A message may take its monitors `budget` seconds of processor time. One that takes longer is cut off: that is a fault.
+  Messages behind it wait for their publisher's next turn. Ticks that are late and take long are left out.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from appliance.channel.messages import (
 )
 from appliance.relay.loop import Loop, Timer
 from appliance.relay.monitors.keeper import Keeper
-from appliance.relay.monitors.lane import LONGEST, TOO_LONG, Lane, dropped
+from appliance.relay.monitors.lane import Lane, dropped
 from appliance.relay.monitors.loader import Loader, Result
 from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
@@ -63,8 +62,9 @@ class Judged:
 class Middle:
     """The monitors of one relay.
 
-    `publish(published)` sends what a monitor publishes; `changed(topics)` is called when other topics may be wanted,
-    with those whose messages may fare otherwise now (None: all).
+    `budget` is how many seconds of processor time a message may take. `publish(published)` sends what a monitor
+    publishes; `changed(topics)` is called when other topics may be wanted, with those whose messages may fare otherwise
+    now (None: all).
     """
 
     def __init__(
@@ -72,10 +72,13 @@ class Middle:
         loop: Loop,
         reporter: Reporter,
         *,
+        budget: float,
         publish: Callable[[Published], None],
         changed: Callable[[frozenset[str] | None], None],
     ) -> None:
         self._loop = loop
+        self.budget = budget
+        self.over = loop.over
         self._reporter = reporter
         self._offset = time.time_ns() - time.monotonic_ns()
         self.monitors: MonitorSet | None = None
@@ -83,7 +86,6 @@ class Middle:
         self._switches: dict[str, bool] = {}
         self.blocked = ""
         self._awaited: SpecificationsStated | None = None
-        self.spent = 0.0
         self.sight = object()
         self._prepared: dict[tuple[Place, str], Prepared] = {}
         """For the walks of requests and replies until there is another `sight`: at most a second."""
@@ -134,6 +136,7 @@ class Middle:
         if isinstance(result, list):
             self._refuse(message, result)
             return
+        result.limit_time(time.thread_time, self.budget)
         result.explain_when(self.observer.asks, self._on_trial.asks)
         before, now, first = self.monitors, self.now(), self._stated is None or bool(self.blocked)
         if before is None:
@@ -303,7 +306,6 @@ class Middle:
     def tick(self) -> None:
         """A second is over."""
         self.look_again()
-        self.spent = 0.0
         self.observer.tick(self.now())
         self.trials.tick()
         if self.monitors is not None:
@@ -331,13 +333,12 @@ class Middle:
             return Judged(b"", self.blocked)
         if self.monitors is None or self.monitors.service_type_of(service, tried=True) is None:
             return Judged(body)
-        if self.spent > LONGEST:
-            return Judged(b"", TOO_LONG)
-        now, began, due = self.now(), time.thread_time(), self.monitors.next_due
+        now, due = self.now(), self.monitors.next_due
         view = memoryview(body)
         outcome = self._walked(self.monitors, place, way_of(service, part), body, now)
         if outcome is None:
             self.look_again()
+            self.monitors.hurry(1.0)
             try:
                 outcome = self.monitors.process_service(
                     service, part, bytearray(body), now, Sender(self.senders.number(place))
@@ -350,7 +351,6 @@ class Middle:
             self.look_again()
         self.keep(way_of(service, part))
         self.observer.told(outcome, place)
-        self.spent += time.thread_time() - began
         self.schedule()
         if outcome.result == "dropped":
             self.observer.dropped(outcome, place, view)
@@ -407,7 +407,7 @@ class Middle:
         self._due = self._timer = None
         if self.monitors is None:
             return
-        began = time.thread_time()
+        self.monitors.hurry(1.0)
         try:
             for outcome in self.monitors.advance(self.now()):
                 self.observer.told(outcome, NOWHERE)
@@ -418,7 +418,6 @@ class Middle:
             self._timer = self._loop.after(_AFTER_DEFECT, self._advance)
             return
         self.keep_all()
-        self.spent += time.thread_time() - began
         self.schedule()
 
 

@@ -70,6 +70,12 @@ class Passage:
         self.pieces += (_LENGTH.pack(len(buffer)), buffer)
         self.run = following
 
+    def stop(self) -> None:
+        """Leave the messages that were not taken for later."""
+        batch, taken = self._batch, self.number_at(self.position) - self._batch.first
+        batch.left = self.messages - taken
+        self._batch, self.messages, self.end = batch.head(taken), taken, self.position
+
     def result(self) -> Batch | None:
         """What goes on; None when nothing does."""
         if not self.run:

@@ -96,7 +96,7 @@ class Interpreter:
         self.turn = Turn()
         self.variables: dict[str, Any] = {}
         self.failed = Failed()
-        self._values = Values(messages)
+        self._values = Values(messages, self.turn.check)
         self._functions = functions
         self._made: dict[str, Callable[[Variables], Any]] = {}
         self._calls: list[Variables] = []
@@ -143,7 +143,7 @@ class Interpreter:
     def _call(self, name: str, variables: Variables) -> Any:
         call = self._made.get(name)
         if call is None:
-            call = self._made[name] = self._make(self._functions[name])
+            call = self._made[name] = self.turn.exclude(lambda: self._make(self._functions[name]))
         return call(variables)
 
     def _make(self, function: form.Function) -> Callable[[Variables], Any]:

@@ -53,8 +53,10 @@ def is_array(kind: Type) -> bool:
 class Values:
     """The values of the types of a set of message definitions. What deals with those of a type is made once."""
 
-    def __init__(self, messages: Messages) -> None:
+    def __init__(self, messages: Messages, check: Callable[[], None] = lambda: None) -> None:
+        """`check` is called now and then while many elements are decoded; it may raise what stops that."""
         self._messages = messages
+        self._check = check
         self._made: dict[tuple[Callable[[Values, Any], Any], Type], Callable[..., Any]] = {}
 
     def _once(self, make: Callable[["Values", Any], Callable[..., Any]], kind: Type) -> Callable[..., Any]:
@@ -185,7 +187,7 @@ class Values:
         code, least, element = struct_code(kind.element), self.least(kind.element), kind.element
         decode: Callable[[wire.Buffer, int, int], tuple[Any, int]]
         if code is None:
-            decode = partial(wire.elements, decode=self.decoder(element))
+            decode = partial(wire.elements, decode=self.decoder(element), check=self._check)
         elif len(code) == 2:
             decode = partial(wire.moments, code=code[0])
         else:

@@ -3,13 +3,15 @@
 Invariants:
 
 1. Between two calls of `begin` a specification spends at most its budget of instructions; loops, calls, copies of
-   anything long and walks over many elements of a message are charged before they are done.
+   anything long and walks over many elements of a message are charged before they are done. Where processor time is
+   bounded (`Turn.limit`), it is read every `STEP` instructions, and every `PART` elements of a walk or a copy.
 2. The values of a specification never hold more than `MAX_BYTES` plus `UNMEASURED` bytes. Whatever makes
    something long says so to `allocate`; when enough has been said, the live values are measured.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from typing import Any, NamedTuple
 
 BUDGET = 1_000_000
@@ -19,6 +21,17 @@ TRIAL_BUDGET = 100_000
 """Instructions that a specification on trial may spend on one message: what waits meanwhile waits some tens of
 milliseconds.
 """
+
+FUEL_PER_SECOND = 1_500_000_000
+"""Instructions of a module that take about a second."""
+
+STEP = 250
+"""Instructions between two readings of the processor time."""
+
+PART = 250
+"""Elements that are walked or made between two readings of the processor time."""
+
+_AT_ONCE = 10e-9  # seconds that an instruction takes at least, of many that are charged before they are done
 
 MAX_BYTES = 16 << 20
 """Bytes that the values of a specification may hold together."""
@@ -84,6 +97,46 @@ class Turn:
     published: list[Published] = field(default_factory=list)
     looked: dict[int, tuple[Any, ...]] = field(default_factory=dict)
     reset: bool = False  # `__RESET;` was met, for the property whose handlers run
+    clock: Callable[[], float] | None = None  # seconds of processor time; None: they are not bounded
+    seconds: float = inf
+    part: float = 1.0  # of them
+    until: float = inf
+
+    def limit(self, clock: Callable[[], float], seconds: float) -> None:
+        """Bound the processor time of each message, tick or deadline from the next one on."""
+        self.clock, self.seconds = clock, seconds
+
+    def begin(self) -> None:
+        """Start the time of a message, a tick or a deadline."""
+        if self.clock is not None:
+            self.until = self.clock() + self.seconds * self.part
+
+    def late(self, more: float = 0.0) -> bool:
+        """Whether the time is over, or will be after so many seconds."""
+        return self.clock is not None and self.clock() + more > self.until
+
+    def check(self) -> None:
+        """Raise a fault if the time is over."""
+        if self.late():
+            raise FaultError(-1, self.too_late)
+
+    @property
+    def too_late(self) -> str:
+        """The text of the fault."""
+        return (
+            f"more than {self.seconds * self.part * 1000:g} ms of processor time for one message: it has too many"
+            f" elements or characters for its monitors (relay.budget is {self.seconds * 1000:g} ms; for a second after"
+            " a message that took longer, the next ones have a tenth)"
+        )
+
+    def exclude(self, make: Callable[[], Any]) -> Any:
+        """Return what `make` returns; its time does not count."""
+        if self.clock is None:
+            return make()
+        began = self.clock()
+        made = make()
+        self.until += self.clock() - began
+        return made
 
 
 class Context:
@@ -91,6 +144,7 @@ class Context:
 
     __slots__ = (
         "_allocated",
+        "_left",
         "_live",
         "_measures",
         "_pending",
@@ -114,7 +168,8 @@ class Context:
         self.monitor = monitor
         self.turn = turn
         self.most = BUDGET
-        self.budget = BUDGET
+        self.budget = BUDGET  # until the time is read again
+        self._left = 0  # beyond that
         self.throttled: dict[int, int] = {}
         self._allocated = 0
         self._measures = measures
@@ -123,24 +178,33 @@ class Context:
 
     def begin(self) -> None:
         """A new message: the whole budget."""
-        self.budget = self.most
+        self.budget = self.most if self.turn.clock is None else min(STEP, self.most)
+        self._left = self.most - self.budget
 
     def spend(self, instructions: int, site: int) -> None:
         """Take from the budget; a fault if nothing is left."""
         self.budget -= instructions
         if self.budget < 0:
-            raise FaultError(
-                site, f"more than {self.most} instructions for one message; is there a loop without end?"
-            )
+            self._go_on(site, "; is there a loop without end?")
 
     def walk(self, elements: int) -> None:
         """Charge for a walk over so many elements of arrays, one by one, to a field behind them."""
         self.budget -= elements
         if self.budget < 0:
-            raise FaultError(
-                -1,
-                f"more than {self.most} instructions for one message: too many elements stand before a field",
-            )
+            self._go_on(-1, ": too many elements stand before a field")
+
+    def _go_on(self, site: int, otherwise: str) -> None:
+        """Take the next step from what is left; a fault if nothing is, or the time is over."""
+        missing = -self.budget
+        if missing > self._left:
+            self._left = 0
+            raise FaultError(site, f"more than {self.most} instructions for one message{otherwise}")
+        if self.turn.late(missing * _AT_ONCE):
+            self._left = 0
+            raise FaultError(site, self.turn.too_late)
+        given = min(self._left, missing + STEP)
+        self._left -= given
+        self.budget += given
 
     def allocate(self, size: int, site: int, replaced: int = 0) -> None:
         """`size` bytes are about to be made, or copied, in the place of `replaced` bytes of a variable."""

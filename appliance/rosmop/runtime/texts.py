@@ -3,7 +3,7 @@
 import math
 import re
 
-from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, Context, FaultError
+from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
 from appliance.rosmop.runtime.numbers import f32
 
 NOT_FOUND = (1 << 64) - 1
@@ -96,7 +96,12 @@ def find_last(context: Context, text: bytes, wanted: bytes, start: int, site: in
 def find_any(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
     """`text.find_first_of(wanted, start)`."""
     context.spend(len(text), site)
-    return next((index for index in range(start, len(text)) if text[index] in wanted), NOT_FOUND)
+    for first in range(start, len(text), PART):
+        context.turn.check()
+        for index in range(first, min(first + PART, len(text))):
+            if text[index] in wanted:
+                return index
+    return NOT_FOUND
 
 
 def charged(context: Context, text: bytes, site: int) -> bytes:

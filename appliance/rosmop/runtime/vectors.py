@@ -6,7 +6,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, Context, FaultError
+from appliance.rosmop.runtime.context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
 
 Values = list[Any]
 
@@ -113,7 +113,15 @@ def filled(context: Context, count: int, make: Callable[[], Any], width: int, si
     """`count` new elements."""
     context.allocate(count * width, site)
     context.spend(count // 4, site)
-    return [make() for _ in range(count)]
+    return _made(context, count, make)
+
+
+def _made(context: Context, count: int, make: Callable[[], Any]) -> Values:
+    values: Values = []
+    for first in range(0, count, PART):
+        context.turn.check()
+        values += [make() for _ in range(min(PART, count - first))]
+    return values
 
 
 def resized(  # noqa: PLR0917  the arguments are C++'s
@@ -144,7 +152,7 @@ def filled_with(  # noqa: PLR0917  the arguments are C++'s
     """`std::vector<T>(count, value)`; `measure` says how many bytes a value holds."""
     context.allocate(count * max(measure(value), 1), site)
     context.spend(count // 4, site)
-    return [copy(value) for _ in range(count)]
+    return _made(context, count, lambda: copy(value))
 
 
 def fixed(values: Values, count: int, site: int) -> Values:
@@ -204,6 +212,8 @@ def accumulate(  # noqa: PLR0917  the arguments are C++'s, and how to add
     """`std::accumulate`."""
     _check_span(values, first, last, site)
     context.spend(last - first, site)
-    for value in values[first:last]:
-        start = add(start, value)
+    for index in range(first, last):
+        if not index % PART:
+            context.turn.check()
+        start = add(start, values[index])
     return start

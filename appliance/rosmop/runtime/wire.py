@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from appliance.rosmop.runtime.context import Context, MalformedError
+from appliance.rosmop.runtime.context import PART, Context, MalformedError
 from appliance.rosmop.runtime.times import with_part
 
 Buffer = bytes | bytearray | memoryview
@@ -60,15 +60,21 @@ def moments(buffer: Buffer, start: int, number: int, code: str) -> tuple[list[in
 
 
 def elements(
-    buffer: Buffer, start: int, number: int, decode: Callable[[Buffer, int], tuple[Any, int]]
+    buffer: Buffer,
+    start: int,
+    number: int,
+    decode: Callable[[Buffer, int], tuple[Any, int]],
+    check: Callable[[], None],
 ) -> tuple[list[Any], int]:
-    """`number` values, each by `decode`, and where they end."""
+    """Return `number` values, each by `decode`, and where they end; `check` is called now and then."""
     if number > _MAX_DECODED:
         raise MalformedError(
             f"an array of {number} elements; at most {_MAX_DECODED} that are no numbers are read"
         )
     values = []
-    for _ in range(number):
+    for index in range(number):
+        if not index % PART:
+            check()
         value, start = decode(buffer, start)
         values.append(value)
     return values, start
@@ -78,9 +84,7 @@ def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], i
     """Where `number` elements end, each of which ends where `end` says. Many are charged before they are walked."""
     if number > FEW:
         context.walk(number)
-    for _ in range(number):
-        start = end(buffer, start)
-    return start
+    return _skipped(buffer, start, number, end, context)
 
 
 def skip_inner(
@@ -88,8 +92,17 @@ def skip_inner(
 ) -> int:
     """As `skip`, within an element that is skipped: a few are charged, too, since there may be many such elements."""
     context.walk(number + 1)
-    for _ in range(number):
-        start = end(buffer, start)
+    return _skipped(buffer, start, number, end, context)
+
+
+def _skipped(
+    buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context
+) -> int:
+    for first in range(0, number, PART):
+        if first:
+            context.turn.check()
+        for _ in range(min(PART, number - first)):
+            start = end(buffer, start)
     return start
 
 

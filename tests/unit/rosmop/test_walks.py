@@ -556,8 +556,9 @@ def test_a_long_message_is_looked_at_where_it_begins() -> None:
     assert behind.state() == ["n 240"]
 
 
-def test_more_frames_than_fit_and_more_changes_than_are_noted() -> None:
+def test_more_frames_than_fit_and_more_changes_than_are_noted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Go in several pieces."""
+    monkeypatch.setattr("appliance.rosmop.walks.FUEL", 10**9)
     fed = Fed("""one() { int n = 0; event e(int count, double x) /plain own/Plain '{count:count, x:x}' {
         n++; if (count % 2) { x = n; } } }
         two() { event e(float y) /plain own/Plain '{y:y}' when (y == 0) { y = 1; } }""")

@@ -18,17 +18,16 @@ from appliance.channel.messages import (
     NodePlaced,
     PublicationPlaced,
     PublicationRefused,
+    PublicationWithdrawn,
     SpecificationsRefused,
     SpecificationsStated,
     SpecificationsTaken,
     UpstreamWanted,
 )
 from appliance.relay.connections.frames import Batch
-from appliance.relay.monitors.lane import TOO_LONG
 from appliance.relay.monitors.loader import Loader
 from appliance.relay.monitors.places import Place
 from appliance.ros.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
-from appliance.rosmop.engine import MonitorSet
 from tests.support.stated import stated
 from tests.unit.relay.world import ASK, HEADER, LOOPBACK, Peer, World
 
@@ -64,6 +63,10 @@ def data_of(peer: Peer) -> bytes:
     """Everything the peer has been sent."""
     peer.read()
     return bytes(peer.data)
+
+
+COSTLY = """a() { int n; event e(std::string s) /chatter std_msgs/String '{data:s}' {
+    for (int i = 0; i < s.size(); i++) { if (s[i] == 'y') n += i; } } }"""
 
 
 class Monitored(World):
@@ -335,10 +338,9 @@ def test_a_monitor_without_end_faults_and_its_messages_are_dropped(world: Monito
     publisher.send(string("loop") + string("after"))
     world.gets(subscriber, string("after"))
     fault = world.event("fault", monitor="guard")
-    assert "instructions" in fault.text
+    assert "processor time" in fault.text
     assert fault.detail["file"] == "0.rv"
     world.push(publisher, string("loop") * 200)
-    world.event("drop", text="the monitors take too long for their messages")
     publisher.send(string("later"))
     world.gets(subscriber, string("later"))
 
@@ -357,25 +359,55 @@ def test_ticks_that_take_longer_than_their_period_do_not_starve_the_relay(world:
     assert "they take too long" in world.event("log", monitor="slow").text
 
 
-def test_messages_that_cost_much_are_seen_by_the_clock_at_once(world: Monitored) -> None:
-    """Not after sixteen: several monitors that use up nearly all of their budgets would take a minute for them."""
-    text = """a() { int n; event e() /chatter std_msgs/String '{}' { for (int i = 0; i < 60000; i++) n += i; } }"""
-    world.load(text)
-    middle = world.engine.middle
-    lane = middle.lane(Place("k", "/chatter"))
-    seen: list[float] = []
-    process = MonitorSet.process
-
-    def watched(*given: Any) -> Any:
-        seen.append(middle.spent)
-        return process(*given)
-
-    assert middle.monitors is not None
+def test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn(world: Monitored) -> None:
+    """In order and unchanged, while those before them go on."""
+    world.load(COSTLY)
+    lane = world.engine.middle.lane(Place("k", "/chatter"))
+    frames = bytearray(string("x" * 3000) + string("last") * 3)
+    batch = Batch(memoryview(frames), 4, None)
+    batch.first = 7
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(MonitorSet, "process", watched)
-        frames = bytearray(string("x") * 4)
-        lane.through(Batch(memoryview(frames), 4, None))
-    assert seen == sorted(set(seen))
+        patch.setattr(world.engine.middle, "over", lambda: True)
+        left = lane.through(batch)
+    assert left is not None
+    assert (left.messages, bytes(left.view)) == (1, string("x" * 3000))
+    rest = batch.tail(batch.left)
+    assert (rest.first, rest.messages, bytes(rest.view)) == (8, 3, string("last") * 3)
+
+
+def test_a_message_that_takes_longer_than_the_budget_is_a_fault(world: Monitored) -> None:
+    """It is dropped, and the record says how much was exceeded; the next ones have a tenth for a second."""
+    world.load(COSTLY)
+    publisher, subscriber = world.typed()
+    publisher.send(string("x" * 500_000) + string("after"))
+    world.gets(subscriber, string("after"))
+    fault = world.event("fault", monitor="a")
+    assert "ms of processor time for one message" in fault.text
+    assert fault.detail["file"] == "0.rv"
+
+
+def test_what_is_left_of_a_read_outlives_other_specifications_and_comes_in_order(world: Monitored) -> None:
+    """Messages that wait for their turn are judged by what is in force then; none is lost or overtaken."""
+    world.load(COSTLY)
+    publisher, subscriber = world.typed()
+    many = [string(f"{number:05}" + "x" * 100) for number in range(3000)]
+    world.engine.middle.over = lambda: True
+    world.push(publisher, b"".join(many))
+    world.loop.turn(0.01)
+    world.load(COSTLY.replace("i < s.size()", "i < 0"), revision=2)
+    world.gets(subscriber, b"".join(many))
+
+
+def test_what_is_left_of_a_read_ends_with_the_publication(world: Monitored) -> None:
+    """It is withdrawn while messages wait for their turn: they are forgotten, and the memory they took."""
+    world.load(COSTLY)
+    publisher, subscriber = world.typed()
+    world.engine.middle.over = lambda: True
+    world.push(publisher, string("x" * 100) * 3000)
+    world.until(lambda: world.held)
+    world.state(PublicationWithdrawn("k", "/chatter"))
+    world.ends(subscriber)
+    assert world.held == 0
 
 
 def test_bytes_that_are_no_message_of_the_type_are_dropped(world: Monitored) -> None:
@@ -601,16 +633,6 @@ def test_the_client_of_a_service_reads_why_its_request_could_not_be_judged(world
     assert refused == "the request is refused by the monitor gate: division by zero"
     world.state(MonitorSwitched("gate", False))
     assert middle.request(Place("k", "/mode"), b"\0").refused is None
-
-
-def test_a_service_without_a_monitor_goes_on_while_monitors_are_slow(world: Monitored) -> None:
-    """Those of other topics have taken too long: only what they would have to judge is refused."""
-    world.load(LATCH)
-    middle = world.engine.middle
-    middle.spent = 99.0
-    assert middle.request(Place("k", "/plain"), b"x").body == b"x"
-    assert middle.request(Place("k", "/mode"), b"\1").refused == TOO_LONG
-    assert middle.response(Place("k", "/plain"), b"y").body == b"y"
 
 
 def test_a_service_with_another_definition_is_refused(world: Monitored) -> None:
