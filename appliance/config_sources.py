@@ -26,6 +26,7 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from appliance.config import Settings
+from appliance.given_files import read_given_text
 from appliance.wrong_values import must_be, not_yaml
 
 if typing.TYPE_CHECKING:
@@ -124,7 +125,7 @@ class _Gathered:
 
     def add_file(self, file: Path) -> None:
         try:
-            text = file.read_text(encoding="utf-8")
+            text = read_given_text(file)
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
             raise ConfigError([Mistake(str(file), f"cannot be read: {reason}")]) from error

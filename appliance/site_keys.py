@@ -17,6 +17,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from appliance.given_files import open_given
+
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
@@ -51,8 +53,8 @@ def name_of(line: str) -> str:
 def read_signature(file: Path) -> str:
     """What FILE.sig has; empty where there is none that can be read."""
     try:
-        with file.with_name(f"{file.name}.sig").open(encoding="ascii", errors="replace") as opened:
-            return opened.read(_LONGEST)
+        with open_given(file.with_name(f"{file.name}.sig")) as opened:
+            return opened.read(_LONGEST).decode("ascii", "replace")
     except OSError:
         return ""
 

@@ -21,6 +21,7 @@ import msgspec
 from appliance.audit.database import LogUnreadableError, reading
 from appliance.audit.findings import Elsewhere, Kind, LogFinding
 from appliance.audit.signatures import signature_is_right
+from appliance.given_files import open_given
 from appliance.sealed_texts import Checkpoint, parse_checkpoint
 
 SYSLOG_ELEMENT = "rosrvCheckpoint@32473"
@@ -90,9 +91,9 @@ def read_copies(file: Path) -> list[SignedCheckpoint]:
     """
     found = []
     try:
-        with file.open("rb") as lines:
-            for line in lines:
-                copy = _parse(line[:_LONGEST_LINE].decode("utf-8", "replace"))
+        with open_given(file) as lines:
+            for line in iter(lambda: lines.readline(_LONGEST_LINE), b""):
+                copy = _parse(line.decode("utf-8", "replace"))
                 if copy is not None:
                     found.append(copy)
     except OSError as error:

@@ -19,6 +19,7 @@ from appliance.audit.evidence import Chain
 from appliance.audit.findings import Kind, LogFinding
 from appliance.audit.output import Entry, entry_of
 from appliance.audit.signatures import signature_is_right
+from appliance.given_files import lines_given
 
 _LONGEST_LINE = 16 << 20
 _MOST_FINDINGS = 1000
@@ -58,8 +59,7 @@ class _Line(NamedTuple):
 def verify_export(file: Path, key: bytes) -> ExportVerification:
     """Check an export against the raw public key. Raises `ExportUnreadableError`."""
     try:
-        with file.open("rb") as lines:
-            return _Walk(key).run(_read(file, lines))
+        return _Walk(key).run(_read(file, lines_given(file, _LONGEST_LINE)))
     except OSError as error:
         raise ExportUnreadableError(f"{file}: {error.strerror}") from error
 
@@ -69,7 +69,7 @@ def _read(file: Path, lines: Iterable[bytes]) -> Iterator[_Line]:
         if not line.strip():
             continue
         try:
-            fields = json.loads(line[:_LONGEST_LINE])
+            fields = json.loads(line)
             yield _Line(entry_of(fields), msgspec.convert(fields["chain"], Chain), number)
         except _NOT_A_RECORD as error:
             raise ExportUnreadableError(

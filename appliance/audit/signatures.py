@@ -15,6 +15,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_public_key
 
 from appliance.audit.writer import ChainWriter
+from appliance.given_files import read_given
 from appliance.whole_files import write_whole
 
 Signer = Callable[[int, bytes], None]
@@ -34,7 +35,7 @@ def pinned_key_path(log: Path) -> Path:
 def read_public_key(path: Path) -> bytes:
     """The raw Ed25519 public key (32 bytes) in a PEM file. Raises `KeyUnreadableError`."""
     try:
-        key = load_pem_public_key(path.read_bytes())
+        key = load_pem_public_key(read_given(path))
     except OSError as error:
         raise KeyUnreadableError(f"{path}: {error.strerror}") from error
     except (ValueError, UnsupportedAlgorithm) as error:

@@ -19,6 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Self
 
 from appliance.backup.contents import AUDIT_LOG, KEPT_PARTS, MOST_FILES, BackupError, belongs, trouble_with
+from appliance.given_files import open_given
 
 _PIECE = 1 << 20
 
@@ -45,7 +46,7 @@ def checked_archive(file: Path, room: int) -> Iterator[tuple[tarfile.TarFile, li
     Raises `BackupError`, also for what cannot be read within.
     """
     try:
-        with file.open("rb") as raw:
+        with open_given(file) as raw:
             _read_to_the_end(file, raw, room)
             raw.seek(0)
             with (

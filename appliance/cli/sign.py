@@ -9,6 +9,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key, load_ssh_private_key
 
 from appliance.cli.output import Json, say, say_json, usage_error, write_told
+from appliance.given_files import read_given
 from appliance.site_keys import name_of, public_line
 from appliance.site_keys import sign as signature_of
 
@@ -44,7 +45,7 @@ def sign(
 
 def _private(file: Path) -> Ed25519PrivateKey:
     try:
-        data = file.read_bytes()
+        data = read_given(file)
         load = load_ssh_private_key if data.startswith(_OPENSSH) else load_pem_private_key
         key = load(data, password=None)
     except OSError as error:
@@ -63,7 +64,7 @@ def _private(file: Path) -> Ed25519PrivateKey:
 def _text(file: Path) -> str:
     """What the appliance will read: it does not know a byte order mark, nor the line ends of other systems."""
     try:
-        text = file.read_bytes().decode("utf-8")
+        text = read_given(file).decode("utf-8")
     except OSError as error:
         raise usage_error(f"cannot read {file}: {error.strerror}", verb="rosrv sign") from error
     except UnicodeDecodeError:

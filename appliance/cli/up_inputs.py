@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from appliance.config import Settings
+from appliance.given_files import read_given_text
 from appliance.policy.findings import PolicyError
 from appliance.policy.judgement import Known, judge
 from appliance.policy.policy import DEFAULT_PORTS
@@ -43,7 +44,7 @@ def read_inputs(settings: Settings) -> range:
 
 def _text(file: Path) -> str:
     try:
-        return file.read_text(encoding="utf-8")
+        return read_given_text(file)
     except OSError as error:
         why = error.strerror
     except UnicodeDecodeError as error:

@@ -24,6 +24,7 @@ from appliance.channel.answers import policy as answers
 from appliance.channel.answers.policy import Loaded
 from appliance.control.errors import UnknownThingError
 from appliance.fingerprints import fingerprint
+from appliance.given_files import read_given_text
 from appliance.policy.findings import PolicyError
 from appliance.policy.hosts import Network
 from appliance.policy.judgement import Known, judge
@@ -273,7 +274,7 @@ class Policies:
         cases = self.file.with_name(f"{self.file.name}.tests.yaml")
         text = error = None
         try:
-            text = cases.read_text(encoding="utf-8")
+            text = read_given_text(cases)
         except FileNotFoundError:
             pass
         except (OSError, UnicodeDecodeError) as fault:
@@ -309,7 +310,7 @@ class Policies:
     def _read(self) -> tuple[str, str]:
         """The file's text and signature."""
         try:
-            return self.file.read_text(encoding="utf-8"), read_signature(self.file)
+            return read_given_text(self.file), read_signature(self.file)
         except (OSError, UnicodeDecodeError) as error:
             raise PolicyRefusedError([f"{self.file}: the policy cannot be read: {_said(error)}"]) from error
 

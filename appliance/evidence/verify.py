@@ -27,12 +27,15 @@ if __name__ == "__main__" and not (sys.flags.isolated or getattr(sys.flags, "saf
 import argparse
 import hashlib
 import json
+import os
+import stat
 import struct
 import subprocess
 import tempfile
 import zipfile
 import zlib
-from collections import Counter
+from bisect import bisect_left
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any, Callable, Iterator
 
@@ -44,6 +47,9 @@ COLUMNS = (
     "rule", "rule_key", "rule_file", "rule_line", "revision", "reason", "duration_us",
 )  # fmt: skip
 MOST = 16 << 20  # bytes of a member that is read at once, or of a line
+# The members of a ZIP file unpack to no more bytes than this, and this for each byte of the file. Records hold hashes,
+# which do not pack: even with the longest text in each, they pack to more than a 256th.
+UNPACKED, PER_BYTE = 1 << 30, 256
 CHAIN = {"previous", "hash", "then", "checkpoint"}
 SEALED = ("log", "number", "sequence", "hash", "time", "previous", "removed")
 # Of a ZIP file: an entry of the directory, the header of a member, the end; what the appliance writes where it is free.
@@ -90,12 +96,15 @@ def extra(*sizes: int) -> bytes:
     return struct.pack(f"<2H{len(sizes)}Q", 1, 8 * len(sizes), *sizes)
 
 
-def ends(file: Any, size: int) -> bool:
-    """Whether the compressed text that begins here has so many bytes, and zeros in the bits that are left over."""
+def ends(file: Any, size: int, unpacked: int) -> bool:
+    """Return whether the compressed text that begins here has `size` bytes, and zeros in the bits that are left over.
+
+    It unpacks to `unpacked` bytes; what unpacks to more is not read to its end.
+    """
     unpacker = zlib.decompressobj(-15)
-    while size > 1 and not unpacker.eof:
+    while size > 1 and not unpacker.eof and unpacked >= 0:
         piece = file.read(min(size - 1, 4096))
-        unpacker.decompress(piece)
+        unpacked -= len(unpacker.decompress(piece))
         size -= len(piece) or size
     last, other = file.read(1)[0], unpacker.copy()
     text = unpacker.decompress(bytes([last]))
@@ -133,7 +142,7 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
         if file.read(header[11]) not in (b"", extra(0, 0), extra(size, packed)):
             yield f"{name!a}: has an extra field"
         at = file.tell() + packed
-        if not (ends(file, packed) if info.compress_type else packed == size):
+        if not (ends(file, packed, size) if info.compress_type else packed == size):
             yield f"{name!a}: something stands behind it"
         file.seek(at)
         forms = ("<4sLQQ", "<4s3L") if max(packed, size) < LARGE else ("<4sLQQ",)
@@ -154,15 +163,56 @@ def foreign(archive: zipfile.ZipFile) -> Iterator[str]:
         yield ""
 
 
+def regular(path: Path, follow: bool = True) -> Any:
+    """Open a regular file. A named pipe or a device could keep its reader waiting for ever: OSError."""
+    flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0)
+    descriptor = os.open(path, flags | (0 if follow else getattr(os, "O_NOFOLLOW", 0)))
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(22, "is not a regular file", str(path))
+    return os.fdopen(descriptor, "rb")
+
+
+def require_bounded(archive: zipfile.ZipFile, size: int) -> None:
+    """Raise ValueError for a ZIP file whose members overlap, or unpack to more than a bundle of its size can."""
+    members, most = archive.infolist(), UNPACKED + PER_BYTE * size
+    if sum(info.compress_size for info in members) > size:
+        raise ValueError("its members overlap: it is not a bundle")
+    if sum(info.file_size for info in members) > most:
+        raise ValueError(f"it unpacks to more than {most} bytes, which no bundle of its size does")
+
+
 def opened(place: Path) -> tuple[list[str], Opener, Iterator[str]]:
-    """The names in a ZIP file or a folder, what opens one, and what is beside them."""
+    """Return the names in a ZIP file or a folder, what opens one, and what is beside them."""
     if not place.is_dir():
+        with regular(place) as file:
+            size = os.fstat(file.fileno()).st_size
         archive = zipfile.ZipFile(place)
+        require_bounded(archive, size)
         return archive.namelist(), archive.open, foreign(archive)
     paths = [path for path in place.rglob("*") if path.is_symlink() or not path.is_dir()]
     strange = {path: "" if path.is_file() and not path.is_symlink() else " (no file)" for path in paths}
     names = [path.relative_to(place).as_posix() + strange[path] for path in paths]
-    return names, lambda name: (place / name).open("rb"), iter(())
+    return names, lambda name: regular(place / name, follow=False), iter(())
+
+
+class Runs:
+    """The runs of records in a bundle: numbers of first and last records, each after the one before."""
+
+    def __init__(self, pairs: list[list[int]]) -> None:
+        edges = [-1, *(edge for first, last in pairs for edge in (first, last))]
+        # Two runs have a record between them.
+        steps = (here - before for before, here in zip(edges, edges[1:]))  # noqa: RUF007  Python 3.8
+        if any(step < (2, 0)[number % 2] for number, step in enumerate(steps)):
+            raise ValueError("the runs of manifest.json are not in their order")
+        self.first, self.last = [first for first, _last in pairs], [last for _first, last in pairs]
+        self.missing = sum(last - first + 1 for first, last in pairs)
+        self.beside = {edge: False for first, last in pairs for edge in (first - 1, last + 1)}
+
+    def meet(self, first: int, last: int) -> bool:
+        """Return whether one of these records is in a run."""
+        after = bisect_left(self.last, first)
+        return after < len(self.last) and self.first[after] <= last
 
 
 class Verifier:
@@ -173,7 +223,7 @@ class Verifier:
     ) -> None:
         self.names, self.open, self.foreign = opened(place)
         self.key, self.copies = folder / "key", copies
-        with key.open("rb") if key else self.open("audit.pub") as file:
+        with regular(key) if key else self.open("audit.pub") as file:
             self.key.write_bytes(file.read(MOST))
         order = ["openssl", "pkey", "-pubin", "-outform", "DER", "-in", str(self.key)]
         self.raw_key = subprocess.run(order, check=True, capture_output=True).stdout[-32:].hex()
@@ -245,12 +295,12 @@ class Verifier:
 
     def look_at_records(self) -> None:
         """Rule 3."""
-        runs, since, until = (self.manifest[name] for name in ("runs", "since", "until"))
-        beside = {edge: False for first, last in runs for edge in (first - 1, last + 1)}
-        missing = sum(last - first + 1 for first, last in runs)
-        for record in self.records("records.ndjson"):
+        since, until = self.manifest["since"], self.manifest["until"]
+        runs = Runs(self.manifest["runs"])
+        beside, missing = runs.beside, runs.missing
+        for record in self.records("records.ndjson", runs):
             sequence = record["sequence"]
-            if any(first <= sequence <= last for first, last in runs):
+            if runs.meet(sequence, sequence):
                 missing -= 1
                 self.revisions.add(record["revision"])
             elif sequence in beside:
@@ -260,10 +310,11 @@ class Verifier:
             self.note_hash(record["event"], record["revision"], json.loads(record["detail"]))
         if missing:
             self.findings.append(f"records.ndjson: {missing} records of its runs are not there")
-        if not beside[runs[0][0] - 1] and runs[0][0] > 1:
-            self.notes.append(f"what was before record {runs[0][0]}: retention has removed it")
-        if not beside[runs[-1][1] + 1]:
-            self.notes.append(f"that record {runs[-1][1]} was the last of this time: the log ended there")
+        first, last = runs.first[0], runs.last[-1]
+        if not beside[first - 1] and first > 1:
+            self.notes.append(f"what was before record {first}: retention has removed it")
+        if not beside[last + 1]:
+            self.notes.append(f"that record {last} was the last of this time: the log ended there")
 
     def note_hash(self, event: str, revision: int, detail: dict[str, Any]) -> None:
         """What a record has the hash of."""
@@ -276,11 +327,14 @@ class Verifier:
 
     def look_at_texts(self) -> None:
         """Rule 4."""
+        missing = {*self.manifest["missing"]}
+        folders: dict[str, list[str]] = defaultdict(list)
+        for name in sorted(self.sums):
+            folders["/".join(name.split("/")[:2]) + "/"].append(name)
         for place, wanted in self.loads.items():
-            inside = sorted(name for name in self.sums if name.startswith(place))
-            lines = "".join(f"{self.sums[name]}  {name[len(place) :]}\n" for name in inside)
+            lines = "".join(f"{self.sums[name]}  {name[len(place) :]}\n" for name in folders.get(place, ()))
             found = sha256(lines.encode()).hex() if place.endswith("/") else self.sums.get(place)
-            if place in self.manifest["missing"]:
+            if place in missing:
                 self.notes.append(f"{place}: the appliance does not have it")
             elif wanted is None:
                 self.notes.append(f"{place}: it was loaded by a version that recorded no hash")
@@ -292,8 +346,8 @@ class Verifier:
         if not any(place.startswith("specifications/") for place in self.loads):
             self.notes.append("which specifications were in force: the log has no record of a load")
 
-    def records(self, name: str) -> Iterator[dict[str, Any]]:
-        """The records of a member, each after it was held against the chain."""
+    def records(self, name: str, runs: Runs | None = None) -> Iterator[dict[str, Any]]:
+        """Yield the records of a member, each after it was compared with the chain."""
         # How far the chain leads, its hash there, and the first record that no checkpoint seals yet.
         place, digest, begin = 0, b"", 0
         with self.open(name) as lines:
@@ -318,9 +372,9 @@ class Verifier:
                 for content in chain["then"] or ():
                     place, digest = place + 1, sha256(digest + b"2" + unhexed(content))
                 if chain["then"] is None:
-                    runs = [run for run in self.manifest["runs"] if begin <= run[1] and run[0] <= sequence]
+                    matters = runs is None or runs.meet(begin, sequence)
                     text = f"records {begin} to {sequence}: lead to no checkpoint; version 0.1.0 wrote what follows"
-                    (self.findings if runs else self.notes).append(text)
+                    (self.findings if matters else self.notes).append(text)
                     begin = 0
                 elif chain.get("checkpoint"):
                     self.look_at_checkpoint(chain["checkpoint"], place, digest.hex())
@@ -356,6 +410,13 @@ class Verifier:
         return right and checkpoint["key"] == self.raw_key
 
 
+def kept_copies(path: Path) -> dict[int, dict[str, Any]]:
+    """Return the checkpoints that were kept elsewhere, by number."""
+    with regular(path) as file:
+        lines = iter(lambda: file.readline(MOST), b"")
+        return {copy["number"]: copy for copy in map(json.loads, lines)}
+
+
 def main(arguments: list[str]) -> int:
     """Say what is found; the exit status."""
     parser = argparse.ArgumentParser(description="Proves a bundle of evidence of a ROSRV appliance.")
@@ -370,8 +431,7 @@ def main(arguments: list[str]) -> int:
     given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
         try:
-            lines = given.checkpoints.read_text().splitlines() if given.checkpoints else []
-            copies = {copy["number"]: copy for copy in map(json.loads, lines)}
+            copies = kept_copies(given.checkpoints) if given.checkpoints else {}
             verifier = Verifier(given.bundle, given.key, Path(folder), copies)
         except Exception as error:
             why = str(error)

@@ -18,6 +18,7 @@ from typing import Any
 
 import yaml
 
+from appliance.given_files import read_given_text
 from appliance.policy.findings import quoted
 from appliance.wrong_values import meant, not_yaml
 
@@ -77,7 +78,7 @@ class Declared:
 def read_declared(path: Path) -> dict[str, DeclaredHost]:
     """The declared hosts by name; none when there is no file. Raises `DeclaredHostsError`."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_given_text(path)
     except FileNotFoundError:
         return {}
     except (OSError, UnicodeDecodeError) as error:

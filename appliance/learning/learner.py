@@ -95,6 +95,10 @@ class _Learner:
                 kept.append(replace(again, alarms=count, widened=why))
             else:
                 left_out.append(replace(candidate, alarms=count))
+        if not kept:
+            raise LearningError(
+                "nothing in these recordings holds often enough to propose it: record for longer"
+            )
         rows = list(specifications(kept, known))
         names = {candidate.key: name for name, _, group in rows for candidate in group}
         text = "\n".join([self._head(known, kept, left_out), *(row[1] for row in rows)])
@@ -166,7 +170,7 @@ class _Learner:
         found: Counter[tuple[str, str, str, int | None]] = Counter()
         groups = {name: group for name, _, group in rows}
         text = "\n".join(row[1] for row in rows)
-        for part in self._held_out:
+        for part in self._held_out if rows else ():
             monitors = MonitorSet.load({"learnt.rv": text}, self._definitions)
             monitors.start(part.began, frozenset(part.topics))
             for topic, time, data in self._messages(part):

@@ -62,13 +62,18 @@ class Part:
 
 
 def split(recordings: Sequence[Recording], held_out: float) -> tuple[list[Part], list[Part]]:
-    """What is learnt from, and about this share to test it: whole recordings, spread evenly; of one alone its end."""
+    """Return what is learnt from, and about this share to test it: whole recordings, spread evenly; of one its end.
+
+    Nothing is held out of one recording that is too short to have an end.
+    """
     parts = [Part(recording, recording.began, recording.ended) for recording in recordings]
     if held_out <= 0:
         return parts, []
     if len(parts) == 1:
         only = parts[0]
         cut = only.ended - int((only.ended - only.began) * held_out)
+        if cut == only.ended:
+            return parts, []
         return [Part(only.whole, only.began, cut)], [Part(only.whole, cut + 1, only.ended)]
     count = min(max(round(len(parts) * held_out), 1), len(parts) - 1)
     chosen = {int((number + 0.5) * len(parts) / count) for number in range(count)}

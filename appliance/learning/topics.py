@@ -42,8 +42,8 @@ class Rhythm:
 
     @property
     def period(self) -> float:
-        """The usual time between two messages in seconds; 0 where it is not known."""
-        return statistics.median(self._some) / 10**9 if self._some else 0.0
+        """The usual time between two messages in seconds; a nanosecond where it is not known, or is none."""
+        return max(statistics.median(self._some) if self._some else 0.0, 1.0) / 10**9
 
     @property
     def interval(self) -> float:

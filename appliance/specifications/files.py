@@ -12,6 +12,7 @@ import msgspec
 
 from appliance import late
 from appliance.channel import messages
+from appliance.given_files import read_given_text
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.ros.message_view import read_fields
@@ -193,6 +194,6 @@ def signatures_of(paths: Mapping[str, Path]) -> dict[str, str]:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8-sig")
+        return read_given_text(path, "utf-8-sig")
     except UnicodeDecodeError as error:
         raise SpecificationsRefusedError([f"{path}: is not UTF-8 text: {error.reason}"]) from error

@@ -12,6 +12,7 @@ from appliance.channel.answers.hosts import EnrolmentToken, KitParts
 from appliance.cli.host.output import Output, usage_error
 from appliance.cli.output import moment, say_json
 from appliance.cli.target import Appliance
+from appliance.given_files import open_given
 from appliance.ipsec.kit import archive
 from appliance.ipsec.requests import make_key, signing_request
 
@@ -110,7 +111,7 @@ def write_script(output: Output, made: EnrolmentToken, *, as_json: bool) -> None
 
 def _read_request(path: Path) -> str:
     try:
-        with path.open("rb") as file:
+        with open_given(path) as file:
             return file.read(_LONGEST_REQUEST + 1).decode("ascii")
     except OSError as error:
         raise usage_error(f"--csr {path}: {error.strerror}") from None

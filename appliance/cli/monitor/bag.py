@@ -12,19 +12,23 @@ from pathlib import Path
 from types import TracebackType
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag1 import Reader, ReaderError, Writer
+from rosbags.rosbag1 import ReaderError, Writer
 from rosbags.rosbag1.writer import WriterError
 
+from appliance.cli.monitor.bounded_bag import BoundedReader
 from appliance.cli.monitor.input import usage_error
-from appliance.ros.definitions import Definitions
+from appliance.ros.definitions import Definitions, MessageDefinition
 from appliance.ros.errors import DefinitionError
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.happened import Sender
 from appliance.rosmop.outcomes import Outcome, Verdict, bound
 
 _OWN = "/rosrv"  # the appliance: what monitors publish is not given to monitors
-# What `rosbags` raises for a damaged bag, beside an error of its own.
-_DAMAGE = (ReaderError, ValueError, LookupError, AssertionError, struct.error, MemoryError, OverflowError)
+# What `rosbags` and what unpacks for it raise for a damaged bag, beside an error of their own.
+_DAMAGE = (
+    ReaderError, ValueError, LookupError, AssertionError, struct.error, MemoryError, OverflowError, OSError,
+    EOFError, RuntimeError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -42,26 +46,25 @@ def ros_type(name: str) -> str:
     return f"{package}/{kind.rpartition('/')[2]}"
 
 
-def open_bag(path: Path) -> Reader:
+def open_bag(path: Path) -> BoundedReader:
     """An open recording, or an end with the reason."""
     try:
-        reader = Reader(path)
+        reader = BoundedReader(path)
         reader.open()
-    except (*_DAMAGE, OSError) as error:
+    except _DAMAGE as error:
         mend = (
             "; it takes a bag of ROS 1, and `rosbag reindex` mends one that was cut off"
             if path.is_file()
             else ""
         )
         raise usage_error(f"cannot read the bag {path}: {_said_by(error).rstrip('.')}{mend}") from error
-    _order_by_place(reader)
     return reader
 
 
-def messages_of(reader: Reader) -> Iterator[tuple[Connection, int, bytes]]:
+def messages_of(reader: BoundedReader) -> Iterator[tuple[Connection, int, bytes]]:
     """Connection, nanoseconds and bytes of every message, in the order of the bag, or an end with the reason."""
     try:
-        yield from reader.messages()
+        yield from reader.in_order()
     except _DAMAGE as error:
         raise usage_error(f"the bag {reader.path} is damaged: {_said_by(error)}") from error
 
@@ -70,28 +73,17 @@ def _said_by(error: Exception) -> str:
     return str(error) or type(error).__name__
 
 
-def _order_by_place(reader: Reader) -> None:
-    """Have messages with equal times come in the order in which they stand in the file.
-
-    The reader merges an index for each connection, by time only; so it is given one index with everything, as if of the
-    first connection. Whose a message is stands in its own record.
-    """
-    everything = [entry for entries in reader.indexes.values() for entry in entries]
-    everything.sort(key=lambda entry: (entry.time, entry.chunk_pos, entry.offset))
-    for number, connection in enumerate(reader.connections):
-        reader.indexes[connection.id] = everything if number == 0 else []
-
-
-def definitions_of(reader: Reader) -> Definitions:
-    """The definitions that the recorded publishers sent; those that cannot be read are left out."""
-    found = Definitions({})
-    for connection in reader.connections:
+def definitions_of(reader: BoundedReader) -> Definitions:
+    """Return the definitions that the recorded publishers sent; those that cannot be read are left out."""
+    found: dict[str, MessageDefinition] = {}
+    sent = dict.fromkeys((ros_type(row.msgtype), row.msgdef.data) for row in reader.connections)
+    for name, text in sent:
         try:
-            name = ros_type(connection.msgtype)
-            found = found.extended(Definitions.from_full_text(name, connection.msgdef.data))
+            own = Definitions.from_full_text(name, text)
         except DefinitionError:
             continue
-    return found
+        found |= {kind: own.message(kind) for kind in own.message_types}
+    return Definitions(found)
 
 
 class Recorded:
@@ -178,7 +170,7 @@ class Recording:
 
 def replay(
     monitors: MonitorSet,
-    reader: Reader,
+    reader: BoundedReader,
     output: Recording | None,
     topics: Sequence[str] = ("*",),
     span: tuple[int, int] = (0, 1 << 63),
@@ -277,7 +269,7 @@ def _fits(connection: Connection, topics: Sequence[str]) -> bool:
     return any(fnmatchcase(connection.topic, pattern) for pattern in topics)
 
 
-def refusals(monitors: MonitorSet, reader: Reader, topics: Sequence[str] = ("*",)) -> list[str]:
+def refusals(monitors: MonitorSet, reader: BoundedReader, topics: Sequence[str] = ("*",)) -> list[str]:
     """What to tell about topics that are refused, of those that fit one of the patterns."""
     found = [_refusal(monitors, connection) for connection in reader.connections if _fits(connection, topics)]
     return sorted({text for text in found if text is not None})

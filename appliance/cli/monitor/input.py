@@ -1,6 +1,7 @@
 """What the monitor verbs read: specifications, and folders of message definitions."""
 
 import functools
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Annotated
 import typer
 
 from appliance.cli import output
+from appliance.given_files import read_given, read_given_text
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.ros.standard import standard_definitions
@@ -41,7 +43,7 @@ def read_specifications(files: Sequence[Path]) -> dict[str, str]:
     texts: dict[str, str] = {}
     for file in sorted(files, key=lambda path: (path.name, str(path))):
         try:
-            raw = file.read_bytes()
+            raw = read_given(file)
         except OSError as error:
             raise usage_error(f"cannot read {file}: {error.strerror}") from error
         texts[str(file)] = raw.decode("utf-8-sig", "surrogateescape")
@@ -73,7 +75,7 @@ def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
     named: dict[str, Path] = {}
     for file in files:
         other = named.setdefault(file.name, file)
-        if other.resolve() != file.resolve():
+        if os.path.realpath(other) != os.path.realpath(file):
             raise usage_error(
                 f"{other} and {file} have one name, and the appliance knows specifications by the names of their "
                 "files: load them under different names"
@@ -121,7 +123,7 @@ def _definition_texts(folder: Path) -> tuple[dict[str, str], dict[str, str]]:
 
 def _text_of(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8", errors="surrogateescape")
+        return read_given_text(path, errors="surrogateescape")
     except OSError as error:
         raise usage_error(f"cannot read {path}: {error.strerror}") from error
 

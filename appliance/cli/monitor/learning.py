@@ -1,5 +1,6 @@
 """`rosrv monitor learn`: specifications out of recordings of a robot that behaves."""
 
+import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -11,6 +12,7 @@ from appliance.cli.monitor.bag import Recorded
 from appliance.cli.monitor.input import BESIDE, Bags, usage_error
 from appliance.cli.output import Json, counted, say, say_json, write_told
 from appliance.cli.progress import progress
+from appliance.given_files import read_given_text
 from appliance.learning.learner import LearningError, Learnt, learn
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
@@ -41,7 +43,7 @@ def learn_monitors(
     """
     if out is not None and out.exists():
         raise usage_error(f"{out} is there already")
-    if len({bag.resolve() for bag in bags}) < len(bags):
+    if len({os.path.realpath(bag) for bag in bags}) < len(bags):
         raise usage_error("a recording is given twice: it would be its own test")
     recordings = [Recorded(bag, topics or ["*"]) for bag in bags]
     recorded = Definitions({})
@@ -95,7 +97,7 @@ def _write(out: Path, learnt: Learnt, recorded: Definitions) -> None:
     for name in _needed(learnt, recorded):
         path = out.parent / BESIDE / f"{name}.msg"
         text = recorded.message(name).text
-        if path.exists() and path.read_text(encoding="utf-8", errors="surrogateescape") != text:
+        if path.exists() and read_given_text(path, errors="surrogateescape") != text:
             raise usage_error(f"{path} is there already and is another than the recordings have")
         files[path] = text
     try:

@@ -9,10 +9,10 @@ from typing import Annotated, NamedTuple
 
 import typer
 from rich.table import Column
-from rosbags.rosbag1 import Reader
 
 from appliance.channel import admin
 from appliance.cli.monitor.bag import Replayed, definitions_of, open_bag, refusals, replay
+from appliance.cli.monitor.bounded_bag import BoundedReader
 from appliance.cli.monitor.input import Folders, read_definitions, read_specifications, usage_error
 from appliance.cli.monitor.output import BILLION, because
 from appliance.cli.monitor.recorder import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
@@ -195,7 +195,7 @@ class _Report:
             else:
                 say(f"{name} is not complete: {why_not}", "yellow")
 
-    def of(self, monitors: MonitorSet, reader: Reader, piece: Piece, topics: Sequence[str]) -> int:
+    def of(self, monitors: MonitorSet, reader: BoundedReader, piece: Piece, topics: Sequence[str]) -> int:
         """A recording; how many messages there were."""
         given = 0
         with progress("replaying", lambda: reader.message_count, shares_screen=True) as told:

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rosbags.rosbag1 import Reader
 
 from appliance.cli.monitor.bag import Recording, definitions_of, open_bag, refusals, replay
+from appliance.cli.monitor.bounded_bag import BoundedReader
 from appliance.cli.monitor.input import Files, Folders, read_definitions, read_specifications, usage_error
 from appliance.cli.monitor.output import explained, lines, record, say_finding
 from appliance.cli.output import Json, counted, printable, refused, say, say_json
@@ -116,7 +116,9 @@ def _load(files: list[Path], folders: list[Path], recorded: Definitions | None =
     return MonitorSet.load(read_specifications(files), definitions)
 
 
-def _report(monitors: MonitorSet, reader: Reader, recording: Recording | None, *, as_json: bool) -> None:
+def _report(
+    monitors: MonitorSet, reader: BoundedReader, recording: Recording | None, *, as_json: bool
+) -> None:
     counts = {"passed": 0, "changed": 0, "dropped": 0}
     verdicts = faults = 0
     with progress("replaying", lambda: reader.message_count, shares_screen=True) as told:

@@ -15,6 +15,7 @@ from appliance.cli.output import printable, say, say_json, usage_error, write_to
 from appliance.cli.policy.in_force import say_loaded
 from appliance.cli.target import Appliance, speaks
 from appliance.cli.trials import ConfirmWithin, seconds_within
+from appliance.given_files import read_given
 
 
 @speaks
@@ -99,7 +100,7 @@ def grant(
 
 def _with_ends_of(file: Path, text: str) -> bytes:
     """The text with lines that end as those of the file that is there; what is in force has none but LF."""
-    ends = b"\r\n" if file.is_file() and b"\r\n" in file.read_bytes() else b"\n"
+    ends = b"\r\n" if file.is_file() and b"\r\n" in read_given(file) else b"\n"
     return text.encode().replace(b"\n", ends)
 
 

@@ -17,6 +17,7 @@ from appliance.channel.admin import RegistrationsWanted
 from appliance.cli import output
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.target import Appliance
+from appliance.given_files import read_given_text
 from appliance.policy.actions import BadWordError, find_hosts
 from appliance.policy.hosts import Network, canonical_address, canonical_network
 from appliance.policy.judgement import Known
@@ -37,7 +38,7 @@ Enrolled = Annotated[
 def read_text(file: Path) -> str:
     """The text of a file; what is no UTF-8 becomes U+FFFD, which no policy may contain outside comments."""
     try:
-        return file.read_text(encoding="utf-8", errors="replace")
+        return read_given_text(file, errors="replace")
     except OSError as error:
         raise usage_error(f"cannot read {file}: {error.strerror}") from error
 

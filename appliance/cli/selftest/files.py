@@ -14,6 +14,7 @@ from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.cli.selftest.findings import Found, fail, ok, skip, told, warn
 from appliance.config import Settings
+from appliance.given_files import read_given, read_given_text
 from appliance.hosts.hosts_file import DeclaredHostsError, read_declared
 from appliance.policy.cases import run_cases
 from appliance.policy.findings import PolicyError
@@ -39,7 +40,7 @@ def files(settings: Settings) -> Iterator[Found]:
 
 def _policy(file: Path, site_keys: Sequence[str]) -> Iterator[Found]:
     try:
-        text = file.read_text(encoding="utf-8")
+        text = read_given_text(file)
         policy = judge(text, str(file), Known(site_keys=site_keys), read_signature(file)).policy
     except OSError as error:
         if isinstance(error, FileNotFoundError) and file == Settings().policy.absolute():
@@ -68,7 +69,7 @@ def _policy(file: Path, site_keys: Sequence[str]) -> Iterator[Found]:
 def _cases(file: Path, policy: Policy) -> Iterator[Found]:
     beside = file.with_name(file.name + ".tests.yaml")
     try:
-        results = run_cases(policy, beside.read_text(encoding="utf-8"), str(beside))
+        results = run_cases(policy, read_given_text(beside), str(beside))
     except FileNotFoundError:
         return
     except (OSError, UnicodeDecodeError, PolicyError) as error:
@@ -200,7 +201,7 @@ def _clock(state: Path) -> Iterator[Found]:
 def _certificates(state: Path) -> Iterator[Found]:
     for path in (state / "api" / "certificate.pem", state / "signer" / "ca.pem"):
         try:
-            certificate = x509.load_pem_x509_certificate(path.read_bytes())
+            certificate = x509.load_pem_x509_certificate(read_given(path))
         except (FileNotFoundError, PermissionError):
             continue
         except ValueError:

@@ -4,6 +4,7 @@ import ast
 import hashlib
 import itertools
 import json
+import os
 import random
 import re
 import shutil
@@ -353,6 +354,87 @@ def test_what_is_no_file_is_named(bundle: Path, tmp_path: Path, reviewer: Review
     assert "'policies/7.ini': is missing" in reviewer.said
 
 
+@pytest.mark.parametrize("name", ["manifest.json", "proof.json", "records.ndjson", "audit.pub"])
+def test_a_pipe_keeps_nobody_waiting(bundle: Path, tmp_path: Path, reviewer: Reviewer, name: str) -> None:
+    """A named pipe is opened nowhere: in the place of any member, of the bundle, of the key, of the checkpoints."""
+    folder = tmp_path / "unpacked"
+    shutil.unpack_archive(bundle, folder)
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    assert verify.main([str(folder)]) == (2 if name == "audit.pub" else 1)
+    pipe = folder / name
+    assert verify.main([str(pipe)]) == 2
+    assert verify.main([str(bundle), "--key", str(pipe)]) == 2
+    assert reviewer.status(bundle, "--checkpoints", pipe) == 2
+    assert "is not a regular file" in reviewer.said
+
+
+def test_an_empty_file_is_no_bundle(bundle: Path, tmp_path: Path, reviewer: Reviewer) -> None:
+    """An empty bundle, folder or key is not right, with a reason; of an empty file of checkpoints none is kept."""
+    empty = tmp_path / "empty"
+    empty.touch()
+    (tmp_path / "folder").mkdir()
+    assert (reviewer.status(empty), reviewer.status(tmp_path / "folder")) == (2, 1)
+    assert verify.main([str(bundle), "--key", str(empty)]) == 2
+    assert reviewer.status(bundle, "--checkpoints", empty) == 0
+
+
+def test_a_bomb_is_not_unpacked(
+    bundle: Path, tmp_path: Path, reviewer: Reviewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A ZIP file that unpacks to more than a bundle of its size can, or whose members overlap, is not read."""
+    monkeypatch.setattr(verify, "UNPACKED", 1 << 20)
+    place, many = tmp_path / "x.zip", bytes(1 << 25)
+    with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("policies/9.ini", many)
+        large = archive.filelist[0]
+    with monkeypatch.context() as without, zipfile.ZipFile(tmp_path / "y.zip", "w") as archive:
+        without.delattr(zipfile.ZipFile, "open")
+        assert reviewer.status(place) == 2
+        assert "unpacks to more than" in reviewer.said
+        large.file_size, large.compress_size = 100, 10_000
+        archive.filelist += [large] * 3
+        archive._didModify = True  # type: ignore[attr-defined]  # a directory whose entries have one place
+        archive.close()
+        assert reviewer.status(tmp_path / "y.zip") == 2
+        assert "overlap" in reviewer.said
+
+
+@pytest.mark.parametrize("runs", [[[1, 5], [3, 9]], [[5, 9], [1, 3]], [[4, 3]], [[1, 3], [4, 9]]])
+def test_runs_are_in_their_order(bundle: Path, tmp_path: Path, reviewer: Reviewer, runs: list[Any]) -> None:
+    """Runs that overlap, touch or go back are refused: a record is looked up in one step for each doubling of them."""
+    members = members_of(bundle)
+    manifest = {**json.loads(members["manifest.json"]), "runs": runs}
+    members["manifest.json"] = json.dumps(manifest).encode()
+    assert reviewer.status(written(members, tmp_path / "x.zip")) == 1
+    assert "the runs of manifest.json are not in their order" in reviewer.said
+
+
+def test_many_runs_take_few_steps() -> None:
+    """Whether a record is in a run takes as many steps as the number of runs has bits."""
+    asked = 0
+
+    class Counted(int):
+        def __lt__(self, other: int) -> bool:
+            nonlocal asked
+            asked += 1
+            return int(self) < other
+
+    runs = verify.Runs([[3 * number + 1, 3 * number + 2] for number in range(30_000)])
+    runs.last = [Counted(last) for last in runs.last]
+    assert [runs.meet(number, number) for number in (0, 1, 2, 3, 4, 90_000)] == [
+        False,
+        True,
+        True,
+        False,
+        True,
+        False,
+    ]
+    assert runs.meet(0, 1)
+    assert asked <= 7 * 16
+    assert runs.missing == 60_000
+
+
 def resealed(members: Members) -> Members:
     """What a forger makes who can hash: the manifest has the hashes of what is there."""
     manifest = json.loads(members["manifest.json"])
@@ -603,6 +685,6 @@ def test_the_verifier_is_a_program_for_python_3_8() -> None:
     imported = {name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names}
     imported |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert imported == {
-        "__future__", "argparse", "collections", "hashlib", "json", "pathlib", "struct", "subprocess", "sys",
-        "tempfile", "typing", "zipfile", "zlib",
+        "__future__", "argparse", "bisect", "collections", "hashlib", "json", "os", "pathlib", "stat", "struct",
+        "subprocess", "sys", "tempfile", "typing", "zipfile", "zlib",
     }  # fmt: skip

@@ -1,0 +1,115 @@
+"""Reads a bag of ROS 1 in a time that is linear in its size, whatever somebody wrote into it.
+
+`rosbags` believes what a bag says of itself. Here
+
+1. no more than `LARGEST_CHUNK` bytes are read at once, and a chunk unpacks to no more;
+2. what is unpacked and what is read of it, each as often as it is, has no more than `PER_BYTE` bytes for each byte of
+   the bag, and one chunk more: entries of the index can mean one message, and have two chunks unpacked in turn;
+3. the index has no more entries than the bag has room for: several chunks cannot share one.
+"""
+
+import bz2
+from collections.abc import Callable, Iterator
+from io import SEEK_CUR, BufferedReader, BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import lz4.frame
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader, ReaderError
+from rosbags.rosbag1.reader import Header, IndexData, RecordType, decompressors, read_bytes, read_uint32
+
+from appliance.given_files import open_given
+
+LARGEST_CHUNK = 256 << 20
+PER_BYTE = 256
+_LONGEST_LINE = 64
+_HEADER, _ENTRY = 55, 12  # bytes of an index of one connection in one chunk, and of a message in it
+_UNPACKERS: dict[Callable[[bytes], bytes], Callable[[], Any]] = {
+    decompressors["bz2"]: bz2.BZ2Decompressor,
+    decompressors["lz4"]: lz4.frame.LZ4FrameDecompressor,
+}
+
+
+class _BoundedFile(BufferedReader):
+    """A file of which only so much is read at once."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return so many bytes."""
+        if size is None or not 0 <= size <= LARGEST_CHUNK:
+            raise ReaderError(f"it has a part of more than {LARGEST_CHUNK} bytes.")
+        return super().read(size)
+
+    def readline(self, _size: int | None = -1, /) -> bytes:
+        """Return the line that names the format."""
+        return super().readline(_LONGEST_LINE)
+
+
+class _BagPath(type(Path())):  # type: ignore[misc]  what Path() makes on this system
+    """The path of a bag, which is a regular file."""
+
+    def open(self, *_mode: object) -> BinaryIO:  # type: ignore[override]
+        """Open it to be read."""
+        return _BoundedFile(open_given(self).detach())
+
+
+class BoundedReader(Reader):
+    """The reader of `rosbags`; beyond a bound it raises `ReaderError`."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(_BagPath(path))
+        self._size = path.stat().st_size
+        self._left = PER_BYTE * self._size + LARGEST_CHUNK
+        self._entries = 0
+
+    @property
+    def message_count(self) -> int:
+        """The number of messages in the index."""
+        return self._entries
+
+    def read_index_data(self, pos: int, indexes: dict[int, list[IndexData]]) -> None:
+        """Read the index of one connection in one chunk."""
+        assert self.bio is not None  # noqa: S101  the reader is open
+        begin = self.bio.tell()
+        super().read_index_data(pos, indexes)
+        self._entries += (self.bio.tell() - begin - _HEADER) // _ENTRY
+        if self._entries * _ENTRY > self._size:
+            raise ReaderError("its chunks share an index.")
+
+    def in_order(self) -> Iterator[tuple[Connection, int, bytes]]:
+        """Yield connection, nanoseconds and bytes of every message: by time, then by its place in the file."""
+        connections = {connection.id: connection for connection in self.connections}
+        everything = [entry for entries in self.indexes.values() for entry in entries]
+        everything.sort(key=lambda entry: (entry.time, entry.chunk_pos, entry.offset))
+        here, content = -1, BytesIO()
+        for entry in everything:
+            if entry.chunk_pos != here:
+                here, content = entry.chunk_pos, BytesIO(self._content(entry.chunk_pos))
+            content.seek(entry.offset)
+            while (header := Header.read(content)).get_uint8("op") == RecordType.CONNECTION:
+                self._charge(content.seek(read_uint32(content), SEEK_CUR) - entry.offset)
+            if header.get_uint8("op") != RecordType.MSGDATA or header.get_time("time") != entry.time:
+                raise ReaderError("its index does not fit its messages.")
+            data = read_bytes(content, read_uint32(content))
+            self._charge(content.tell() - entry.offset)
+            yield connections[header.get_uint32("conn")], entry.time, data
+
+    def _content(self, place: int) -> bytes:
+        """Return what a chunk unpacks to."""
+        assert self.bio is not None  # noqa: S101  the reader is open
+        chunk = self.chunks[place]
+        self.bio.seek(chunk.datapos)
+        data = read_bytes(self.bio, chunk.datasize)
+        if chunk.decompressor in _UNPACKERS:
+            unpacker = _UNPACKERS[chunk.decompressor]()
+            data = unpacker.decompress(data, LARGEST_CHUNK)
+            if not unpacker.eof:
+                more = f"a chunk unpacks to more than {LARGEST_CHUNK} bytes."
+                raise ReaderError("a chunk is cut off." if unpacker.needs_input else more)
+        self._charge(len(data))
+        return data
+
+    def _charge(self, count: int) -> None:
+        self._left -= count
+        if self._left < 0:
+            raise ReaderError(f"to read it takes more than {PER_BYTE} times its size.")

@@ -1,0 +1,66 @@
+"""Reads files that a person names, or that are in a folder a person names: regular files, and never without a bound.
+
+A named pipe keeps its reader waiting for ever, a device can have no end, and a file may be larger than the memory. Each
+is an `OSError` here, whose text says what it is, so that it gets to the person as one that is missing does.
+"""
+
+import errno
+import io
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+LONGEST = 64 << 20
+"""Bytes of a text, unless its reader says how many."""
+
+_NULL = os.makedev(1, 3)  # /dev/null: an empty file
+_KINDS = {
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFDIR: "a folder",
+    stat.S_IFSOCK: "a socket",
+}
+
+
+def open_given(path: Path) -> BinaryIO:
+    """Open a regular file, or the pipe that a shell made of `<(command)` or `command |`. Raises `OSError`."""
+    descriptor = os.open(os.fspath(path), os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    try:
+        about = os.fstat(descriptor)
+        kind = stat.S_IFMT(about.st_mode)
+        if kind == stat.S_IFIFO and str(Path(f"/proc/self/fd/{descriptor}").readlink()).startswith("pipe:"):
+            os.set_blocking(descriptor, True)
+        elif kind != stat.S_IFREG and about.st_rdev != _NULL:
+            what = f"not a regular file: it is {_KINDS.get(kind, 'something else')}"
+            raise OSError(errno.EINVAL, what, str(path))
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return os.fdopen(descriptor, "rb")
+
+
+def read_given(path: Path, longest: int = LONGEST) -> bytes:
+    """Return the bytes of such a file, `longest` at most. Raises `OSError`."""
+    with open_given(path) as file:
+        data = file.read(longest + 1)
+    if len(data) > longest:
+        raise OSError(errno.EFBIG, f"longer than {longest} bytes", str(path))
+    return data
+
+
+def read_given_text(path: Path, encoding: str = "utf-8", errors: str = "strict") -> str:
+    """Return the text of such a file, its lines ended by LF. Raises `OSError` and `UnicodeDecodeError`."""
+    with io.TextIOWrapper(io.BytesIO(read_given(path)), encoding, errors) as text:
+        return text.read()
+
+
+def lines_given(path: Path, longest: int) -> Iterator[bytes]:
+    """Yield the lines of such a file, each `longest` bytes at most. Raises `OSError`."""
+    with open_given(path) as file:
+        for line in iter(lambda: file.readline(longest + 1), b""):
+            if len(line) > longest:
+                raise OSError(errno.EFBIG, f"has a line of more than {longest} bytes", str(path))
+            yield line

@@ -1,0 +1,154 @@
+"""Bags that somebody made to be costly: to read one takes a time that is linear in its size, and a bounded memory."""
+
+import bz2
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import lz4.frame
+import pytest
+import typer
+from rosbags.rosbag1 import Writer
+
+from appliance.cli.monitor import bounded_bag
+from appliance.cli.monitor.bag import Recorded
+from tests.unit.cli.monitor.test_verbs import invoke, make_bag, number
+
+Part = tuple[dict[str, bytes], bytes]
+U32, U64 = struct.Struct("<I").pack, struct.Struct("<Q").pack
+CONNECTION: Part = (
+    {"op": b"\x07", "conn": U32(0), "topic": b"/t"},
+    b"".join(
+        U32(len(field)) + field
+        for field in (b"topic=/t", b"type=std_msgs/String", b"md5sum=992ce8a1687cec8c8bd883ec73ca41d1",
+                      b"message_definition=string data\n")
+    ),
+)  # fmt: skip
+
+
+def record(fields: dict[str, bytes], data: bytes) -> bytes:
+    """One record of a bag."""
+    header = b"".join(
+        U32(len(name) + 1 + len(value)) + name.encode() + b"=" + value for name, value in fields.items()
+    )
+    return U32(len(header)) + header + U32(len(data)) + data
+
+
+def bag(place: Path, chunks: list[tuple[str, bytes, list[tuple[int, int]]]]) -> Path:
+    """Write a bag with these chunks: how each is packed, its packed bytes, seconds and offset of each message."""
+    out = bytearray(b"#ROSBAG V2.0\n" + bytes(4096))
+    infos = b""
+    for compression, packed, entries in chunks:
+        infos += record(
+            {"op": b"\x06", "ver": U32(1), "chunk_pos": U64(len(out)), "start_time": U64(entries[0][0]),
+             "end_time": U64(entries[-1][0]), "count": U32(1)}, U32(0) + U32(len(entries)),
+        )  # fmt: skip
+        out += record({"op": b"\x05", "compression": compression.encode(), "size": U32(1)}, packed)
+        index = b"".join(U32(seconds) + U32(0) + U32(offset) for seconds, offset in entries)
+        out += record({"op": b"\x04", "ver": U32(1), "conn": U32(0), "count": U32(len(entries))}, index)
+    head = record(
+        {"op": b"\x03", "index_pos": U64(len(out)), "conn_count": U32(1), "chunk_count": U32(len(chunks))},
+        b"",
+    )
+    out[13 : 13 + len(head)] = head
+    place.write_bytes(bytes(out) + record(*CONNECTION) + infos)
+    return place
+
+
+def message(seconds: int, text: bytes) -> bytes:
+    """The record of a message."""
+    return record({"op": b"\x02", "conn": U32(0), "time": U64(seconds)}, U32(len(text)) + text)
+
+
+def refusal(place: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """What is said of a bag that is refused."""
+    with pytest.raises(typer.Exit) as ended:
+        list(Recorded(place, ["*"]).messages())
+    assert ended.value.exit_code == 2
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "pack"), [("bz2", bz2.compress), ("lz4", lz4.frame.compress), ("none", bytes)]
+)
+def test_a_chunk_is_unpacked_under_a_bound(
+    name: str, pack: Callable[[bytes], bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """A chunk as large as the bound is read; of one that unpacks to more no more is unpacked."""
+    one = message(1, b"x" * 1000)
+    place = bag(tmp_path / "x.bag", [(name, pack(one), [(1, 0)])])
+    monkeypatch.setattr(bounded_bag, "LARGEST_CHUNK", len(one))
+    assert [data for _topic, _time, data in Recorded(place, ["*"]).messages()] == [U32(1000) + b"x" * 1000]
+    place = bag(tmp_path / "x.bag", [(name, pack(message(1, bytes(2000))), [(1, 0)])])
+    assert f"more than {len(one)} bytes" in refusal(place, capsys)
+
+
+@pytest.mark.parametrize(("name", "pack"), [("bz2", bz2.compress), ("lz4", lz4.frame.compress)])
+def test_a_damaged_chunk_is_said(
+    name: str, pack: Callable[[bytes], bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A chunk that is cut off or is not packed at all ends with the reason, and so does one of no bytes."""
+    packed = pack(message(1, b"x" * 1000))
+    for wrong in (packed[:-4], b"?" * 50, b"", packed[:20] + b"?" * 20 + packed[40:]):
+        assert "is damaged" in refusal(bag(tmp_path / "x.bag", [(name, wrong, [(1, 0)])]), capsys)
+
+
+def test_what_is_read_again_and_again_is_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Chunks in turn, entries that mean one message, and connections in front of each: all has one bound."""
+    monkeypatch.setattr(bounded_bag, "LARGEST_CHUNK", 1 << 20)
+    monkeypatch.setattr(bounded_bag, "PER_BYTE", 4)
+    large = bz2.compress(message(0, b"") * 1 + bytes(1 << 17))
+    turns = [("bz2", large, [(0, 0)] * 40), ("bz2", large, [(0, 0)] * 40)]
+    assert Recorded(bag(tmp_path / "x.bag", turns), ["*"]).message_count == 80
+    one = bag(tmp_path / "one.bag", [("none", message(1, bytes(1 << 17)), [(1, 0)] * 100)])
+    assert "more than 4 times its size" in refusal(one, capsys)
+    chain = record(*CONNECTION)
+    offsets = [(1, number * len(chain)) for number in range(500)]
+    links = bag(tmp_path / "links.bag", [("none", chain * 500 + message(1, b""), offsets)])
+    assert "more than 4 times its size" in refusal(links, capsys)
+    between = [
+        ("bz2", bz2.compress(message(time, b"") * 2 + bytes(1 << 17)), [(time, 0)]) for time in range(20)
+    ]
+    twice = [(name, packed, [entries[0], (entries[0][0] + 1, 0)]) for name, packed, entries in between]
+    assert "damaged" in refusal(bag(tmp_path / "turns.bag", twice), capsys)
+
+
+def test_chunks_cannot_share_an_index(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A hundred chunks in the index that are one chunk in the file: its messages are not counted a hundred times."""
+    place = bag(tmp_path / "x.bag", [("none", message(1, b""), [(1, 0)] * 1000)])
+    data = place.read_bytes()
+    info = data[data.index(record(*CONNECTION)) + len(record(*CONNECTION)) :]
+    place.write_bytes(data.replace(b"chunk_count=" + U32(1), b"chunk_count=" + U32(100)) + info * 99)
+    assert "share an index" in refusal(place, capsys)
+
+
+@pytest.mark.parametrize("times", [[1000.0], [1000.0, 1000.0], [1000.0, 1000.000000001], [1000.0, 1001.0]])
+@pytest.mark.parametrize("share", ["0", "0.3", "0.9"])
+def test_a_short_recording_is_learnt_from(times: list[float], share: str, tmp_path: Path) -> None:
+    """One message, two at one time, two far apart: something is proposed, or it is said that it is too little."""
+    place = make_bag(tmp_path / "x.bag", [("/t", "std_msgs/Int32", time, number(1)) for time in times])
+    for arguments in (
+        ["learn", "--bag", place, "--hold-out", share],
+        ["learn", "--bag", place, "--bag", _copy(place)],
+    ):
+        result = invoke(*arguments)
+        assert result.exit_code in (0, 2), result.exception
+
+
+def _copy(place: Path) -> Path:
+    other = place.with_name("other.bag")
+    other.write_bytes(place.read_bytes())
+    return other
+
+
+def test_an_empty_recording_is_refused(tmp_path: Path) -> None:
+    """A bag without a message: nothing can be learnt, and nothing was dropped."""
+    with Writer(tmp_path / "x.bag"):
+        pass
+    assert invoke("learn", "--bag", tmp_path / "x.bag").exit_code == 2
+    specification = tmp_path / "m.rv"
+    specification.write_text("m() { event e() /t std_msgs/Int32 '{}' {} ere: e @match {} }")
+    assert invoke("run", specification, "--bag", tmp_path / "x.bag").exit_code == 0

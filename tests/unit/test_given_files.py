@@ -1,0 +1,122 @@
+"""A file that a person names is a regular one, read under a bound; what it cannot be is said in words."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from appliance.cli import main
+from appliance.given_files import lines_given, read_given, read_given_text
+
+POLICY = "[Nodes]\ndefault = *\n"
+SPECIFICATION = "m() { event e() /t std_msgs/Int32 '{}' {} fsm: s0 [ e -> s0 ] @s0 {} }\n"
+
+# `{}` is the file that is not what it should be; the others are in order.
+VERBS = [
+    "policy check {}",
+    "policy test {}",
+    "policy test policy.ini --cases {}",
+    "policy explain {} --host 10.0.0.9 --command getPid",
+    "policy diff {} policy.ini --requests empty",
+    "policy diff policy.ini policy.ini --requests {}",
+    "monitor check {}",
+    "monitor check m.rv --msg {}",
+    "monitor run m.rv --bag {}",
+    "monitor run {} --bag empty",
+    "monitor learn --bag {}",
+    "monitor coverage m.rv --bag {}",
+    "monitor replay m.rv --bag {}",
+    "sign {} --key policy.ini",
+    "sign policy.ini --key {}",
+    "config check {}",
+    "up --config {}",
+    "audit verify --key {} --export policy.ini",
+    "audit verify --checkpoints {}",
+    "audit verify --export {} --key policy.ini",
+    "evidence verify {}",
+    "evidence verify policy.ini --key {}",
+    "evidence verify policy.ini --checkpoints {}",
+    "restore {} --state new",
+    "policy check policy.ini --api https://127.0.0.1:1 --api-ca {}",
+]
+OF_NOTHING = {"policy check empty", "policy test empty", "config check empty"}
+
+
+def folder(place: Path) -> None:
+    """Make a folder that has a named pipe where a definition would be."""
+    (place / "p").mkdir(parents=True)
+    os.mkfifo(place / "p" / "T.msg")
+
+
+def huge(place: Path) -> None:
+    """Make a file of a gigabyte that takes no room."""
+    place.touch()
+    os.truncate(place, 1 << 30)
+
+
+KINDS: dict[str, Callable[[Path], None]] = {
+    "pipe": os.mkfifo,
+    "device": lambda place: place.symlink_to("/dev/zero"),
+    "folder": folder,
+    "loop": lambda place: place.symlink_to(place),
+    "empty": Path.touch,
+    "bytes": lambda place: place.write_bytes(bytes(range(256)) * 10) and None,
+    "deep": lambda place: place.write_bytes(b"[" * 100_000) and None,
+    "huge": huge,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("verb", VERBS)
+def test_no_file_makes_a_verb_hang_or_crash(
+    verb: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever a verb is given as a file, it ends with 1 or 2 and words, or finds the file in order."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROSRV_TOKEN", "x" * 43)
+    Path("policy.ini").write_text(POLICY)
+    Path("m.rv").write_text(SPECIFICATION)
+    Path("empty").touch()
+    KINDS[kind](Path("given"))
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        ["rosrv", *verb.format("given").split(), "--state", "state"][: None if "audit" in verb else -2],
+    )
+    with pytest.raises(SystemExit) as ended:
+        main.main()
+    said = capsys.readouterr()
+    assert ended.value.code in (0, 1, 2), said.err
+    assert said.out + said.err
+    if kind in ("pipe", "device", "loop"):
+        assert ended.value.code != 0
+
+
+def test_a_pipe_of_the_shell_is_read(tmp_path: Path) -> None:
+    """`rosrv policy check <(command)` reads what the command writes: that pipe has a writer."""
+    script = (
+        "import sys; from pathlib import Path; from appliance import given_files;"
+        " print(given_files.read_given(Path(sys.argv[1])))"
+    )
+    said = subprocess.run(
+        ["bash", "-c", '"$0" -c "$1" <(printf a; printf b)', sys.executable, script],
+        capture_output=True, text=True, check=True, cwd=tmp_path,
+    ).stdout  # fmt: skip
+    assert said == "b'ab'\n"
+    assert read_given(Path("/dev/null")) == b""
+
+
+def test_what_is_too_long_is_refused(tmp_path: Path) -> None:
+    """A file, and a line of one, has as many bytes as its reader takes, or is an error that says so."""
+    file = tmp_path / "file"
+    file.write_bytes(b"abc\r\nd\n")
+    assert read_given(file, 7) == b"abc\r\nd\n"
+    assert read_given_text(file) == "abc\nd\n"
+    assert list(lines_given(file, 5)) == [b"abc\r\n", b"d\n"]
+    with pytest.raises(OSError, match="longer than 6 bytes"):
+        read_given(file, 6)
+    with pytest.raises(OSError, match="a line of more than 4 bytes"):
+        list(lines_given(file, 4))
