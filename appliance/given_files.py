@@ -10,7 +10,6 @@ import os
 import stat
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 LONGEST = 64 << 20
 """Bytes of a text, unless its reader says how many."""
@@ -25,7 +24,7 @@ _KINDS = {
 }
 
 
-def open_given(path: Path) -> BinaryIO:
+def open_given(path: Path) -> io.BufferedReader:
     """Open a regular file, or the pipe that a shell made of `<(command)` or `command |`. Raises `OSError`."""
     descriptor = os.open(os.fspath(path), os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     try:

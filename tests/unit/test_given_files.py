@@ -57,14 +57,14 @@ def huge(place: Path) -> None:
     os.truncate(place, 1 << 30)
 
 
-KINDS: dict[str, Callable[[Path], None]] = {
+KINDS: dict[str, Callable[[Path], object]] = {
     "pipe": os.mkfifo,
     "device": lambda place: place.symlink_to("/dev/zero"),
     "folder": folder,
     "loop": lambda place: place.symlink_to(place),
     "empty": Path.touch,
-    "bytes": lambda place: place.write_bytes(bytes(range(256)) * 10) and None,
-    "deep": lambda place: place.write_bytes(b"[" * 100_000) and None,
+    "bytes": lambda place: place.write_bytes(bytes(range(256)) * 10),
+    "deep": lambda place: place.write_bytes(b"[" * 100_000),
     "huge": huge,
 }
 

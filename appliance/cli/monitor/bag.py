@@ -17,8 +17,9 @@ from rosbags.rosbag1.writer import WriterError
 
 from appliance.cli.monitor.bounded_bag import BoundedReader
 from appliance.cli.monitor.input import usage_error
-from appliance.ros.definitions import Definitions, MessageDefinition
+from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
+from appliance.ros.message_text import MessageDefinition
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.happened import Sender
 from appliance.rosmop.outcomes import Outcome, Verdict, bound

@@ -11,10 +11,10 @@
 import bz2
 from collections.abc import Callable, Iterator
 from io import SEEK_CUR, BufferedReader, BytesIO
-from pathlib import Path
+from pathlib import Path, PosixPath
 from typing import Any, BinaryIO
 
-import lz4.frame
+import lz4.frame  # type: ignore[import-untyped]
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import Header, IndexData, RecordType, decompressors, read_bytes, read_uint32
@@ -45,10 +45,10 @@ class _BoundedFile(BufferedReader):
         return super().readline(_LONGEST_LINE)
 
 
-class _BagPath(type(Path())):  # type: ignore[misc]  what Path() makes on this system
+class _BagPath(PosixPath):
     """The path of a bag, which is a regular file."""
 
-    def open(self, *_mode: object) -> BinaryIO:  # type: ignore[override]
+    def open(self, *_mode: object) -> BinaryIO:  # type: ignore[override] # rosbags asks for bytes
         """Open it to be read."""
         return _BoundedFile(open_given(self).detach())
 
