@@ -358,3 +358,5 @@ def _described(recording: Recording) -> Iterator[str]:
     for topic in recording.topics:
         missed = f", {topic.missed} missed" if topic.missed else ""
         yield f"  {topic.topic}  {topic.type}  {counted(topic.messages, 'message')}, {topic.bytes} bytes{missed}"
+    for row in recording.left_out:
+        yield f"  {row.topic}  {row.type}  left out: {row.why} ({row.host})"

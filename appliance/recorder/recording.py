@@ -20,9 +20,11 @@ import msgspec
 
 from appliance.audit.output import Entry, as_json
 from appliance.audit.record import Severity
-from appliance.channel.answers.recordings import RecordedTopic, Recording, Trigger
+from appliance.channel.answers.recordings import LeftOutTopic, RecordedTopic, Recording, Trigger
 from appliance.channel.messages import RevisionsStated
 from appliance.recorder.bag import BagWriter, Message
+from appliance.recorder.never import NAMED
+from appliance.recorder.ring import LEFT_OUT
 from appliance.recorder.ring_reader import MOST_MESSAGES, Found, Place, RingReader
 from appliance.recorder.shelf import ABOUT, BAG, PROGRESS
 from appliance.ros.log_message import ERROR, INFO, TYPE, WARN, log_message
@@ -33,6 +35,7 @@ RECORDS, LOG = "/rosrv/records", "/rosrv/log"
 MOST_TRIGGERS = 200
 _CHUNK = 1 << 20
 _MOST_NAMED = 10
+_MOST_LEFT_OUT = 100
 _MOST_HEADERS = 8 << 20
 _LENGTH = struct.Struct("<I")
 _LEVELS = {Severity.WARNING: WARN, Severity.ALARM: ERROR}
@@ -73,6 +76,9 @@ class Progress(msgspec.Struct):
     """Messages of connections beyond `_MOST_HEADERS`."""
     why_not: str = ""
     """Why it ended before its time."""
+    left_out: list[LeftOutTopic] = []
+    claims: int = 0
+    """Topics that were left out because of what their publishers say."""
 
 
 def load_progress(folder: Path) -> Progress:
@@ -97,6 +103,7 @@ class RecordingInProgress:
             progress.why_not = progress.why_not or "the disk lost what was written last"
         self._numbers = {_key(header): number for number, header in enumerate(progress.connections)}
         self._headers = sum(map(_length, progress.connections))
+        self._left_out = set(progress.left_out)
         self._topics = {(row.topic, row.type, row.md5sum): row for row in progress.topics}
         places = progress.places or [{} for _ring in rings]
         self._readers = [RingReader(ring, dict(read)) for ring, read in zip(rings, places, strict=False)]
@@ -117,6 +124,9 @@ class RecordingInProgress:
 
     def _take(self, found: Found, following: dict[int, int]) -> None:
         progress, header = self.progress, found.header
+        if LEFT_OUT in header:
+            self._leave_out(header, seen=bool(found.batches))
+            return
         if found.torn and found.stream not in following and header["topic"] not in progress.torn:
             progress.torn.append(header["topic"])
         if not found.batches:
@@ -148,6 +158,16 @@ class RecordingInProgress:
                 row.bytes, waiting, size = row.bytes + size, [], 0
         progress.size = self._bag.write(waiting)
         row.bytes += size
+
+    def _leave_out(self, header: dict[str, str], *, seen: bool) -> None:
+        """Note once that this publisher's messages are not recorded, if there were any."""
+        progress = self.progress
+        row = LeftOutTopic(header["topic"], header["type"], header.get("host", ""), header[LEFT_OUT])
+        if seen and row not in self._left_out:
+            self._left_out.add(row)
+            progress.claims += row.why != NAMED
+            if len(progress.left_out) < _MOST_LEFT_OUT:
+                progress.left_out.append(row)
 
     def _connection(self, header: dict[str, str]) -> int:
         """The number of a connection: a publisher that comes again with the same header has the same."""
@@ -188,6 +208,7 @@ class RecordingInProgress:
             sha256=sha256,
             complete=not why_not,
             why_not=why_not,
+            left_out=progress.left_out,
         )
         about = msgspec.json.format(msgspec.json.encode(recording)) + b"\n"
         write_whole(self._folder / ABOUT, about, 0o640)
@@ -202,6 +223,10 @@ class RecordingInProgress:
             reasons.append(f"{missed} messages had no room (see topics)")
         if progress.unconnected:
             reasons.append(f"{progress.unconnected} messages of too many different connections")
+        if progress.claims:
+            claims = [row.topic for row in progress.left_out if row.why != NAMED][:_MOST_NAMED]
+            named = ", ".join(claims) + (" and others" if progress.claims > len(claims) else "")
+            reasons.append(f"left out because of the type that its publisher says (recorder.never): {named}")
         if progress.torn:
             named = ", ".join(progress.torn[:_MOST_NAMED]) + (
                 " and others" if progress.torn[_MOST_NAMED:] else ""

@@ -38,6 +38,10 @@ from appliance.ros.tcpros import encode_header
 SMALLEST = 1 << 20
 """No ring is smaller than so many bytes."""
 
+LEFT_OUT = "left_out"
+"""The field of a stream's header that says why its messages are not recorded; publishers' fields of that name are not
+passed on."""
+
 HEADER, DATA = 1, 2
 RECORD = struct.Struct("<IIQQQ")  # mark, frames, bytes of the frames, time, number of the first frame
 MARK, PAD = 0x0001_D00D, 0x0002_D00D
@@ -139,6 +143,9 @@ def used_at(block: int) -> int:
 
 class Stream:
     """What one connection to a publisher leaves in the ring, until it is closed."""
+
+    keeps = True
+    """Whether it keeps what it is given to write."""
 
     __slots__ = ("_chain", "_end", "_number", "_place", "_ring", "_stream", "_used", "block", "written")
 

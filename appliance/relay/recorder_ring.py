@@ -4,14 +4,15 @@ import mmap
 import os
 import time
 from collections.abc import Callable, Mapping
-from fnmatch import fnmatchcase
 
 from appliance.channel.messages import RingGiven
-from appliance.recorder.ring import RingWriter, Stream
+from appliance.recorder.never import fits, left_out_because
+from appliance.recorder.ring import LEFT_OUT, RingWriter, Stream
 from appliance.shares.table import RECORDER_MEMORY
 
 _TOPIC_SHARE = 0.25
 _STEP = 100_000_000  # nanoseconds
+_NOTHING = memoryview(b"")
 
 
 class Recorded:
@@ -25,7 +26,7 @@ class Recorded:
         bounds = RECORDER_MEMORY.bounds
         # Its pages are mapped at once: else each is, by a fault, when the first message comes to it.
         memory = mmap.mmap(descriptor, 0, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
-        self._topics, self._never = given.topics, given.never
+        self._topics, self._never, self._sums = given.topics, given.never, given.sums
         self._now, self._set = now, 0
         self._ring = RingWriter(
             memoryview(memory),
@@ -43,12 +44,29 @@ class Recorded:
             self._set += ahead
         return (judged or now) + self._set
 
-    def open(self, topic: str, host: str, header: Mapping[str, str]) -> Stream | None:
-        """Begin what a publisher says; None when that is not to be recorded, or has no room."""
-        if not _fits(self._topics, topic) or _fits(self._never, topic, header.get("type", "")):
+    def open(self, topic: str, host: str, header: Mapping[str, str]) -> "Stream | LeftOut | None":
+        """Begin to keep a publisher's messages; None when they are not to be recorded, or have no room."""
+        if not fits(self._topics, topic):
             return None
-        return self._ring.open(topic, host, {"message_definition": "", **header})
+        why = left_out_because(self._never, self._sums, topic, header)
+        if not why:
+            return self._ring.open(topic, host, {"message_definition": "", **header})
+        marked = self._ring.open(topic, host, {**header, "message_definition": "", LEFT_OUT: why})
+        return None if marked is None else LeftOut(marked)
 
 
-def _fits(globs: list[str], *names: str) -> bool:
-    return any(fnmatchcase(name, glob) for glob in globs for name in names)
+class LeftOut:
+    """The stream of a publisher whose messages are left out: it has when they came, and nothing of them."""
+
+    keeps = False
+
+    def __init__(self, marked: Stream) -> None:
+        self._marked = marked
+
+    def write(self, _frames: memoryview, _messages: int, first: int, judged: int = 0) -> None:
+        """Leave a mark in place of these frames."""
+        self._marked.write(_NOTHING, 0, first, judged)
+
+    def close(self) -> None:
+        """Nothing more comes."""
+        self._marked.close()

@@ -15,6 +15,7 @@ from pydantic import ByteSize
 
 from appliance.channel.messages import RingGiven
 from appliance.config import RecorderRules
+from appliance.recorder.never import known_sums
 from appliance.supervisor.errors import StartError
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
@@ -31,7 +32,7 @@ class Rings:
                 f"({left.human_readable()}): give less, or end what else takes memory"
             )
         size = int(rules.memory) // relays // _PAGE * _PAGE
-        since = time.time_ns()
+        since, sums = time.time_ns(), known_sums(rules.never)
         self._rings: list[tuple[RingGiven, int, int]] = []  # to be written and to be read
         for index in range(relays):
             writable = os.memfd_create(f"rosrv-ring-{index}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
@@ -39,7 +40,7 @@ class Rings:
             os.posix_fallocate(writable, 0, size)
             fcntl.fcntl(writable, fcntl.F_ADD_SEALS, _SEALS)
             readable = os.open(f"/proc/self/fd/{writable}", os.O_RDONLY | os.O_CLOEXEC)
-            given = RingGiven(index, since, rules.before, list(rules.topics), list(rules.never))
+            given = RingGiven(index, since, rules.before, list(rules.topics), list(rules.never), sums)
             self._rings.append((given, writable, readable))
 
     def given_to(self, role: str, index: int) -> Iterator[tuple[RingGiven, int]]:

@@ -30,6 +30,15 @@ class RecordedTopic(msgspec.Struct, frozen=True):
     missed: Annotated[int, told("messages of that time for which the recorder's memory had no room")]
 
 
+class LeftOutTopic(msgspec.Struct, frozen=True):
+    """A topic of one publisher that carried messages in that time and is not in the recording (`recorder.never`)."""
+
+    topic: str
+    type: Annotated[str, told("as the publisher says")]
+    host: str
+    why: Annotated[str, told("by whose word it was left out")]
+
+
 class Recording(msgspec.Struct, frozen=True):
     """One recording; it is also `recording.json` beside its bag."""
 
@@ -44,6 +53,9 @@ class Recording(msgspec.Struct, frozen=True):
     sha256: Annotated[str, told("of the bag, hexadecimal")]
     complete: bool
     why_not: Annotated[str, told("what is missing, in words; empty when it is complete")]
+    left_out: Annotated[
+        list[LeftOutTopic], told("the first topics that recorder.never left out, and why")
+    ] = []
 
 
 class RecordingBegun(msgspec.Struct, frozen=True):

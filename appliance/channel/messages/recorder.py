@@ -2,6 +2,8 @@
 
 from typing import ClassVar
 
+import msgspec
+
 from appliance.channel.answers.recordings import Recording, Trigger
 from appliance.channel.messages.message import Message
 
@@ -10,7 +12,8 @@ class RingGiven(Message):
     """The supervisor gives relay `index`, and the recorder, the memory in which that relay leaves what it receives.
 
     It was made at `since` (nanoseconds since the epoch). The relay keeps `seconds` of the topics of which a glob of
-    `topics` fits the name, but none of which one of `never` fits the name or the type.
+    `topics` fits the name, but none of which one of `never` fits the name or the type. `sums` has the md5sums of the
+    types that a glob of `never` fits, as far as they are known: a topic that claims such a type must have its sum.
     """
 
     descriptors: ClassVar[int] = 1
@@ -19,6 +22,7 @@ class RingGiven(Message):
     seconds: float
     topics: list[str]
     never: list[str]
+    sums: dict[str, str] = msgspec.field(default_factory=dict)
 
 
 class RecordingsAsked(Message):

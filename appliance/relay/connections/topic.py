@@ -37,6 +37,7 @@ from appliance.relay.connections.flow import Part, PublicationFlow
 from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.headers import to_subscriber
 from appliance.relay.connections.memory import HostShare
+from appliance.relay.recorder_ring import LeftOut
 
 _SEEN_OF_A_HOST = 16  # subscribers that a publisher may see by name: each is a connection to it more
 
@@ -101,7 +102,7 @@ class Upstream(Protocol):
 class Recorder(Protocol):
     """The flight recorder, as a topic sees it."""
 
-    def open(self, topic: str, host: str, header: Mapping[str, str]) -> Stream | None:
+    def open(self, topic: str, host: str, header: Mapping[str, str]) -> Stream | LeftOut | None:
         """A publisher is connected; None: what it says is not recorded."""
 
 
@@ -145,7 +146,7 @@ class RelayedTopic:
         self._make_room = make_room
         self._refused = refused
         self._recorder = recorded
-        self._recording: Stream | None = None
+        self._recording: Stream | LeftOut | None = None
         self._unkept: LatchRefused | None = None
         self._fresh_until = clock() + (APPEARED if fresh else -1)
         self._header: dict[str, str] | None = None
@@ -297,7 +298,7 @@ class RelayedTopic:
             return None if passing is None else self._admit(passing, since)
         # Recorded when subscribers have it, so that nothing is later; monitors may change it in place meanwhile.
         whole = batch
-        if self.through is not None:
+        if self.through is not None and recording.keeps:
             whole = Batch(memoryview(bytes(batch.view)), batch.messages, batch.last, stride=batch.stride)
             whole.first = batch.first
         passes = 0 if passing is None else passing.messages

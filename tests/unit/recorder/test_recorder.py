@@ -16,10 +16,12 @@ from appliance.audit.log import AuditLog
 from appliance.channel import messages
 from appliance.channel.answers.recordings import Recording, Trigger
 from appliance.config import RecorderRules
+from appliance.recorder.never import NAMED
 from appliance.recorder.recorder import SETTLE_SECONDS, Recorder
 from appliance.recorder.recording import RecordingInProgress
-from appliance.recorder.ring import SMALLEST, RingWriter
+from appliance.recorder.ring import LEFT_OUT, SMALLEST, RingWriter
 from appliance.recorder.shelf import MOST_LENT, Shelf
+from appliance.relay.recorder_ring import LeftOut
 from tests.support.audit import decision, settle
 from tests.unit.recorder.test_ring import HEADER, Clock, frame, opened
 
@@ -256,6 +258,33 @@ def test_a_recording_has_an_eighth_of_the_disk(tmp_path: Path) -> None:
     assert "an eighth of recorder.disk" in recording.why_not
     assert not recording.complete
     scene.log.close()
+
+
+def test_what_was_left_out_is_said_and_by_whose_word(scene: Scene) -> None:
+    """A recording without a topic that claims a type of `never` is not complete; one that names the topic is."""
+    named = scene.writer.open("/camera", "10.0.0.1", HEADER | {LEFT_OUT: NAMED})
+    assert named is not None
+    LeftOut(named).write(memoryview(frame(TEXT)), 1, 1)
+    scene.happen()
+    assert not scene.closed(scene.later(1))
+    [recording] = scene.closed(scene.later(10))
+    assert recording.complete
+    assert [(row.topic, row.host, row.why) for row in recording.left_out] == [("/camera", "10.0.0.1", NAMED)]
+    claimed = scene.writer.open("/front", "10.0.0.9", HEADER | {LEFT_OUT: "its publisher says so"})
+    assert claimed is not None
+    for number in range(1, 4):
+        LeftOut(claimed).write(memoryview(frame(TEXT)), 1, number)
+    scene.happen()
+    assert not scene.closed(scene.later(1))
+    scene.begin_anew()
+    [recording] = scene.closed(scene.later(10))
+    assert (recording.complete, "/front" in recording.why_not) == (False, True)
+    assert {row.topic for row in recording.left_out} >= {"/front"}
+    assert {name for name, _time, _data in scene.bag(recording)} <= {
+        "/chatter",
+        "/rosrv/records",
+        "/rosrv/log",
+    }
 
 
 def test_what_had_left_the_memory_is_said(scene: Scene) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from appliance.channel.messages import RingGiven
+from appliance.recorder.never import known_sums
 from appliance.recorder.ring import SMALLEST
 from appliance.recorder.ring_reader import RingReader
 from appliance.relay.recorder_ring import Recorded
@@ -60,9 +61,28 @@ def test_what_monitors_drop_is_recorded(memory: int) -> None:
 def test_what_is_never_to_be_recorded_is_not(memory: int, never: tuple[str, ...]) -> None:
     """By the name of the topic or of its type; nor is what no glob of `topics` fits."""
     header = {"type": "std_msgs/String", "md5sum": "*", "callerid": "/talker"}
-    assert given(memory, never=never).open("/chatter", "10.0.0.1", header) is None
+    stream = given(memory, never=never).open("/chatter", "10.0.0.1", header)
+    assert stream is not None
+    stream.write(batch(b"secret").view, 1, 1)
+    assert kept(memory) == []
+    assert not stream.keeps
     assert given(memory).open("/other", "10.0.0.1", header) is None
-    assert given(memory).open("/chatter", "10.0.0.1", header) is not None
+    whole = given(memory).open("/chatter", "10.0.0.1", header)
+    assert whole is not None
+    assert whole.keeps
+
+
+def test_a_topic_with_the_sum_of_another_type_is_recorded(memory: int) -> None:
+    """A guest's string under the name of a camera's type stays in the recording."""
+    sums = known_sums(["sensor_msgs/Image"])
+    recorded = Recorded(
+        RingGiven(0, 1, 60, ["/*"], ["sensor_msgs/Image"], sums), os.dup(memory), time.time_ns
+    )
+    header = {"type": "sensor_msgs/Image", "md5sum": "992ce8a1687cec8c8bd883ec73ca41d1", "callerid": "/g"}
+    stream = recorded.open("/orders", "10.0.0.9", header)
+    assert stream is not None
+    stream.write(batch(b"go").view, 1, 1)
+    assert kept(memory) == [("/orders", b"go")]
 
 
 def test_what_was_judged_has_the_time_of_that_until_the_clock_is_set(
