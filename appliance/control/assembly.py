@@ -346,6 +346,7 @@ class Parts:
             limits=self._limits,
             offload=self._offload,
             bulk=bulk_turns(base.standing),
+            processor=base.doors.time,
         )
 
     def policy_changed(self, before: Policy, policy: Policy) -> int:

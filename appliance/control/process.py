@@ -68,7 +68,7 @@ from appliance.store.state import StateStore
 
 _log = structlog.get_logger()
 _OWN, _ADMIN = "own", "admin"
-_SWITCH_SECONDS = 0.001
+_SWITCH_SECONDS = 0.0002
 _GARBAGE = 10_000  # objects more than at the last look for garbage: records that wait for the log are none
 _SAVE_SECONDS = 1.0
 _TASKS_SECONDS = 0.4

@@ -4,15 +4,21 @@ A tree of parameters takes ten times its size while it is read from ROSMaster an
 needs for that is its *bulk*: there is room for the bulk of `AT_ONCE` requests, one of each host, and hosts take turns.
 """
 
+import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Callable
-from typing import Self
+import time
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any, ParamSpec, Self, TypeVar
 
 from appliance.policy.model import Address
 from appliance.ros.xmlrpc import Value
+from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.turns import Turns
 from appliance.shares.pool import Bounds, Standing
 from appliance.shares.table import LARGE_WRITES
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 AT_ONCE = 2
 _BOUNDS = Bounds(whole=AT_ONCE, host=1, strangers=1, kept=1)
@@ -25,11 +31,15 @@ def bulk_turns(standing: Callable[[Address], Standing]) -> Turns:
 
 
 class Bulk:
-    """The bulk of one request of a host: room for it is taken when it is needed, and given back at the end."""
+    """The bulk of one request of a host: room for it is taken when it is needed, and given back at the end.
 
-    def __init__(self, turns: Turns, host: Address) -> None:
+    What is done beside the request's own steps (in a thread, in another task) is charged to the host here.
+    """
+
+    def __init__(self, turns: Turns, host: Address, processor: ProcessorTime) -> None:
         self._turns = turns
         self._host = host
+        self._processor = processor
         self.taken = False
         self.large = False  # whether the request itself is
 
@@ -44,6 +54,27 @@ class Bulk:
         if not self.taken:
             await self._turns.enter(self._host)
             self.taken = True
+
+    async def in_thread(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function in a thread, whose processor time is the host's."""
+        used = 0.0
+
+        def measured() -> T:
+            nonlocal used
+            since = time.thread_time()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                used = time.thread_time() - since
+
+        try:
+            return await asyncio.to_thread(measured)
+        finally:
+            self._processor.charge_beside(self._host, used)
+
+    async def beside(self, work: Coroutine[Any, Any, T]) -> T:
+        """Carry out work for the request in a task of its own."""
+        return await self._processor.spend(self._host, work)
 
     def give_back(self) -> None:
         """Make room for others."""

@@ -140,12 +140,16 @@ class ProcessorTime:
 
     def charge(self, host: Address, seconds: float) -> None:
         """Count time that was used for a host, in this turn."""
-        kind = self._kind(host)
         self._spent += seconds
+        self.charge_beside(host, seconds)
+        self._end_turn_later()
+
+    def charge_beside(self, host: Address, seconds: float) -> None:
+        """Count time that was used for a host, in another thread."""
+        kind = self._kind(host)
         self._classes.charge(kind, seconds)
         if (hosts := self._hosts.get(kind)) is not None:
             hosts.charge(host, seconds)
-        self._end_turn_later()
 
     def begin(self) -> bool:
         """A piece begins; False inside another one, which is charged with it."""

@@ -20,6 +20,7 @@ from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.policy import Policy
 from appliance.ros.xmlrpc import Limits
 from appliance.rpc.bulk import LargeWrites, bulk_turns
+from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest
 from appliance.shares.pool import Standing
 
@@ -72,6 +73,7 @@ def serving(
         limits=Limits(),
         offload=offload,
         bulk=bulk_turns(lambda _host: Standing.REGISTERED),
+        processor=ProcessorTime(lambda host: host),
     )
     monitors: Any = None
     if target is not None:

@@ -79,7 +79,7 @@ class Execution:
         call = visit.table[method].call
         try:
             if visit.bulk.large and weigh(list(params), self.large) >= self.large:
-                return await asyncio.to_thread(call.attempt, visit.caller, params)
+                return await visit.bulk.in_thread(call.attempt, visit.caller, params)
             return call.attempt(visit.caller, params)
         except PeerError as error:
             return self._malformed(call, visit.caller, claimed_name(params), error)

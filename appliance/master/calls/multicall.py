@@ -4,11 +4,10 @@ Roslaunch clears and sets parameters in one multicall, and the order is what cou
 parameters and follow each other are a *run*: each is decided and recorded by itself, they wait for the disk and for
 ROSMaster once. A read of what a run writes begins the next. A run of writes is decided and recorded while ROSMaster
 carries out the one before, unless it touches what that writes; ROSMaster has it when that has ended. Everything else
-waits for the part before it.
+waits for the part before it. After each run, and after each other part, other hosts may have their turn.
 """
 
 import asyncio
-import time
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -26,7 +25,7 @@ from appliance.rpc.bulk import weigh
 MULTICALL = "system.multicall"
 PARSE_FAULT, LIMIT_FAULT = -32700, -32600
 _LONGEST_RUN = 64  # parts that reach ROSMaster in one request
-_LONGEST_STRETCH = 0.005  # seconds without a look at anybody else
+_LONGEST_READING = 8  # parts of a run that reads: each is answered before others have their turn
 _FORM = "a part of a multicall has methodName and params, nothing else"
 
 _Parts = deque["Value | Attempt"]
@@ -50,7 +49,6 @@ class Multicall:
         left: _Parts = deque(params[0])
         results: list[Value] = []
         room = self.parameters.mirror.bytes_limit
-        since = time.monotonic()  # not the loop's time, which stands still meanwhile
         before: _UnderWay | None = None
         async with asyncio.TaskGroup() as group:
             while left and not (why := self._why_no_more(visit, room)):
@@ -66,15 +64,13 @@ class Multicall:
                 else:
                     after = None if before is None else before.task
                     task = self.execution.answer_run(visit, run.attempts, run.recorded, after)
-                    following = _UnderWay(run, group.create_task(task))
+                    following = _UnderWay(run, group.create_task(visit.bulk.beside(task)))
                     await run.recorded.wait()
                     answers += [] if before is None else await before.answers()
                     before = following
                 room -= await self._weigh(visit, answers)
                 results += answers
-                if time.monotonic() - since > _LONGEST_STRETCH:
-                    await asyncio.sleep(0)
-                    since = time.monotonic()
+                await asyncio.sleep(0)  # others have their turn
             results += [] if before is None else await before.answers()
         if left:
             why = f"{why}; {len(left)} more parts are not carried out"
@@ -91,7 +87,7 @@ class Multicall:
         """The next parts, which are taken from those that are left, as they were understood."""
         run = _Run()
         weight, most = 0, min(room, self.offload)
-        while left and len(run.answers) < _LONGEST_RUN and weight < most and _in_run(visit, left[0]):
+        while left and len(run.answers) < run.longest and weight < most and _in_run(visit, left[0]):
             attempt = await self._understand(visit, left[0])
             if isinstance(attempt, Attempt):
                 if attempt.call.verb is Verb.WRITE:
@@ -129,7 +125,7 @@ class Multicall:
         if weight < self.offload:
             return weight
         await visit.bulk.take()
-        return await asyncio.to_thread(weigh, answers, self.parameters.mirror.bytes_limit)
+        return await visit.bulk.in_thread(weigh, answers, self.parameters.mirror.bytes_limit)
 
     def _refused(self, visit: Visit, why: str) -> Value:
         return self._fault(visit, PARSE_FAULT, "malformed", why)
@@ -156,6 +152,11 @@ class _Run:
     written: list[str] = field(default_factory=list)
     reads: bool = False
     recorded: asyncio.Event = field(default_factory=asyncio.Event)
+
+    @property
+    def longest(self) -> int:
+        """The number of parts that it may have."""
+        return _LONGEST_READING if self.reads else _LONGEST_RUN
 
     def goes_beside(self, before: "_Run") -> bool:
         """Whether nothing that is decided or answered here depends on what ROSMaster makes of the run before."""

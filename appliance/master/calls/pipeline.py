@@ -3,7 +3,6 @@
 The same way serves the Master API and the outer faces, with another table of calls.
 """
 
-import asyncio
 import time
 from dataclasses import dataclass
 
@@ -22,6 +21,7 @@ from appliance.ros.errors import EncodingError, LimitExceededError, PeerError
 from appliance.ros.xmlrpc import Limits, MethodCall, Value, build_fault, build_response, parse_call
 from appliance.rpc.bulk import Bulk, weigh
 from appliance.rpc.method_name import method_named
+from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest
 from appliance.rpc.turns import Turns
 
@@ -44,6 +44,7 @@ class Pipeline:
     limits: Limits
     offload: int
     bulk: Turns
+    processor: ProcessorTime
 
     def handler(self, table: Table, *, own: bool = False, target: Incarnation | None = None) -> Handler:
         """The handler of one listener: its table, whether it is for the appliance's own nodes, and its target."""
@@ -52,7 +53,7 @@ class Pipeline:
             await self.addresses.learn(request.peer)
             caller = Caller(request.peer, "", request.arrived, own=own, target=target)
             before = self.repetitions.state
-            with Bulk(self.bulk, caller.peer.host) as bulk:
+            with Bulk(self.bulk, caller.peer.host, self.processor) as bulk:
                 call, answer = await self._serve(Visit(table, caller, bulk), request.body)
             if call is not None and not own and target is None:
                 self.repetitions.note(table, request, call, answer, before=before)
@@ -77,7 +78,7 @@ class Pipeline:
             if weigh(answer, self.offload) < self.offload:
                 return call, build_response(answer)
             await visit.bulk.take()
-            return call, await asyncio.to_thread(build_response, answer)
+            return call, await visit.bulk.in_thread(build_response, answer)
         except EncodingError as error:
             _log.error("answer cannot be written", call=call.method, error=str(error))
             return None, build_fault(
@@ -94,7 +95,7 @@ class Pipeline:
         bulk.large = True
         await bulk.take()
         try:
-            return await asyncio.to_thread(parse_call, body, self.limits)
+            return await bulk.in_thread(parse_call, body, self.limits)
         finally:
             bulk.give_back()  # to carry it out may take long
 

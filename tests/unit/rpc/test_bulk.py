@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from appliance.master.parameter_charges import measure
 from appliance.ros.xmlrpc import Value, build_response
 from appliance.rpc.bulk import AT_ONCE, Bulk, LargeWrites, bulk_turns, weigh
+from appliance.rpc.processor_time import ProcessorTime
 from appliance.shares.pool import Standing
 
+TIME = ProcessorTime(lambda host: host)
 HOSTS = [ipaddress.ip_address(f"10.0.0.{number}") for number in range(1, 5)]
 VALUES: st.SearchStrategy[Value] = st.recursive(
     st.one_of(st.booleans(), st.integers(-9, 9), st.floats(), st.text("x<&>\u00e9", max_size=30)),
@@ -33,7 +35,7 @@ def test_room_for_one_of_a_host_and_two_in_all() -> None:
         go = asyncio.Event()
 
         async def request(host: Any) -> None:
-            with Bulk(turns, host) as bulk:
+            with Bulk(turns, host, TIME) as bulk:
                 await bulk.take()
                 await bulk.take()  # again is nothing more
                 inside.append(host)
@@ -57,12 +59,12 @@ def test_room_comes_back_after_a_failure() -> None:
     async def scene() -> None:
         turns = bulk_turns(lambda _host: Standing.REGISTERED)
         for _ in range(3):
-            with pytest.raises(KeyError), Bulk(turns, HOSTS[0]) as bulk:
+            with pytest.raises(KeyError), Bulk(turns, HOSTS[0], TIME) as bulk:
                 await bulk.take()
                 raise KeyError
-            with Bulk(turns, HOSTS[0]):
+            with Bulk(turns, HOSTS[0], TIME):
                 pass
-        with Bulk(turns, HOSTS[0]) as bulk:
+        with Bulk(turns, HOSTS[0], TIME) as bulk:
             async with asyncio.timeout(20):
                 await bulk.take()
             assert bulk.taken
@@ -122,5 +124,23 @@ def test_large_values_of_a_host_go_one_at_a_time() -> None:
         go.set()
         await asyncio.gather(*tasks)
         assert not inside
+
+    asyncio.run(scene())
+
+
+def test_what_a_thread_does_for_a_host_is_charged_to_it() -> None:
+    """A host whose large document was read in a thread is next after the others, as if the loop had read it."""
+
+    async def scene() -> None:
+        time, order = ProcessorTime(lambda host: host, lambda: 0.0), list[Any]()
+        bulk = Bulk(bulk_turns(lambda _host: Standing.REGISTERED), HOSTS[0], time)
+        with pytest.raises(ZeroDivisionError):
+            await bulk.in_thread(lambda: sum(range(200_000)) / 0)
+        time.charge(HOSTS[2], 10.0)  # the turn is over
+        for host in (HOSTS[0], HOSTS[1]):
+            time.run(host, lambda host=host: order.append(host))  # type: ignore[misc]
+        while time.waiting:
+            await asyncio.sleep(0)
+        assert order == [HOSTS[1], HOSTS[0]]
 
     asyncio.run(scene())

@@ -261,6 +261,23 @@ async def held(site: Site, parts: list[Value]) -> "asyncio.Task[Any]":
     return asked
 
 
+def test_a_long_multicall_gives_way_after_a_few_parts() -> None:
+    """Of 9,000 reads in one multicall a few are decided and answered in one go; between them others have their turn."""
+
+    async def scene() -> None:
+        site = Site()
+        reads: list[Value] = [part("hasParam", f"/arm/{number}") for number in range(9000)]
+        asked = asyncio.create_task(site.ask(OPERATOR, "system.multicall", reads))
+        most = before = 0
+        while not asked.done():
+            await asyncio.sleep(0)
+            most, before = max(most, len(site.trail.decisions) - before), len(site.trail.decisions)
+        assert told(await asked) == [1] * 9000
+        assert most <= 16
+
+    play(scene)
+
+
 def test_a_run_of_writes_is_decided_while_the_one_before_is_carried_out() -> None:
     """One run ahead, no more; ROSMaster has a run when the one before has ended, and all in the order of the parts."""
 
