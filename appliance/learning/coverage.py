@@ -201,6 +201,8 @@ class _Watch(CompiledProperty):
 class _Run:
     """A run that says which state it was in."""
 
+    keeps = ()
+
     def __init__(self, watch: _Watch, run: Run, state: str) -> None:
         self._watch = watch
         self._run = run
@@ -213,6 +215,11 @@ class _Run:
     def deadline(self) -> int | None:
         """The machine's."""
         return self._run.deadline
+
+    @property
+    def as_new(self) -> bool:
+        """Never: what is watched is not tried out."""
+        return False
 
     def step(self, event: int, time_ns: int) -> Categories:
         """Take an event, and count it."""

@@ -60,6 +60,7 @@ class Engine:
             budget=limits.budget / 1000,
             publish=lambda published: self._publish(published.topic, published.data),
             changed=self._monitors_changed,
+            holder=self._holder,
         )
         self._table = StatedTable()
         self.memory = Memory.of(limits, self._table.standing)
@@ -274,6 +275,10 @@ class Engine:
         place = Place(relayed.key, topic, relayed.host, relayed.name)
         through = middle.lane(place).through if middle.stands(topic) else None
         relayed.monitor(through, wanted=middle.wants(topic))
+
+    def _holder(self, host: str) -> str:
+        """A host that has a registration is told apart; all others are one."""
+        return host if self._table.standing(host) is Standing.REGISTERED else ""
 
     def _monitors_changed(self, topics: frozenset[str] | None) -> None:
         monitors = self.middle.monitors

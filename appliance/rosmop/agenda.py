@@ -2,11 +2,15 @@
 
 Time is what the caller says, in nanoseconds. Ticks up to and including a time happen, and deadlines before it. Ticks
 that take longer than the caller's `patience` allows are left out, and that is logged; deadlines wait for the next time.
+
+Slices of parametric specifications have deadlines of their own. Whoever makes up bindings chooses how many of them pass
+at one moment, so `advance` lets at most `most` of them pass; the others are due at once again. A slice takes no message
+before its own deadlines have passed (`Execution`).
 """
 
 from collections.abc import Callable, Sequence
 
-from appliance.rosmop.execution import Execution
+from appliance.rosmop.execution import EXPLAINED, Execution
 from appliance.rosmop.monitor import Monitor, RunningProperty, Timer
 from appliance.rosmop.outcomes import Outcome
 
@@ -19,13 +23,16 @@ MAX_TICKS = 100_000
 class Agenda:
     """The timers and deadlines of monitors."""
 
-    def __init__(self, monitors: Sequence[Monitor], execution: Execution, patience: Patience) -> None:
+    def __init__(
+        self, monitors: Sequence[Monitor], execution: Execution, patience: Patience, most: int
+    ) -> None:
         """`patience()` is asked when something is due: what says whether that has taken too long."""
         self.due: int | None = None
         """When the next tick is due or the next deadline has passed; None if nothing is waited for."""
         self._monitors = monitors
         self._execution = execution
         self._patience = patience
+        self._most = most
         self._timed = any(
             monitor.timers or any(running.code.property.timed for running in monitor.properties)
             for monitor in monitors
@@ -61,17 +68,21 @@ class Agenda:
         """Let the ticks up to this time and the deadlines before it happen, in the order of their times."""
         outcomes: list[Outcome] = []
         ticks: dict[int, int] = {}
+        left = self._most
         over = self._patience()
         self.schedule()  # walks may have moved deadlines on
         while self.has_come(time_ns):
             timer = self._next_timer()
-            deadline = self._next_deadline()
+            deadline = self._next_deadline(slices=left > 0)
             if timer is not None and timer.due is not None and (deadline is None or timer.due <= deadline[0]):
                 if timer.due > time_ns:
                     break
                 outcomes.append(self._tick(timer, time_ns, ticks))
             elif deadline is not None and deadline[0] < time_ns:
-                outcomes.append(self._execution.expire(deadline[1], deadline[2]))
+                _, monitor, running = deadline
+                left -= running is None
+                explains = self._most - left <= EXPLAINED
+                outcomes += self._execution.expire(monitor, running, explains=explains)
             else:
                 break
             self.schedule()
@@ -120,10 +131,15 @@ class Agenda:
         ]
         return min(timers, key=lambda timer: timer.due or 0, default=None)
 
-    def _next_deadline(self) -> tuple[int, Monitor, RunningProperty] | None:
-        found: tuple[int, Monitor, RunningProperty] | None = None
+    def _next_deadline(self, *, slices: bool = True) -> tuple[int, Monitor, RunningProperty | None] | None:
+        """The next deadline, and of which property it is; None there: of a slice (only with `slices`)."""
+        found: tuple[int, Monitor, RunningProperty | None] | None = None
         for monitor in self._monitors:
-            if monitor.enabled:
+            if monitor.enabled and monitor.slices is not None:
+                deadline = monitor.slices.deadline if slices else None
+                if deadline is not None and (found is None or deadline < found[0]):
+                    found = (deadline, monitor, None)
+            elif monitor.enabled:
                 for running in monitor.properties:
                     if running.code.property.timed:
                         monitor.come_home()

@@ -77,10 +77,14 @@ class Publication:
 
 @dataclass(frozen=True)
 class Slicing:
-    """What slices differ in: the parameters (name in the text, name in the code, type), and their own variables."""
+    """What slices differ in: the parameters (name in the text, name in the code, type), and their own variables.
+
+    `enforces`: the specification drops or changes messages, or publishes some.
+    """
 
     parameters: tuple[tuple[str, str, kinds.Type], ...]
     own: tuple[str, ...]
+    enforces: bool
 
 
 @dataclass(frozen=True)

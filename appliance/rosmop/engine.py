@@ -19,6 +19,7 @@ Theory of operation:
 """
 
 import math
+import sys
 import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
@@ -35,6 +36,7 @@ from appliance.rosmop.monitor import Group, Monitor, Step, monitors_of
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding, Position
 from appliance.rosmop.program import groups
+from appliance.rosmop.quota import Holder
 from appliance.rosmop.remembered import (
     KeptGroup,
     encoded,
@@ -118,8 +120,11 @@ class MonitorSet:
         trials: Sequence["MonitorSet"] = (),
         *,
         slices: int = LIMIT,
+        deadlines: int = sys.maxsize,
     ) -> None:
-        """`compiled` is all of them in their order; what is on trial is in `trials`."""
+        """`compiled` is all of them in their order; what is on trial is in `trials`. At most so many `deadlines` of
+        slices pass at a time.
+        """
         tried = {name for trial in trials for name in trial.names}
         self.names: tuple[str, ...] = tuple(one.name for one in compiled.specifications)
         compiled = compiled.part(frozenset(self.names).difference(tried)) if tried else compiled
@@ -142,7 +147,7 @@ class MonitorSet:
         self._silent: dict[tuple[str, int], Prepared] = {}
         """What is prepared for `judge`, by topic and source."""
         self._execution = Execution(self.interpreter, on_fault)
-        self._agenda = Agenda(self._monitors, self._execution, patience)
+        self._agenda = Agenda(self._monitors, self._execution, patience, deadlines)
         self.began: tuple[str, ...] = ()
         self._walks = Walks()
         self._broken = False
@@ -195,15 +200,16 @@ class MonitorSet:
         trials: Collection[str] = (),
         trial_patience: Patience = lambda: _never,
         slices: int = LIMIT,
+        deadlines: int = sys.maxsize,
     ) -> "MonitorSet":
-        """The set of what was compiled; the rest as `load` says."""
+        """The set of what was compiled; the rest as `load` and `__init__` say."""
         tried = []
         for group in compiled.groups(trials):
-            trial = cls(compiled.part(group), on_fault, trial_patience, slices=slices)
+            trial = cls(compiled.part(group), on_fault, trial_patience, slices=slices, deadlines=deadlines)
             for monitor in trial._monitors:
                 monitor.context.most = TRIAL_BUDGET
             tried.append(trial)
-        return cls(compiled, on_fault, patience, tried, slices=slices)
+        return cls(compiled, on_fault, patience, tried, slices=slices, deadlines=deadlines)
 
     # What there is
 
@@ -333,6 +339,13 @@ class MonitorSet:
         self._execution.asked = asked
         for trial in self.trials:
             trial.explain_when(tried, tried)
+
+    def charge_slices(self, holder_of: Callable[[int], Holder]) -> None:
+        """Charge slices to the holder of the source whose message makes them (`quota.py`)."""
+        for part in (self, *self.trials):
+            for monitor in part._monitors:
+                if monitor.slices is not None:
+                    monitor.slices.holder_of = holder_of
 
     @property
     def area(self) -> memoryview | None:
@@ -565,6 +578,8 @@ class MonitorSet:
                 for running in monitor.properties:
                     if running.code.property.timed:
                         running.begin(time_ns)
+                if monitor.slices is not None:
+                    monitor.slices.restart(time_ns)
         if changed:
             self._index()
             self._agenda.schedule()

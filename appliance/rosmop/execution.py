@@ -11,7 +11,9 @@ seen is the trace that subscribers saw. Variables, output and the other properti
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
+from functools import partial
 from math import inf
 from typing import Literal
 
@@ -22,7 +24,7 @@ from appliance.rosmop.logics.interface import Categories, RunFaultError
 from appliance.rosmop.monitor import Handler, Monitor, RunningProperty, Step
 from appliance.rosmop.outcomes import DROPPED, Fault, Outcome, Verdict
 from appliance.rosmop.positions import Position
-from appliance.rosmop.runtime.context import FOLDED_NS, FaultError, LogLine
+from appliance.rosmop.runtime.context import FOLDED_NS, LogLine
 from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.slices import Key, Slice, Slices
 from appliance.rosmop.why import Bound, of_slice
@@ -30,8 +32,16 @@ from appliance.rosmop.why import Bound, of_slice
 OnFault = Literal["drop", "pass"]
 Asked = Callable[[Verdict, int], bool]
 
-EXPLAINED = 20
-"""Verdicts of slices that are explained of those which one message brings about: each takes a millisecond."""
+EXPLAINED = 3
+"""Verdicts of slices that are explained of those which one message, or one go of deadlines, brings about: each takes a
+millisecond.
+"""
+
+SLICE_SECONDS = 30e-6
+"""Processor time that a message has more for each slice that it concerns."""
+
+TICK_BUDGET = 2_000
+"""Instructions that a slice may spend on a tick that concerns several."""
 
 
 class Execution:
@@ -50,6 +60,10 @@ class Execution:
         """What takes back the steps for the message at hand, by the run or slice that made them."""
         self._trailed: dict[Monitor, int] = {}
         """How many entries the message at hand has in trails."""
+        self._copies = False
+        """Whether what happens in a slice may be taken back."""
+        self._passed: int | None = None
+        """The deadline of a slice that passes now."""
 
     def begin(self, monitors: Sequence[Monitor], time_ns: int) -> Outcome:
         """Constants, first values, `init`: each for all before the next, as one may read another's variables."""
@@ -124,22 +138,68 @@ class Execution:
             outcome.events = (step.name,)
         return outcome
 
-    def expire(self, monitor: Monitor, running: RunningProperty) -> Outcome:
-        """Tell a property that its deadline has passed."""
-        self._sender = NOBODY
+    def expire(self, monitor: Monitor, running: RunningProperty | None, *, explains: bool) -> list[Outcome]:
+        """Let the deadline of a property pass, or (None) the first one of a slice; the outcomes that are told. Where
+        not `explains`, a slice's verdict is not explained.
+        """
+        self._sender, self._bound = NOBODY, None
         monitor.come_home()
         monitor.touch()
-        deadline = running.run.deadline or 0
+        if running is None:
+            assert monitor.slices is not None  # noqa: S101  only they have deadlines of their own
+            self._explains = explains
+            outcomes = self._expire_in_slice(monitor, monitor.slices.due)
+            self._explains = True
+            return outcomes
+        outcome = self._expiry(monitor, running.run.deadline or 0, running)
+        categories = running.history.expire(running.run)
+        self._tell(monitor, running, categories, None, outcome, in_order_told=True)
+        self.collect(outcome)
+        return [outcome]
+
+    def _expiry(self, monitor: Monitor, deadline: int, running: RunningProperty) -> Outcome:
+        """Begin what comes of the deadline of a property."""
         word = "timeout" if running.code.property.logic == "tfsm" else "deadline"
         outcome = Outcome(time=deadline)
         outcome.timer = f"{monitor.name}.{word}"
         self._turn.now = deadline
         self._turn.begin()
         monitor.context.begin()
-        categories = running.history.expire(running.run)
-        self._tell(monitor, running, categories, None, outcome, in_order_told=True)
-        self.collect(outcome)
         return outcome
+
+    def _expire_in_slice(self, monitor: Monitor, slice_: Slice) -> list[Outcome]:
+        """Let the first deadline of a slice pass. Nothing is told of one that lacks a parameter."""
+        slices = monitor.slices
+        assert slices is not None  # noqa: S101  it has a slice
+        deadline = slice_.deadline or 0
+        number = next(place for place, run in enumerate(slice_.runs) if run.deadline == deadline)
+        running = monitor.properties[number]
+        outcome = self._expiry(monitor, deadline, running)
+
+        def act(outcome: Outcome, _: Message | None) -> bool:
+            self._passed = deadline
+            self._tell(monitor, running, running.run.expire(), None, outcome, in_order_told=True)
+            self._passed = None
+            return False
+
+        whole = slices.is_whole(slice_)
+        (self._in_slice if whole else self._in_seed)(monitor, slice_, outcome, None, act)()
+        self.collect(outcome)
+        return [outcome] if whole else []
+
+    def _catch_up(self, monitor: Monitor, behind: Sequence[Slice], outcome: Outcome) -> None:
+        """Let the deadlines of slices pass that are before a message, where there were too many to pass in time."""
+        turn, go_on = self._turn, monitor.context.put_off()
+        kept = turn.log, turn.published, turn.looked, self._sender, self._bound
+        turn.log, turn.published, turn.looked = [], [], {}
+        before = [*outcome.before]
+        self._sender, self._explains = NOBODY, len(behind) <= EXPLAINED
+        for slice_ in behind:
+            while not slice_.gone and (deadline := slice_.deadline) is not None and deadline < outcome.time:
+                before += self._expire_in_slice(monitor, slice_)
+        outcome.before, turn.now, self._explains = before, outcome.time, True
+        turn.log, turn.published, turn.looked, self._sender, self._bound = kept
+        go_on()
 
     def warn(self, monitor: Monitor, text: str) -> None:
         """A line of the monitor's log, for the next `collect`."""
@@ -223,49 +283,99 @@ class Execution:
     ) -> None:
         """Let an event happen in each slice that it belongs to, until one has dropped the message.
 
-        In a slice that lacks a parameter it happens to a copy of the message, and what it puts out is not put out.
+        A message whose budget ends on the way has happened in no slice. At a tick each slice has a budget of its own,
+        so that none takes it from others.
         """
-        slices = step.monitor.slices
+        monitor, slices, turn = step.monitor, step.monitor.slices, self._turn
         assert slices is not None  # noqa: S101  who asks has looked
-        whole, seeds = slices.targets(step.event, key)
+        found = slices.targets(step.event, key, outcome.time, self._sender.source)
+        if slices.behind:
+            self._catch_up(monitor, slices.behind, outcome)
+            found = slices.targets(step.event, key, outcome.time, self._sender.source)
         refused, why = slices.refused, slices.why
-        before, verdicts, faults = outcome.events, [*outcome.verdicts], [*outcome.faults]
-        names: Sequence[str] = before
-        turn, dropped, reached = self._turn, False, 0
-        if len(whole) + len(seeds) > 1:
-            try:
-                step.monitor.context.spend(len(whole) + len(seeds), -1)
-            except FaultError as error:
-                self._fault(error, step.monitor, step.event.position, outcome)
-                self._block(message, outcome)
-                return
-        for slice_ in whole:
+        before, earlier, lines, published = (
+            outcome.events, (outcome.verdicts, outcome.faults), len(turn.log), len(turn.published),
+        )  # fmt: skip
+        events, verdicts, faults = before, [*outcome.verdicts], [*outcome.faults]
+        several, reached = len(found) > 1, 0
+        commits: list[Callable[[], None]] = []
+        self._copies = several and message is not None
+        turn.until += SLICE_SECONDS * len(found)
+        for slice_ in found:
             outcome.events, outcome.verdicts, outcome.faults = before, (), ()
             self._explains = len(verdicts) < EXPLAINED
-            dropped = self._in_slice(step.monitor, slice_, outcome, message, act)
-            if outcome.events is not before:
-                names, reached = outcome.events, reached + 1
-            verdicts += outcome.verdicts  # many slices: a tuple would be copied with each
+            if several and message is None:
+                turn.begin()
+                monitor.context.begin(TICK_BUDGET)
+            commits.append(self._in_one(step, slice_, outcome, message, act))
+            if several and message is not None and monitor.context.budget < 0:
+                del turn.log[lines:], turn.published[published:]
+                cut = outcome.faults[-1:]
+                outcome.events, (outcome.verdicts, outcome.faults) = before, earlier
+                outcome.faults = (*outcome.faults, *cut)
+                self._copies, self._explains = False, True
+                return
             faults += outcome.faults
-            if dropped:
+            verdicts += outcome.verdicts  # many slices: a tuple would be copied with each
+            if outcome.events is not before:
+                reached += 1
+                events = outcome.events if slices.is_whole(slice_) else events
+            if message is None:
+                commits.pop()()
+            elif message.dropped:
                 break
-        self._explains = False  # of seeds nothing is told
-        for slice_ in () if dropped else seeds:
-            unseen = Outcome(time=outcome.time)
-            lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
-            copied = None if message is None else Message(bytes(message.buffer), message.time)
-            self._in_slice(step.monitor, slice_, unseen, copied, act)
-            reached += bool(unseen.events)
-            del turn.log[lines:], turn.published[published:]
-            turn.looked = looked
-            faults += unseen.faults
+        self._copies = False
+        for commit in commits:
+            commit()
         self._explains = True
-        trail = step.monitor.trail
-        if 0 < reached < len(whole) + len(seeds) and trail and trail[-1] is self._bound:
+        trail = monitor.trail
+        if 0 < reached < len(found) and trail and trail[-1] is self._bound:
             trail[-1] = self._bound._replace(everywhere=False)
-        outcome.events, outcome.verdicts, outcome.faults = names, tuple(verdicts), tuple(faults)
-        if refused is not None and not dropped:
+        outcome.events, outcome.verdicts, outcome.faults = events, tuple(verdicts), tuple(faults)
+        if text := slices.forgotten(outcome.time):
+            self.warn(monitor, text)
+        if refused is not None and (message is None or not message.dropped):
             self._refuse_slice(step, refused, why, message, outcome)
+
+    def _in_one(
+        self,
+        step: Step,
+        slice_: Slice,
+        outcome: Outcome,
+        message: Message | None,
+        act: Callable[[Outcome, Message | None], bool],
+    ) -> Callable[[], None]:
+        """Let an event happen in a slice; return how the slice takes the state."""
+        slices = step.monitor.slices
+        assert slices is not None  # noqa: S101  it has a slice
+        if message is not None:
+            self._mark_slice(slices, slice_)
+        if (after := slices.quiet(step.index, slice_)) is not None:
+            outcome.events = (*outcome.events, step.name)
+            self._note(step.monitor)
+            return partial(slice_.stand, after)
+        if slices.is_whole(slice_):
+            return self._in_slice(step.monitor, slice_, outcome, message, act)
+        return self._in_seed(step.monitor, slice_, outcome, message, act)
+
+    def _in_seed(
+        self,
+        monitor: Monitor,
+        slice_: Slice,
+        outcome: Outcome,
+        message: Message | None,
+        act: Callable[[Outcome, Message | None], bool],
+    ) -> Callable[[], None]:
+        """Let the event happen in a slice that lacks a parameter, to a copy of the message; leave out its output."""
+        turn, explains = self._turn, self._explains
+        lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
+        copied = None if message is None else Message(bytes(message.buffer), message.time)
+        self._explains = False
+        commit = self._in_slice(monitor, slice_, outcome, copied, act)
+        self._explains = explains
+        del turn.log[lines:], turn.published[published:]
+        turn.looked, outcome.verdicts, outcome.fatal = looked, (), None
+        return commit
 
     def _in_slice(
         self,
@@ -274,18 +384,16 @@ class Execution:
         outcome: Outcome,
         message: Message | None,
         act: Callable[[Outcome, Message | None], bool],
-    ) -> bool:
-        """Make the slice the state of the monitor and let the event happen; whether the message was dropped."""
+    ) -> Callable[[], None]:
+        """Make the slice the state of the monitor and let the event happen; return how the slice takes the state."""
         slices = monitor.slices
         assert slices is not None  # noqa: S101  it has a slice
         for running, run in zip(monitor.properties, slices.select(slice_), strict=True):
-            running.run = run
-        self._mark_slice(slices, slice_)
+            running.run = copy(run) if self._copies else run
         before, monitor.slice = outcome.events, slice_
-        dropped = act(outcome, message)
+        act(outcome, message)
         runs = tuple(running.run for running in monitor.properties)
-        slices.settle(slice_, runs, happened=outcome.events is not before)
-        return dropped
+        return partial(slices.settle, slice_, runs, slices.own(), happened=outcome.events is not before)
 
     def _refuse_slice(
         self,
@@ -340,14 +448,14 @@ class Execution:
                 timer.due = message.time + timer.period
         return False
 
+    def _note(self, monitor: Monitor) -> None:
+        """Keep what the event has bound, which has happened in a slice."""
+        if self._bound is not None and (not monitor.trail or monitor.trail[-1] is not self._bound):
+            self._append_to_trail(monitor, self._bound)
+
     def _step_properties(self, step: Step, message: Message | None, time_ns: int, outcome: Outcome) -> None:
-        trail = step.monitor.trail
-        if (
-            self._bound is not None
-            and step.monitor.slices is not None
-            and (not trail or trail[-1] is not self._bound)
-        ):
-            self._append_to_trail(step.monitor, self._bound)
+        if step.monitor.slices is not None:
+            self._note(step.monitor)
         for running in step.monitor.properties:
             try:
                 if step.monitor.slices is None:
@@ -364,7 +472,7 @@ class Execution:
                 self._tell(step.monitor, running, categories, message, outcome)
 
     def _mark_slice(self, slices: Slices, slice_: Slice) -> None:
-        if id(slice_) not in self._taking_back:
+        if slices.suppresses and id(slice_) not in self._taking_back:
             self._taking_back[id(slice_)] = slices.mark(slice_)
 
     def _append_to_trail(self, monitor: Monitor, bound: Bound) -> None:
@@ -420,7 +528,7 @@ class Execution:
             return replace(verdict, why=running.history.explain(category))
         if not self._explains:
             return verdict
-        why = of_slice(running.code.property, monitor.trail, slices.values(slice_), category)
+        why = of_slice(running.code.property, monitor.trail, slices.values(slice_), category, self._passed)
         return replace(verdict, why=why)
 
     def _handle(

@@ -1,45 +1,64 @@
 """The slices of a running parametric specification (Chen and Roşu, "Parametric trace slicing and monitoring", 2012).
 
 A *binding* gives some or all of the parameters a value. The *slice* of a binding are the events that bind nothing else
-than it does, from the first on that is a `creation event` (where there is none: from the first on). What is monitored
-is each slice whose events bind all parameters: as if the specification stood there for it alone.
+than it does, from the first on that is a `creation event` (where there is none: from the first on). Each slice whose
+events bind all parameters is monitored, as if the specification stood there for it alone.
 
 Theory of operation:
 
-1. `targets` says which slices an event belongs to: those whose bindings agree with what it binds, joined with it. One
-   that is not there yet begins with the state of the largest binding in it that is known; there is one such, because
-   with two known bindings that agree what they make together is known, too. Slices that lack a parameter (`seeds`)
-   are kept for that, and what their actions and handlers put out is not put out.
+1. `targets` returns the slices that an event belongs to: those whose bindings agree with what it binds, joined with it.
+   A slice that is not there yet begins with the state of the largest known binding in it; there is one such, because
+   with two known bindings that agree their union is known, too. Slices that lack a parameter (`seeds`) are kept for
+   that, and the output of their actions and handlers is left out.
 2. The engine makes each of them in turn the state of the monitor (`select`), steps it as any other, and takes the state
-   back (`settle`): the tables, functions and handlers are the ones of specifications without parameters. Where
-   nothing comes of an event but other states of automata, `step` does that.
-3. A slice ends, and its ticks with it, when no event can bring it to a handler any more, and no action for a message
-   does more than to change its variables.
-   Its binding is remembered, so that none begins anew with it: of so many bindings as there may be slices, then the
-   one that ended first is forgotten. One that is as at its beginning, and would begin with any event that matters to
-   it, is forgotten at once: nobody can tell.
-4. There are never more than `limit` slices, and no binding has more than `MAX_BINDING` bytes. What would be beyond is
-   `refused`: a fault, and no slice; those that are there go on.
+   back (`settle`): the tables, functions and handlers are the ones of specifications without parameters. Where an
+   event only moves automata to other states, `step` and `quiet` do that.
+3. Each slice has its own clocks. `deadline` is the first deadline of all slices (a heap), `due` the slice that it
+   belongs to. A slice has one entry in the heap that counts (`Slice.due`), which may be too early, never too late.
+4. A slice ends when nothing of it can act any more: no event and no deadline leads to a handler, and no action, of
+   messages or of ticks, does more than to change its variables. Its binding is remembered, so that none begins anew
+   with it. A slice that is as at its beginning, and would begin with any event that matters to it, is forgotten at
+   once: nothing differs then.
+5. There are never more than `limit` slices, and each host (*holder*) has no more than are left for all others
+   (`quota.py`). A host that is at its bound pays itself: where the specification only observes, its own oldest slice is
+   forgotten; where it acts on messages or publishes, its new binding is `refused`, so that no host can have an
+   obligation of its own forgotten. No slice is removed for another host's. Bindings that have ended are
+   remembered under the same rule. No binding has more than `MAX_BINDING` bytes.
+6. What one message costs is bounded by these numbers. Where an event does not bind all parameters it may concern all
+   slices, and there are at most `TOGETHER_LIMIT`.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
-from itertools import repeat
+from heapq import heapify, heappop, heappush
+from itertools import count, repeat
 from operator import contains, getitem
 from typing import Any, cast
 
 from appliance.rosmop.compiled import EventCode, PropertyCode, SpecificationCode
 from appliance.rosmop.ir.sites import showing
-from appliance.rosmop.logics.interface import FiniteProperty, FormulaRun, Run
+from appliance.rosmop.logics.bounded import MOST_OPEN_IN_SLICE, BoundedProperty
+from appliance.rosmop.logics.interface import (
+    Categories,
+    ClockedProperty,
+    CompiledProperty,
+    FiniteProperty,
+    FormulaRun,
+    Run,
+)
+from appliance.rosmop.quota import Holder, Quota
+from appliance.rosmop.runtime.context import FOLDED_NS
 from appliance.rosmop.types import kinds
 
 LIMIT = 100_000
 """Slices of one specification, unless it is set otherwise."""
 
 GROWING_LIMIT = 1_000
-"""The same where a run is more than the state of an automaton (`cfg`, `srs`, `ptcaret`), and may grow."""
+"""The same where a run is more than the state of an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
+
+TOGETHER_LIMIT = 2_000
+"""The same where an event, or a tick, may concern all slices at once."""
 
 MAX_BINDING = 256
 """Bytes of the strings in a binding."""
@@ -52,13 +71,26 @@ _NAN = float("nan")  # one is found again, though it is not equal to itself
 
 @dataclass(eq=False, slots=True)
 class Slice:
-    """One slice: which parameters its binding has (a set of bits), their values, and its state."""
+    """One slice: which parameters its binding has (a set of bits), their values, its state, and who has made it.
+
+    It is `kept` once an event has happened in it, and `gone` once it has ended or was forgotten.
+    """
 
     domain: int
     key: Key
     runs: tuple[Run, ...]
     values: tuple[Any, ...]
+    holder: Holder = None
     kept: bool = False
+    gone: bool = False
+    due: int | None = None
+    """The time of its entry in the heap of deadlines that counts."""
+
+    @property
+    def deadline(self) -> int | None:
+        """The first deadline of its properties."""
+        times = [time for run in self.runs if (time := run.deadline) is not None]
+        return min(times, default=None)
 
     def stand(self, states: Sequence[int]) -> None:
         """Its automata are in these states."""
@@ -82,44 +114,71 @@ class Slices:
 
     def __init__(self, code: SpecificationCode, namespace: dict[str, Any], limit: int) -> None:
         assert code.slicing is not None  # noqa: S101  who asks has looked
-        grows = any(not isinstance(declared.property, FiniteProperty) for declared in code.properties)
-        self.limit = min(limit, GROWING_LIMIT) if grows else limit
+        properties = [declared.property for declared in code.properties]
+        self._all = (1 << len(code.slicing.parameters)) - 1
+        self.limit = limit
+        for one in properties:
+            if isinstance(one, BoundedProperty):
+                one.most = MOST_OPEN_IN_SLICE
+        if any(not isinstance(one, FiniteProperty | ClockedProperty) for one in properties):
+            self.limit = min(self.limit, GROWING_LIMIT)
+        if any(_domain(event) != self._all for event in code.events):
+            self.limit = min(self.limit, TOGETHER_LIMIT)
+        self.holder_of: Callable[[int], Holder] = lambda _source: None
+        """Who is charged for the slices that the messages of a source make (`Sender.source`)."""
         self.refused: Mapping[str, object] | None = None
-        """What the last event bound of which there can be no slice."""
+        """The binding of the last event of which there can be no slice."""
         self.why = ""
         """Why not."""
-        self.live = 0
-        """Slices, also such that lack a parameter."""
+        self.behind: list[Slice] = []
+        """The slices that matter to the last event and have deadlines before it that have not passed yet."""
         self._code = code
         self._namespace = namespace
         self._parameters = code.slicing.parameters
         self._own = code.slicing.own
-        self._all = (1 << len(self._parameters)) - 1
+        self._forgets = not code.slicing.enforces
+        self._timed = any(one.timed for one in properties)
         self._floating = any(isinstance(kind, kinds.Floating) for _, _, kind in self._parameters)
         self._first: Slice
+        self._holder: Holder = None
+        self._now = 0
         self._known = {domain: _Known() for domain in _joined(_domain(event) for event in code.events)}
-        self._ended: deque[tuple[int, Key]] = deque()
+        self._live: Quota[tuple[int, Key]] = Quota(self.limit)
+        self._ended: Quota[tuple[int, Key]] = Quota(self.limit)
+        self._forgotten = 0
+        self._told: int | None = None
+        self._deadlines: list[tuple[int, int, Slice]] = []
+        self._order = count()
         self._whole = self._known[self._all].slices
         self._formulas = [declared.property.suppresses for declared in code.properties]
+        self.suppresses = any(self._formulas)
+        """Whether a dropped message is taken back in some of its properties."""
         self._look_at(code.properties)
         for wanted in {_domain(event) for event in code.events}:
             for domain, known in self._known.items():
                 if wanted & domain not in (0, domain):
                     known.parts.setdefault(wanted & domain, {})
 
+    @property
+    def live(self) -> int:
+        """How many slices there are, with those that lack a parameter."""
+        return self._live.total
+
     def _look_at(self, properties: Sequence[PropertyCode]) -> None:
         """Find out in which states of automata a slice is over, as if there were none, or nothing but a state."""
-        events = self._code.events
+        self._properties, events = properties, self._code.events
         finite = [declared for declared in properties if isinstance(declared.property, FiniteProperty)]
         every = len(finite) == len(properties)
-        ends = every and bool(finite) and not any(event.acts for event in events if event.period_ns is None)
-        self._lost = [_lost(declared) for declared in finite] if ends else []
-        self._idles = _idles(events, finite, self._all) if every and finite else None
+        tables = all(
+            isinstance(declared.property, FiniteProperty | ClockedProperty) for declared in properties
+        )
+        ends = tables and bool(properties) and not any(event.acts for event in events)
+        self._lost = [_lost(declared) for declared in properties] if ends else []
+        self._renews = bool(properties) and _renews(events, properties, self._all)
         lost = self._lost or [frozenset()] * len(finite)
-        idles = self._idles or [-1] * len(finite)
         self._calm = [
-            [*map(_calm, finite, repeat(number), lost, idles)]
-            if every and event.plain and _domain(event) == self._all
+            [*map(_calm, finite, repeat(number), lost, repeat(self._renews))]
+            if every and event.plain
             else None
             for number, event in enumerate(events)
         ]
@@ -128,10 +187,11 @@ class Slices:
         """The specification begins: there are no slices, and the next ones begin as it has."""
         self._look_at(properties)
         zero = tuple(self._namespace[code] for _, code, _ in self._parameters)
-        values = tuple(self._namespace[name] for name in self._own)
+        values = self.own()
         self._first = Slice(0, (True, *zero), runs, values)
+        self._live.clear()
         self._ended.clear()
-        self.live = 0
+        self._deadlines.clear()
         for known in self._known.values():
             known.slices.clear()
             for part in known.parts.values():
@@ -139,12 +199,10 @@ class Slices:
 
     def take_over(self, before: "Slices") -> None:
         """Go on with those of the same specification before it was loaded again."""
-        self._first, self._known, self._ended, self.live = (
-            before._first,
-            before._known,
-            before._ended,
-            before.live,
-        )
+        self._first, self._known = before._first, before._known
+        self._live.take_over(before._live)
+        self._ended.take_over(before._ended)
+        self._deadlines, self._order = before._deadlines, before._order
         self._whole = before._whole
 
     # What an event belongs to
@@ -176,12 +234,23 @@ class Slices:
         """The slice of all parameters with this key, if there is one."""
         return self._whole.get(key)
 
-    def targets(self, event: EventCode, key: Key) -> tuple[Sequence[Slice], Sequence[Slice]]:
-        """The slices with all parameters that an event belongs to, in the order in which they began, and the others.
+    def quiet(self, event: int, slice_: Slice) -> Sequence[int] | None:
+        """The states of a slice after an event, if nothing comes of it but those."""
+        calm = self._calm[event]
+        if calm is None or not slice_.kept:
+            return None
+        after = [*map(getitem, calm, _states(slice_.runs))]
+        return after if min(after, default=0) >= 0 else None
 
-        `refused` says afterwards whether there would be more of them.
+    def targets(self, event: EventCode, key: Key, time_ns: int, source: int) -> Sequence[Slice]:
+        """The slices that an event belongs to: first those with all parameters, in the order in which they began.
+
+        A slice that begins begins now, and its host is that of the `source`. `refused` says afterwards whether there
+        would be more of them.
         """
         self.refused = None
+        self.behind = []
+        self._now = time_ns
         if self._floating:
             key = tuple(_NAN if value != value else value for value in key)  # noqa: PLR0124  NaN
         domain = _domain(event)
@@ -189,16 +258,17 @@ class Slices:
             known = self._known[domain].slices
             if key in known:
                 found = known[key]
-                return () if found is None else (found,), ()
+                return () if found is None else (self._looked_at(found),)
         size = sum(len(value) for value in key if isinstance(value, bytes))
         if size > MAX_BINDING:
             self._refuse(domain, key, f"a binding of {size} bytes; it may have {MAX_BINDING}")
-            return (), ()
+            return ()
+        self._holder = self.holder_of(source)
         whole: list[Slice] = []
         seeds: list[Slice] = []
         for slice_ in (*self._agreeing(domain, key), *self._fresh(event, domain, key)):
             (whole if slice_.domain == self._all else seeds).append(slice_)
-        return whole, seeds
+        return [*whole, *seeds]
 
     def _agreeing(self, domain: int, key: Key) -> Iterator[Slice]:
         """The slices that bind what the event binds, with the same values."""
@@ -207,7 +277,12 @@ class Slices:
                 for known_key in self._with(other, domain, key):
                     found = known.slices[known_key]
                     if found is not None:
-                        yield found
+                        yield self._looked_at(found)
+
+    def _looked_at(self, slice_: Slice) -> Slice:
+        if slice_.due is not None and slice_.due < self._now:
+            self.behind.append(slice_)
+        return slice_
 
     def _with(self, domain: int, part: int, key: Key) -> Sequence[Key]:
         """The keys of this domain that have these values of the parameters in `part`."""
@@ -246,12 +321,23 @@ class Slices:
                 parent = self._known[other].slices[part]
                 break
         if parent is None:
-            self._remember(domain, key)
+            self._remember(domain, key, self._holder)
             return None
-        if self.live + most > self.limit:
+        if not self._has_room(most):
             self._refuse(domain, key, f"more than {self.limit} slices")
             return None
-        return Slice(domain, key, tuple(map(copy, parent.runs)), parent.values)
+        if parent is self._first:
+            runs = tuple(
+                declared.property.start(self._now) if declared.property.timed else copy(run)
+                for declared, run in zip(self._properties, parent.runs, strict=True)
+            )
+        else:
+            runs = tuple(map(copy, self._looked_at(parent).runs))
+        return Slice(domain, key, runs, parent.values, self._holder)
+
+    def _has_room(self, most: int) -> bool:
+        """Whether the host may have so many slices more, or has some of its own to forget for them."""
+        return self._live.fits(self._holder, most) or (self._forgets and self._live.held(self._holder) > 0)
 
     def _refuse(self, domain: int, key: Key, why: str) -> None:
         self.refused, self.why = self._shown(domain, key), why
@@ -272,28 +358,99 @@ class Slices:
             namespace.update(zip(self._own, slice_.values, strict=True))
         return slice_.runs
 
-    def settle(self, slice_: Slice, runs: tuple[Run, ...], *, happened: bool) -> None:
-        """Take the state back; one that has begun with this event stays only if it `happened`."""
-        if self._own:
-            slice_.values = tuple(self._namespace[name] for name in self._own)
-        slice_.runs = runs
+    def own(self) -> tuple[Any, ...]:
+        """The values of the variables that each slice has of its own."""
+        return tuple(self._namespace[name] for name in self._own)
+
+    def settle(
+        self, slice_: Slice, runs: tuple[Run, ...], values: tuple[Any, ...], *, happened: bool
+    ) -> None:
+        """Take the state back; a slice that has begun with this event stays only if it `happened`."""
+        slice_.runs, slice_.values = runs, values
+        if slice_.gone:
+            return
         if not slice_.kept:
             if not happened:
                 return
             self._keep(slice_)
         if self._lost and all(map(contains, self._lost, _states(runs))):
-            self._remember(slice_.domain, slice_.key)
-            self.live -= 1
-        elif self._idles is not None and slice_.values == self._first.values and self._idles == _states(runs):
+            self._leave(slice_)
+            self._remember(slice_.domain, slice_.key, slice_.holder)
+        elif self._renews and slice_.values == self._first.values and all(run.as_new for run in slice_.runs):
+            self._leave(slice_)
             self._forget(slice_.domain, slice_.key)
-            self.live -= 1
+        elif self._timed:
+            self._await(slice_)
+
+    def forgotten(self, time_ns: int) -> str:
+        """How many slices were forgotten for others of their host, in words; once in a while, else empty."""
+        number = self._forgotten
+        if not number or (self._told is not None and time_ns - self._told < FOLDED_NS):
+            return ""
+        self._forgotten, self._told = 0, time_ns
+        return (
+            f"{number} of its oldest slices are forgotten to make room for new ones of the same host; "
+            f"there may be {self.limit} slices"
+        )
+
+    # Deadlines
+
+    @property
+    def deadline(self) -> int | None:
+        """The first deadline of all slices; None if none waits."""
+        while self._deadlines:
+            time, _, slice_ = self._deadlines[0]
+            if time == slice_.due and not slice_.gone:
+                if slice_.deadline == time:
+                    return time
+                slice_.due = None
+                heappop(self._deadlines)
+                self._await(slice_)
+            else:
+                heappop(self._deadlines)
+        return None
+
+    @property
+    def due(self) -> Slice:
+        """The slice whose deadline that is."""
+        return self._deadlines[0][2]
+
+    def _await(self, slice_: Slice) -> None:
+        """See that the deadline of a slice is in the heap, or an earlier time."""
+        deadline = slice_.deadline
+        if deadline is None or (slice_.due is not None and slice_.due <= deadline):
+            return
+        slice_.due = deadline
+        if len(self._deadlines) > 2 * self.live + 64:  # most of them count no more
+            self._deadlines = [one for one in self._deadlines if one[0] == one[2].due and not one[2].gone]
+            heapify(self._deadlines)
+        heappush(self._deadlines, (deadline, next(self._order), slice_))
+
+    def restart(self, time_ns: int) -> None:
+        """Let the properties with time begin anew in each slice."""
+        self._deadlines.clear()
+        for known in self._known.values():
+            for slice_ in known.slices.values():
+                if slice_ is not None:
+                    slice_.due = None
+                    slice_.runs = tuple(
+                        declared.property.start(time_ns) if declared.property.timed else run
+                        for declared, run in zip(self._properties, slice_.runs, strict=True)
+                    )
+                    self._await(slice_)
+
+    # What is known
+
+    def is_whole(self, slice_: Slice) -> bool:
+        """Whether a slice has all parameters."""
+        return slice_.domain == self._all
 
     def mark(self, slice_: Slice) -> Callable[[], None]:
         """Return what takes back all that comes to the formulas of a slice from here on, but time; one that begins
         with the message at hand has not begun, if there are only formulas.
         """
-        runs, known = slice_.runs, self._known[slice_.domain].slices
-        begun = not slice_.kept and bool(runs) and all(self._formulas)
+        runs = slice_.runs
+        begun = not slice_.kept and all(self._formulas)
         formulas = [
             cast("FormulaRun", run) for run, formula in zip(runs, self._formulas, strict=True) if formula
         ]
@@ -304,18 +461,29 @@ class Slices:
                 run.take_back(mark)
             both = zip(runs, slice_.runs, self._formulas, strict=True)
             slice_.runs = tuple(before if formula else now for before, now, formula in both)
-            there, ended = slice_.key in known, known.get(slice_.key, slice_) is None
-            if begun:
-                if there:
-                    self.live -= not ended
-                    self._forget(slice_.domain, slice_.key)
-            elif not there or ended:
-                self.live += 1
-                self._put(slice_.domain, slice_.key, slice_)
-            if ended:
-                self._ended.remove((slice_.domain, slice_.key))
+            if begun and slice_.kept:
+                self._undo_end(slice_)
+                self._leave(slice_)
+                self._forget(slice_.domain, slice_.key)
+            elif slice_.kept:
+                self._undo_end(slice_)
+                self._await(slice_)
 
         return take_back
+
+    def _undo_end(self, slice_: Slice) -> None:
+        """Make a slice that has ended or was forgotten live again."""
+        if not slice_.gone:
+            return
+        binding = (slice_.domain, slice_.key)
+        known = self._known[slice_.domain].slices
+        if known.get(slice_.key) is not None:
+            return  # another has begun since
+        if slice_.key in known:
+            self._ended.give_back(slice_.holder, binding)
+        slice_.gone = False
+        self._live.take(slice_.holder, binding)
+        self._put(*binding, slice_)
 
     def values(self, slice_: Slice) -> Mapping[int, Any]:
         """The values of the parameters, by their numbers."""
@@ -333,9 +501,21 @@ class Slices:
         return told
 
     def _keep(self, slice_: Slice) -> None:
+        while not self._live.fits(slice_.holder, 1):
+            domain, key = self._live.oldest(slice_.holder)
+            oldest = self._known[domain].slices[key]
+            assert oldest is not None  # noqa: S101  it is live
+            self._leave(oldest)
+            self._forget(domain, key)
+            self._forgotten += 1
         slice_.kept = True
-        self.live += 1
+        self._live.take(slice_.holder, (slice_.domain, slice_.key))
         self._put(slice_.domain, slice_.key, slice_)
+
+    def _leave(self, slice_: Slice) -> None:
+        """A slice is live no more."""
+        slice_.gone = True
+        self._live.give_back(slice_.holder, (slice_.domain, slice_.key))
 
     def _put(self, domain: int, key: Key, slice_: Slice | None) -> None:
         known = self._known[domain]
@@ -345,12 +525,18 @@ class Slices:
                 keys.setdefault(_key(values, part), {})[key] = None
         known.slices[key] = slice_
 
-    def _remember(self, domain: int, key: Key) -> None:
-        """No slice begins with this binding."""
+    def _remember(self, domain: int, key: Key, holder: Holder) -> None:
+        """No slice begins with this binding, until the host has so many of them that it is forgotten."""
+        while not self._ended.fits(holder, 1):
+            if not self._ended.held(holder):
+                if key in self._known[domain].slices:
+                    self._forget(domain, key)
+                return
+            oldest = self._ended.oldest(holder)
+            self._ended.give_back(holder, oldest)
+            self._forget(*oldest)
         self._put(domain, key, None)
-        self._ended.append((domain, key))
-        if len(self._ended) > self.limit:
-            self._forget(*self._ended.popleft())
+        self._ended.take(holder, (domain, key))
 
     def _forget(self, domain: int, key: Key) -> None:
         known = self._known[domain]
@@ -388,51 +574,59 @@ def _joined(domains: Iterator[int]) -> list[int]:
     return sorted(found)
 
 
-def _calm(code: PropertyCode, event: int, lost: frozenset[int], idle: int) -> list[int]:
-    """The state after an event for each state; -1 where a handler runs, or the slice may be over."""
+def _calm(code: PropertyCode, event: int, lost: frozenset[int], renews: bool) -> list[int]:
+    """The state after an event for each state; -1 where a handler runs, or the slice may be over or forgotten."""
     assert isinstance(code.property, FiniteProperty)  # noqa: S101  who asks has looked
     automaton, handled = code.property.automaton, {*code.order}
     return [
         -1
-        if row[event] in lost or row[event] == idle or {*automaton.verdicts[row[event]]} & handled
+        if row[event] in lost
+        or (renews and row[event] == automaton.initial)
+        or {*automaton.verdicts[row[event]]} & handled
         else row[event]
         for row in automaton.table
     ]
 
 
 def _lost(code: PropertyCode) -> frozenset[int]:
-    """The states from which no event leads to a handler any more, now or later."""
-    assert isinstance(code.property, FiniteProperty)  # noqa: S101  who asks has looked
-    automaton = code.property.automaton
+    """The states from which no event and no deadline leads to a handler any more, now or later."""
+    steps = _steps(code.property)
+    handled = {*code.order}
     hopeful: set[int] = set()
-    told = {state for state, verdicts in enumerate(automaton.verdicts) if {*verdicts} & {*code.order}}
     while True:
         more = {
             state
-            for state, row in enumerate(automaton.table)
-            if state not in hopeful and any(target in told or target in hopeful for target in row)
+            for state, ways in enumerate(steps)
+            if state not in hopeful and any(handled & {*told} or target in hopeful for target, told in ways)
         }
         if not more:
-            return frozenset(range(len(automaton))) - hopeful
+            return frozenset(range(len(steps))) - hopeful
         hopeful |= more
 
 
-def _idles(
-    events: Sequence[EventCode], properties: Sequence[PropertyCode], everything: int
-) -> list[int] | None:
-    """The states of the properties in which a slice is as if there were none; None if that cannot be."""
-    automata = [
-        (declared.property.automaton, {*declared.order})
-        for declared in properties
-        if isinstance(declared.property, FiniteProperty)
-    ]
-    initial = [automaton.initial for automaton, _ in automata]
-    for number, event in enumerate(events):
-        stays = event.plain and all(
-            automaton.table[automaton.initial][number] == automaton.initial
-            and handled.isdisjoint(automaton.verdicts[automaton.initial])
-            for automaton, handled in automata
-        )
-        if _domain(event) != everything or not (event.creates or stays):
-            return None
-    return initial
+def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
+    """For each state where an event or a deadline leads, and what is told then."""
+    if isinstance(compiled, FiniteProperty):
+        automaton = compiled.automaton
+        return [[(target, automaton.verdicts[target]) for target in row] for row in automaton.table]
+    assert isinstance(compiled, ClockedProperty)  # noqa: S101  who asks has looked
+    verdicts = compiled.verdicts
+    found = []
+    for early, late, wait in zip(compiled.moves, compiled.late, compiled.waits, strict=True):
+        ways = [(target, verdicts[target]) for target, _ in (*early, *late)]
+        found.append(ways if wait is None else [*ways, (wait.move[0], wait.told)])
+    return found
+
+
+def _renews(events: Sequence[EventCode], properties: Sequence[PropertyCode], everything: int) -> bool:
+    """Whether a slice that is as at its beginning may be forgotten: each event begins one, or changes nothing in it."""
+    return all(
+        _domain(event) == everything
+        and (event.creates or (event.plain and all(_stays(one, number) for one in properties)))
+        for number, event in enumerate(events)
+    )
+
+
+def _stays(code: PropertyCode, event: int) -> bool:
+    run = code.property.start(0)
+    return run.as_new and {*code.order}.isdisjoint(run.step(event, 0)) and run.as_new

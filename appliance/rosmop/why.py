@@ -418,20 +418,32 @@ class _Trial:
 
 
 def of_slice(
-    compiled: CompiledProperty, trail: Iterable[Bound], values: Mapping[int, Any], category: str
+    compiled: CompiledProperty,
+    trail: Iterable[Bound],
+    values: Mapping[int, Any],
+    category: str,
+    passed: int | None = None,
 ) -> Explanation | None:
-    """What made the verdict in the slice of a binding (parameters by number): it is the last that happened.
+    """What made the verdict in the slice of a binding (parameters by number): it is the last that happened, or the
+    deadline that has `passed`.
 
     None where it takes an event of which it is not known whether it happened in this slice.
     """
-    found, own = Steps(compiled, 0), dict[Happened, bool]()
+    own: dict[Happened, bool] = {}
+    happened: list[Happened] = []
     for bound in trail:
         if not bound.passed and compiled.suppresses:
             continue
         if all(map(_same, map(values.get, bound.binds), bound.key[1:])) and (own or bound.creates):
-            happened = Happened(bound.event, bound.time, bound.sender)
-            own[happened] = bound.everywhere
-            found.add(happened)
+            happened.append(Happened(bound.event, bound.time, bound.sender))
+            own[happened[-1]] = bound.everywhere
+    if not happened:
+        return None
+    found = Steps(compiled, happened[0].time)
+    for event in happened:
+        found.add(event)
+    if passed is not None:
+        found.add(Happened(_DEADLINE, passed, NOBODY))
     why = found.explain(category)
     return why if why is not None and all(own[event] for event in why.events) else None
 

@@ -252,6 +252,21 @@ DRY_RUNS = Share(
         "unit/specifications/test_monitors.py::test_a_client_has_one_dry_run_at_a_time",
     ),
 )
+SLICES = Share(
+    "slices of a parametric specification (of bindings that have ended as many are remembered)",
+    Bounds(whole=100_000, host=50_000, strangers=0, kept=0),
+    "a host gets no more than is left for all others, and hosts without a registration are one: where the"
+    " specification only observes, the oldest slice of the same host is forgotten; where it drops, changes or"
+    " publishes messages, the message with a new binding is a fault; no slice is removed for another host's. There are"
+    " 2,000 in all where an event or a timer does not bind all parameters, and 1,000 where a property has no tables",
+    "`monitor fault`, a line of the monitor; `rosrv_monitor_slices`",
+    (
+        "unit/rosmop/test_slices_shares.py::test_a_guest_that_makes_up_ids_refuses_the_robot_nothing",
+        "unit/rosmop/test_slices_shares.py::test_a_guest_that_makes_up_ids_pushes_out_its_own",
+        "unit/rosmop/test_slices_shares.py::test_one_message_concerns_a_bounded_number_of_slices",
+    ),
+    setting="slices (the first number)",
+)
 REST_CONNECTIONS = Share(
     "connections to REST, TLS handshakes included",
     Bounds(whole=512, host=64, strangers=192, kept=320),

@@ -64,7 +64,7 @@ class Middle:
 
     `budget` is how many seconds of processor time a message may take. `publish(published)` sends what a monitor
     publishes; `changed(topics)` is called when other topics may be wanted, with those whose messages may fare otherwise
-    now (None: all).
+    now (None: all). `holder(host)` is charged for the slices that messages of this host make.
     """
 
     def __init__(
@@ -75,6 +75,7 @@ class Middle:
         budget: float,
         publish: Callable[[Published], None],
         changed: Callable[[frozenset[str] | None], None],
+        holder: Callable[[str], str] = str,
     ) -> None:
         self._loop = loop
         self.budget = budget
@@ -94,6 +95,7 @@ class Middle:
         self._loader = Loader(loop, self.loaded)
         self.observations = Observations(loop, reporter, self._rows)
         self._changed = changed
+        self._holder = holder
         self.senders = Senders()
         self._margins = Margins()
         self._publish = publish
@@ -138,6 +140,7 @@ class Middle:
             return
         result.limit_time(time.thread_time, self.budget)
         result.explain_when(self.observer.asks, self._on_trial.asks)
+        result.charge_slices(self._holder_of)
         before, now, first = self.monitors, self.now(), self._stated is None or bool(self.blocked)
         if before is None:
             outcome = self._begun(result, now, restarted=first and message.restarted)
@@ -169,6 +172,10 @@ class Middle:
         if restarted and self._keeper is None:
             return monitors.recover((), {"": _NO_MEMORY}, now, restarted=True)
         return monitors.start(now, restarted=restarted)
+
+    def _holder_of(self, source: int) -> str:
+        place = self.senders.place(source)
+        return self._holder("" if place is None else place.host)
 
     def _taken(self, message: SpecificationsStated, began: list[str], anew: frozenset[str] | None) -> None:
         self.look_again()

@@ -17,6 +17,7 @@ from appliance.rosmop.types.messages import Messages
 
 _TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in one go
 _TRIAL_TICKS_SECONDS = 0.02
+_DEADLINES = 100  # of slices that pass in one go: some milliseconds
 
 
 def monitor_set(message: SpecificationsStated) -> Result:
@@ -32,6 +33,7 @@ def monitor_set(message: SpecificationsStated) -> Result:
         trials=message.trials,
         trial_patience=lambda: _patience(_TRIAL_TICKS_SECONDS),
         slices=message.slices,
+        deadlines=_DEADLINES,
     )
     monitors.take_module(part.module)
     return monitors

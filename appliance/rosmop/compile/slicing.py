@@ -4,10 +4,13 @@ An event binds a parameter of the specification by one of its own with that name
 one that gives the values that it binds, for which nothing else of the message is read.
 """
 
+from collections.abc import Iterable, Sequence
+
 from appliance.rosmop.compile.places import Variable
 from appliance.rosmop.compile.scope import Shared, SpecificationNames
-from appliance.rosmop.compiled import Slicing
+from appliance.rosmop.compiled import EventCode, PropertyCode, Slicing
 from appliance.rosmop.ir import form
+from appliance.rosmop.logics.bounded import BoundedProperty
 from appliance.rosmop.logics.interface import CompiledProperty
 from appliance.rosmop.logics.past import PastProperty
 from appliance.rosmop.positions import Finding
@@ -61,7 +64,9 @@ def check_own(names: SpecificationNames, variable: Variable) -> None:
         raise SpecificationError.at(variable.position, text)
 
 
-def slicing_of(names: SpecificationNames) -> Slicing | None:
+def slicing_of(
+    shared: Shared, names: SpecificationNames, events: Iterable[EventCode], properties: Iterable[PropertyCode]
+) -> Slicing | None:
     """What the slices of a specification differ in; None without parameters."""
     if not names.parameters:
         return None
@@ -70,10 +75,29 @@ def slicing_of(names: SpecificationNames) -> Slicing | None:
         for variable in names.variables.values()
         if variable.sliced and variable.name not in names.parameters
     )
+    functions = [event.function for event in events]
+    functions += (name for code in properties for name in code.handlers.values())
     return Slicing(
         tuple((parameter.name, parameter.code, parameter.type) for parameter in names.parameters.values()),
         tuple(variable.code for variable in own),
+        _enforces(shared, functions),
     )
+
+
+def _enforces(shared: Shared, functions: Sequence[str]) -> bool:
+    """Whether these functions, or those that they call, drop, change or publish a message."""
+    waiting, seen = [*functions], {*functions}
+    while waiting:
+        function = shared.functions.get(waiting.pop())
+        for node in () if function is None else form.nodes(function.body):
+            if isinstance(node, form.Drop | form.Publish) or (
+                isinstance(node, form.WriteBack) and node.writes
+            ):
+                return True
+            if isinstance(node, form.Invoke) and node.function not in seen:
+                seen.add(node.function)
+                waiting.append(node.function)
+    return False
 
 
 def binds(names: SpecificationNames, event: tree.Event) -> tuple[int, ...]:
@@ -103,13 +127,18 @@ def acts(function: form.Function, shared: Shared) -> bool:
 
 def unsliceable(compiled: CompiledProperty) -> str | None:
     """Why slices cannot have a run each of a property."""
-    if compiled.timed:
+    if isinstance(compiled, PastProperty) and compiled.timed:
         return (
-            f"a `{compiled.logic}` with times cannot be sliced: keep the time of an event in a variable of the slice "
-            "and compare it, or look at it in an `event … every`"
+            "a formula with several bounds of time, or with one that neither begins at 0 nor ends at `inf`, cannot be "
+            "sliced: what a slice keeps of it has no bound; write a property for each bound"
         )
     if isinstance(compiled, PastProperty):
         return "the formula has too many states to be sliced; split it into several properties"
+    if isinstance(compiled, BoundedProperty) and any(compiled.folded.bounds):
+        return (
+            "a formula that looks back and forward within bounds of time cannot be sliced: what a slice keeps of it "
+            "has no bound; write a property for each"
+        )
     return None
 
 

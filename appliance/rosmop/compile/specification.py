@@ -164,7 +164,7 @@ def _compile(
         variables,
         uses,
         tuple(sorted(names.comparisons.values(), key=lambda comparison: comparison.position)),
-        slicing_of(names),
+        slicing_of(shared, names, good, known),
         any(modifier.parts == ("begin",) for modifier in specification.modifiers),
     )
 

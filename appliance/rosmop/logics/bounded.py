@@ -25,7 +25,7 @@ from abc import ABC, abstractmethod
 from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Mapping
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -34,6 +34,9 @@ from appliance.rosmop.logics.interface import Categories, CompiledProperty, Run,
 from appliance.rosmop.logics.past import FOREVER, VERDICTS, Instruction, Program, Window, fold
 
 MOST_OPEN = 10_000
+
+MOST_OPEN_IN_SLICE = 1_000
+"""The same of a slice of a parametric specification, of which there may be many."""
 
 _LATER = ("until", "next")
 
@@ -482,6 +485,8 @@ class BoundedProperty(CompiledProperty):
     """A formula of mtl about the future, and perhaps the past."""
 
     timed = True
+    most = MOST_OPEN
+    """How many events of a run may wait."""
 
     def __init__(self, source: Source, formula: Formula) -> None:
         super().__init__(source, VERDICTS)
@@ -557,6 +562,10 @@ _KINDS: dict[str, type[_Operator]] = {
 }
 
 
+_FORWARD = (_Until, _OpenUntil, _Next)
+"""Operators that keep nothing but the events that wait (`rows`)."""
+
+
 class BoundedRun:
     """A run of a formula about the future."""
 
@@ -583,6 +592,21 @@ class BoundedRun:
         found = (operator.deadline for operator in self.operators.values())
         return min((deadline for deadline in found if deadline is not None), default=None)
 
+    @property
+    def as_new(self) -> bool:
+        """Whether no event waits, and the part about the past is as at the beginning."""
+        operators = self.operators.values()
+        return (
+            all(type(operator) in _FORWARD and not operator.rows for operator in operators)
+            and self.deadline is None
+            and self._at_once == self._compiled.folded.start()
+        )
+
+    def __copy__(self) -> "BoundedRun":
+        program = self._compiled.program
+        shared = (self._compiled, program, *program.instructions)
+        return deepcopy(self, {id(one): one for one in shared})
+
     def step(self, event: int, time_ns: int) -> Categories:
         """Take the event."""
         if self._now < time_ns:
@@ -590,8 +614,8 @@ class BoundedRun:
             if deadline is not None and time_ns > deadline:
                 raise ValueError("the deadline has passed: expire the run first")
             self._now = time_ns
-        if sum(len(operator.rows) for operator in self.operators.values()) >= MOST_OPEN:
-            raise RunFaultError(f"more than {MOST_OPEN} events wait for what follows them")
+        if sum(len(operator.rows) for operator in self.operators.values()) >= self._compiled.most:
+            raise RunFaultError(f"more than {self._compiled.most} events wait for what follows them")
         self.place += 1
         self._places = self._compiled.folded.take(self._at_once, event, self._now)
         self._values = {}

@@ -50,6 +50,10 @@ class Run(Protocol):
     """
 
     @property
+    def as_new(self) -> bool:
+        """Whether it goes on as a run that begins now would; where that is not known, False."""
+
+    @property
     def deadline(self) -> int | None:
         """The last instant (ns) at which an event is in time, or None if the run waits for nothing."""
 
@@ -177,6 +181,11 @@ class UntimedRun:
 
     deadline: int | None = None
 
+    @property
+    def as_new(self) -> bool:
+        """Not known."""
+        return False
+
     def expire(self) -> Categories:
         """Never right: there is no deadline."""
         raise ValueError("this run has no deadline")
@@ -187,10 +196,16 @@ class FiniteRun(UntimedRun):
 
     __slots__ = ("_automaton", "state")
     keeps = ("state",)
+    __copy__ = twin
 
     def __init__(self, automaton: Automaton) -> None:
         self._automaton = automaton
         self.state = automaton.initial
+
+    @property
+    def as_new(self) -> bool:
+        """Whether it is in the initial state."""
+        return self.state == self._automaton.initial
 
     def step(self, event: int, _time_ns: int) -> Categories:
         """Take the event; the time plays no part."""
@@ -255,6 +270,16 @@ class ClockedRun:
         """When the wait of the state is over."""
         wait = self._tables.waits[self.state]
         return None if wait is None else self.since + wait.after
+
+    @property
+    def as_new(self) -> bool:
+        """Whether it is in the initial state, and the clock plays no part there."""
+        state, tables = self.state, self._tables
+        return (
+            state == tables.initial
+            and tables.waits[state] is None
+            and tables.moves[state] == tables.late[state]
+        )
 
     def step(self, event: int, time_ns: int) -> Categories:
         """Take the event."""

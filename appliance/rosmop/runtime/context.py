@@ -176,10 +176,20 @@ class Context:
         self._live = live
         self._pending = 0
 
-    def begin(self) -> None:
-        """A new message: the whole budget."""
-        self.budget = self.most if self.turn.clock is None else min(STEP, self.most)
-        self._left = self.most - self.budget
+    def begin(self, most: int | None = None) -> None:
+        """A new message: the whole budget, or at most so much of it."""
+        whole = self.most if most is None else min(most, self.most)
+        self.budget = whole if self.turn.clock is None else min(STEP, whole)
+        self._left = whole - self.budget
+
+    def put_off(self) -> Callable[[], None]:
+        """Return what gives back the budget that is left now, and the time."""
+        budget, left, until = self.budget, self._left, self.turn.until
+
+        def go_on() -> None:
+            self.budget, self._left, self.turn.until = budget, left, until
+
+        return go_on
 
     def spend(self, instructions: int, site: int) -> None:
         """Take from the budget; a fault if nothing is left."""

@@ -204,7 +204,7 @@ def test_each_goal_is_answered_within_its_cancel() -> None:
     goal(monitors, "cancel", "b", 3.2)
     goal(monitors, "result", "a", 5)
     said = [(each.time / SECOND, line.text) for each in monitors.advance(20 * SECOND) for line in each.log]
-    assert said == [(6.5, "goal b is not answered 3.0 s after it was cancelled")]
+    assert said == [(6.2, "goal b is not answered 3.0 s after it was cancelled")]
 
 
 def test_an_id_is_that_of_one_goal() -> None:

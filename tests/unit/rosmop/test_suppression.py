@@ -358,7 +358,7 @@ def test_slices_take_back_theirs(creation: str) -> None:
 
 def test_a_fault_of_the_run_itself_drops_and_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """More open events than a run may have: the message is dropped, and no formula has seen it."""
-    monkeypatch.setattr("appliance.rosmop.logics.bounded.MOST_OPEN", 2)
+    monkeypatch.setattr("appliance.rosmop.logics.bounded.BoundedProperty.most", 2)
     monitors = load(guard("mtl: a => always[0,9s] !b"))
     assert passed(monitors, [(1, "a"), (2, "a"), (3, "a"), (4, "b")]) == [True, True, False, False]
     run = monitors.monitor("s").properties[0].run

@@ -773,3 +773,11 @@ def test_a_verdict_says_who_and_which_messages_made_it_so(world: Monitored) -> N
     drop = world.event("drop", monitor="latch", count=0)
     assert drop.detail["at"] == ["0.rv:7:33"]
     assert drop.detail["conditions"] == {"0.rv:4:77": {"text": "go"}}
+
+
+def test_slices_are_charged_to_the_host_that_publishes(world: Monitored) -> None:
+    """A host with a registration is told apart; all other hosts are one."""
+    middle = world.engine.middle
+    world.state(NodePlaced("robot", "/robot", "10.0.0.1"), world.listen())
+    numbers = [middle.senders.number(Place("k", "/t", host)) for host in ("10.0.0.1", "10.0.0.8", "10.0.0.9")]
+    assert [middle._holder_of(number) for number in (*numbers, 999)] == ["10.0.0.1", "", "", ""]
