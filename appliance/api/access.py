@@ -16,7 +16,7 @@ import secrets
 import time
 from collections import OrderedDict
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import cast
 
 from appliance.api.problems import ProblemError, too_many
@@ -36,7 +36,8 @@ _MOST_KNOWN = 1024
 class Bearer:
     """The holder of a token; `expires` is seconds since the epoch.
 
-    `shown` is what came with the request, the token or its reading key; `asked` the request itself, if it is no look.
+    `shown` is what came with the request, the token or its reading key; `asked` the request itself, if it is no look,
+    and `gone` ends when its client disconnects.
     """
 
     id: str
@@ -45,6 +46,7 @@ class Bearer:
     expires: float
     shown: str
     asked: Asked | None = None
+    gone: "asyncio.Future[None] | None" = field(default=None, compare=False)
 
 
 class Doorkeeper:

@@ -8,7 +8,10 @@ Invariants:
    next one; what is lost is counted and logged.
 """
 
+import asyncio
 import contextlib
+import math
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -16,12 +19,13 @@ from typing import Any
 import structlog
 
 from appliance.api.access import Bearer
-from appliance.channel.admin import CHANGES, A, AdminAnswer, AdminRequest, decode
+from appliance.channel.admin import CHANGES, ORDERS, A, AdminAnswer, AdminRequest, decode
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
 from appliance.channel.messages.api import (
     RequestAnswered,
     RequestMade,
+    RequestWithdrawn,
     RestCalled,
     RestServed,
     TokenKept,
@@ -32,16 +36,23 @@ _log = structlog.get_logger()
 _MOST_OPEN = 48
 _MOST_KEPT = 1000
 ANSWER_SECONDS = 15.0
+_GRACE_SECONDS = 10.0  # in which control answers what became of an order whose time is over
+_UNKNOWN = (
+    ": the order may have taken effect; if it has not by now, it never will. What took effect is in the audit log:"
+    " rosrv audit search --since 5m (GET /v1/audit)"
+)
 
 
 class ControlAwayError(Exception):
     """Control cannot be asked now; the text says why, for whoever called."""
 
 
-def _made(number: int, request: AdminRequest[Any], bearer: Bearer | None) -> RequestMade:
+def _made(
+    number: int, request: AdminRequest[Any], bearer: Bearer | None, until: float = math.inf
+) -> RequestMade:
     shown = bearer.shown if bearer is not None else ""
     asked = bearer.asked if bearer is not None and type(request) in CHANGES else None
-    return RequestMade(number, request, shown, asked)
+    return RequestMade(number, request, shown, asked, until)
 
 
 class ControlLink:
@@ -83,22 +94,55 @@ class ControlLink:
     async def ask(
         self, request: AdminRequest[A], bearer: Bearer | None, seconds: float = ANSWER_SECONDS
     ) -> AdminAnswer[A]:
-        """Control's answer to a request of whoever showed a token, if any. Raises `ControlAwayError`."""
+        """Control's answer to a request of whoever showed a token, if any. Raises `ControlAwayError`.
+
+        What has not taken effect after so many seconds, or when the client is gone, is withdrawn; control says so.
+        """
         if self._link.channel is None:
             raise ControlAwayError("the appliance is being restarted: try again in a second")
         if self._link.unanswered >= _MOST_OPEN:
             raise ControlAwayError("too many requests wait for the appliance: try again")
+        changes = type(request) in ORDERS
+        longest = seconds + _GRACE_SECONDS if changes else seconds
         try:
-            answer = await self._link.ask(lambda number: _made(number, request, bearer), seconds)
+            answer = await self._asked(request, bearer, time.monotonic() + seconds, longest)
         except TimeoutError:
-            raise ControlAwayError(f"the appliance did not answer within {seconds:g} s") from None
+            raise ControlAwayError(
+                f"the appliance did not answer within {longest:g} s{_UNKNOWN if changes else ''}"
+            ) from None
         except ChannelFullError:
             raise ControlAwayError("the appliance does not take requests now: try again") from None
         except ChannelClosedError:
             raise ControlAwayError(
-                "the appliance is being restarted: whether the request was carried out is not known"
+                f"the appliance was restarted before it answered{_UNKNOWN if changes else ': try again'}"
             ) from None
         return decode(answer, request)
+
+    async def _asked(
+        self, request: AdminRequest[Any], bearer: Bearer | None, until: float, longest: float
+    ) -> bytes:
+        """Ask, and have the request withdrawn when its client is gone. Raises as `Link.ask`."""
+        number = 0
+
+        def question(given: int) -> RequestMade:
+            nonlocal number
+            number = given
+            return _made(number, request, bearer, until)
+
+        def withdraw(gone: "asyncio.Future[None]") -> None:
+            if not gone.cancelled():
+                with contextlib.suppress(ChannelFullError):  # the time of the request ends it
+                    self._link.send(RequestWithdrawn(number))
+
+        gone = bearer.gone if bearer is not None else None
+        if gone is not None:
+            gone.add_done_callback(withdraw)
+        try:
+            answer: bytes = await self._link.ask(question, longest)
+        finally:
+            if gone is not None:
+                gone.remove_done_callback(withdraw)
+        return answer
 
     def tell(self, call: RestCalled) -> None:
         """Have a call recorded."""

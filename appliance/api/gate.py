@@ -93,8 +93,12 @@ class Gate:
         if scope["type"] != "http":
             return
         answer = _Answer(scope, send, self._journal)
+        gone: asyncio.Future[None] | None = None
         try:
             bearer, body = await self._pass(scope, receive)
+            if bearer is not None and bearer.asked is not None:
+                gone = asyncio.ensure_future(_disconnected(receive))
+                bearer = replace(bearer, gone=gone)
             answer.bearer = scope[BEARER] = bearer
             await self._app(scope, _replay(body, receive), answer.send)
         except ProblemError as problem:
@@ -105,6 +109,9 @@ class Gate:
         except Exception as error:  # noqa: BLE001  a defect in a route is one client's failure
             _log.exception("a REST call failed", path=scope["path"])
             await answer.fail(defect(error), receive)
+        finally:
+            if gone is not None:
+                gone.cancel()
 
     async def _pass(self, scope: Scope, receive: Receive) -> tuple[Bearer | None, bytes]:
         host = scope["client"][0]
@@ -211,6 +218,12 @@ class _Answer:
             dry=is_dry(path, self._scope["query_string"]),
             duration_us=(time.monotonic_ns() - self._started) // 1000,
         )
+
+
+async def _disconnected(receive: Receive) -> None:
+    """Return when the client is gone."""
+    while (await receive())["type"] != "http.disconnect":
+        pass
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:

@@ -568,6 +568,9 @@ CHANGES = frozenset(
 )
 """What changes something in the name of a token: control makes it only with the request that asked for it."""
 
+ORDERS = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
+"""What changes something over REST, also in the name of a host itself."""
+
 if TYPE_CHECKING:
     RestRequest = AdminRequest[Any]
     AnyRequest = AdminRequest[Any]

@@ -16,6 +16,13 @@ SECONDS = 60.0
 """How long an answer may take: longer than control's slowest, a host that waits for charon, a set that is compiled."""
 
 
+_GRACE_SECONDS = 10.0
+UNKNOWN = (
+    "an order may have taken effect; if it has not by now, it never will. What took effect:"
+    " rosrv audit search --since 5m"
+)
+
+
 class NotRunningError(Exception):
     """No appliance can be asked at this place, or not by this user or token; the text says what to do."""
 
@@ -46,7 +53,7 @@ class AdminSocket:
                 sock.settimeout(self._seconds)
                 sock.connect(str(path))
                 sock.sendall(line + b"\n")
-                answer = _read_line(sock)
+                answer = self._read(sock)
         except FileNotFoundError:
             raise NotRunningError(
                 f"{self.state}: no appliance runs with this state directory; start it: rosrv up"
@@ -58,15 +65,25 @@ class AdminSocket:
                 f"{self.state}: the appliance that used this state directory has ended"
             ) from None
         except TimeoutError:
-            raise NotRunningError(
-                f"{path}: the appliance did not answer within {self._seconds:g} s"
-            ) from None
+            text = f"{path}: the appliance did not answer within {self._seconds:g} s"
+            raise NotRunningError(f"{text}; {UNKNOWN}") from None
         except OSError as error:
             raise NotRunningError(f"{path}: {error.strerror or error}") from error
         try:
             return decode(answer, request)
         except msgspec.MsgspecError as error:
             raise NotRunningError(f"{path}: an appliance of another version answers: {error}") from None
+
+    def _read(self, sock: socket.socket) -> bytes:
+        """Return the answer; when it does not come in time, withdraw the request and wait for what became of it."""
+        line = bytearray()
+        try:
+            _read_line(sock, line)
+        except TimeoutError:
+            sock.shutdown(socket.SHUT_WR)
+            sock.settimeout(_GRACE_SECONDS)
+            _read_line(sock, line)
+        return bytes(line)
 
 
 def encoded(request: AdminRequest[Any]) -> bytes:
@@ -79,11 +96,10 @@ def encoded(request: AdminRequest[Any]) -> bytes:
         raise NotRunningError(f"'{shown}' is not UTF-8: write it anew in that encoding") from None
 
 
-def _read_line(sock: socket.socket) -> bytes:
-    line = bytearray()
+def _read_line(sock: socket.socket, line: bytearray) -> None:
+    """Read the rest of a line."""
     while not line.endswith(b"\n"):
         piece = sock.recv(65536)
         if not piece:
-            raise ConnectionResetError("the appliance closed the connection before it answered")
+            raise ConnectionResetError(f"the appliance closed the connection before it answered; {UNKNOWN}")
         line += piece
-    return bytes(line)

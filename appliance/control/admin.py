@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import select
 import socket
 from typing import Any
 
@@ -10,6 +11,7 @@ import structlog
 
 from appliance.channel import admin
 from appliance.control.administration import Administration
+from appliance.withdrawal import awaited
 
 _log = structlog.get_logger()
 _LINE_LIMIT = 16 << 20
@@ -31,7 +33,9 @@ class AdminServer:
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
             while line := await reader.readline():
-                writer.write(admin.encode(await self._answer(line)) + b"\n")
+                with awaited(lambda: _given_up(writer)):
+                    answer = await self._answer(line)
+                writer.write(admin.encode(answer) + b"\n")
                 await writer.drain()
         except (ValueError, ConnectionError) as error:
             _log.warning("a tool spoke nonsense on the admin socket", error=str(error))
@@ -48,3 +52,12 @@ class AdminServer:
                 False, error=f"not a request of this version: {error}", trouble="request"
             )
         return await self._administration.carry_out(request, who=_OPERATOR)
+
+
+def _given_up(writer: asyncio.StreamWriter) -> bool:
+    """Whether the client closed the connection, or its direction: so it withdraws what it asked."""
+    if writer.is_closing():
+        return True
+    found = select.poll()
+    found.register(writer.get_extra_info("socket").fileno(), select.POLLRDHUP)
+    return bool(found.poll(0))

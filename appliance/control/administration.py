@@ -32,6 +32,7 @@ from appliance.specifications.monitors import (
     UnknownMonitorError,
 )
 from appliance.store.database import StoreError
+from appliance.withdrawal import WithdrawnError, require_awaited
 
 # The first that an error is.
 _TROUBLES: dict[type[Exception], admin.Trouble] = {
@@ -41,6 +42,7 @@ _TROUBLES: dict[type[Exception], admin.Trouble] = {
     SenselessError: "request",
     TooManyLooksError: "busy",
     DryRunUnderWayError: "busy",
+    WithdrawnError: "busy",
     UnknownMonitorError: "unknown",
     UnknownHostError: "unknown",
     HostForbiddenError: "forbidden",
@@ -96,7 +98,8 @@ class Administration:
     async def carry_out(self, request: admin.AdminRequest[A], *, who: str) -> admin.AdminAnswer[A]:
         """Do what is asked on behalf of `who` (the name of a token, or `operator` for the admin socket).
 
-        What somebody did is in the audit log when it is answered: who then searches finds it.
+        What somebody did is in the audit log when it is answered: who then searches finds it. An order whose client
+        gave up is not begun (`appliance/withdrawal.py`, which says when one that was begun is withdrawn).
         """
         answer = await self._answer(request, who)
         if self._methods[type(request)].orders:
@@ -106,6 +109,7 @@ class Administration:
     async def _answer(self, request: admin.AdminRequest[A], who: str) -> admin.AdminAnswer[A]:
         method, wants_who, _ = self._methods[type(request)]
         try:
+            require_awaited()
             if type(request) in KEPT:
                 self._require_room()
             return admin.AdminAnswer(True, await (method(request, who) if wants_who else method(request)))

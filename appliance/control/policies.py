@@ -33,6 +33,7 @@ from appliance.policy.policy import Policy
 from appliance.site_keys import read_signature, signer
 from appliance.store.revisions import Trial, UnknownRevisionError, wanted
 from appliance.store.state import RevisionRow, StateStore
+from appliance.withdrawal import require_awaited, take_effect
 
 _log = structlog.get_logger()
 _DISK = "disk"
@@ -150,6 +151,7 @@ class Policies:
     async def _changing(self, expected: int | None) -> AsyncIterator[None]:
         """Around an operator's change; it is on the disk and carried out afterwards."""
         async with self._one_change:
+            require_awaited()
             if expected not in (None, self.revision):
                 raise RevisionChangedError(expected, self.revision)
             yield
@@ -166,6 +168,7 @@ class Policies:
         async with self._changing(request.expected):
             before = self.revision
             policy, signature = await self._prepared(self._read, str(self.file), by)
+            take_effect()
             self.trial.announce(before, within)
             revoked = self._keep(policy, signature, who=_DISK, note="reloaded from disk", by=by)
             return self._answer(policy, before, revoked, within)
@@ -185,6 +188,7 @@ class Policies:
                     before, before, [str(warning) for warning in self.current.warnings], 0, self.confirm_by
                 )
             policy, signature = await self._prepared(lambda: given, f"revision {self.revision + 1}", who)
+            take_effect()
             self.trial.announce(before, within)
             revoked = self._keep(policy, signature, who=who, note=request.note or "posted")
             return self._answer(policy, before, revoked, within)
@@ -325,6 +329,7 @@ class Policies:
             raise PolicyRefusedError([str(finding) for finding in error.findings]) from error
 
     def _keep(self, policy: Policy, signature: str, *, who: str, note: str, by: str | None = None) -> int:
+        take_effect()
         number = self.revision + 1
         row = RevisionRow(number, policy.text, policy.file, time.time(), who, note, signature)
         self.store.save_revision(row)

@@ -6,11 +6,13 @@ Invariants, so that an api that is flooded or has fallen to a stranger cannot ho
    nodes. Those that wait for others (`WaitingRequest`, at most `_MOST_SLOW`) hold up nobody else.
 2. What is not of the link ends it; an api that does not read its answers loses the link.
 3. Nothing that can be asked here makes an access token, and no decision of RVMaster depends on the api.
-4. Everything is asked in the name of a token that was shown and whose role may; a change is what the client asked for,
+4. What no client waits for any more is withdrawn before it takes effect (`appliance/withdrawal.py`).
+5. Everything is asked in the name of a token that was shown and whose role may; a change is what the client asked for,
    with its proof (`rest_proof.py`). What is not is refused and recorded, by control itself.
 """
 
 import asyncio
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -21,29 +23,33 @@ from appliance.audit.record import Severity
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.admin import (
-    CHANGES,
+    ORDERS,
     AdminAnswer,
     ChallengeWanted,
-    HostEnrol,
-    HostRenewed,
-    HostRenewItself,
     WaitingRequest,
     encode,
     verb_of,
 )
 from appliance.channel.channel import Channel, ChannelFullError
 from appliance.channel.link import Link
-from appliance.channel.messages.api import RequestAnswered, RequestMade, RestCalled, RestServed, TokensStated
+from appliance.channel.messages.api import (
+    RequestAnswered,
+    RequestMade,
+    RequestWithdrawn,
+    RestCalled,
+    RestServed,
+    TokensStated,
+)
 from appliance.control.administration import Administration
 from appliance.control.rest_proof import Askers, UnprovenError
 from appliance.control.tokens import Tokens
+from appliance.withdrawal import awaited
 
 _log = structlog.get_logger()
 _MOST_WAITING = 64
 _TEXT = 300
 _DENIED = (401, 403, 421, 429)
-_ORDERS = ("POST", "PUT", "PATCH", "DELETE")  # refused in whatever way, nothing was changed
-_CHANGES = CHANGES | {HostEnrol, HostRenewItself, HostRenewed}
+_METHODS = ("POST", "PUT", "PATCH", "DELETE")  # refused in whatever way, nothing was changed
 _MOST_SLOW = 16
 
 
@@ -69,6 +75,7 @@ class RestLink:
         self._trail = trail
         self._link = Link(self._received, self._lost)
         self._waiting: deque[RequestMade] = deque()
+        self._withdrawn: dict[int, bool] = {}  # of the requests of the present link that are not answered
         self._worker: asyncio.Task[None] | None = None  # of the present link
         self._slow: set[asyncio.Task[None]] = set()
         self._workers: set[asyncio.Task[None]] = set()  # that, and those of links that ended amid a request
@@ -79,6 +86,7 @@ class RestLink:
         self._link.attach(channel)
         self._worker = None
         self._waiting.clear()
+        self._withdrawn = {}
         self.state_tokens()
 
     def _received(self, message: object) -> None:
@@ -89,10 +97,14 @@ class RestLink:
                     self._send_answer(number, AdminAnswer(False, error=text, trouble="busy"))
                     return
                 self._waiting.append(message)
+                self._withdrawn[number] = False
                 if self._worker is None or self._worker.done():
                     self._worker = asyncio.get_running_loop().create_task(self._work(self._link.channel))
                     self._workers.add(self._worker)
                     self._worker.add_done_callback(self._workers.discard)
+            case RequestWithdrawn(number):
+                if number in self._withdrawn:
+                    self._withdrawn[number] = True
             case RestCalled():
                 self._record(message)
             case RestServed(pin):
@@ -121,12 +133,19 @@ class RestLink:
         task.add_done_callback(self._slow.discard)
 
     async def _serve(self, channel: Channel | None, made: RequestMade) -> None:
-        answer = await self._answer(made)
+        withdrawn = self._withdrawn
+
+        def given_up() -> bool:
+            gone = withdrawn.get(made.number, False) or channel is not self._link.channel
+            return gone or time.monotonic() > made.until
+
+        with awaited(given_up):
+            answer = await self._answer(made)
         if channel is self._link.channel:
             self._send_answer(made.number, answer)
 
     async def _answer(self, made: RequestMade) -> AdminAnswer[Any]:
-        if type(made.request) in _CHANGES and self._trail.obstacle is not None:
+        if type(made.request) in ORDERS and self._trail.obstacle is not None:
             return AdminAnswer(False, error=self._trail.obstacle, trouble="failed")
         try:
             who = await self._askers.asker(made)
@@ -155,7 +174,7 @@ class RestLink:
         )
 
     def _record(self, call: RestCalled) -> None:
-        denied = call.status in _DENIED or (call.method in _ORDERS and call.status >= 400 and not call.dry)
+        denied = call.status in _DENIED or (call.method in _METHODS and call.status >= 400 and not call.dry)
         self._trail.happened(
             "rest call",
             call.reason[:_TEXT],
@@ -177,6 +196,7 @@ class RestLink:
         self._send(TokensStated(self._tokens.usable()))
 
     def _send_answer(self, number: int, answer: AdminAnswer[Any]) -> None:
+        self._withdrawn.pop(number, None)
         self._send(RequestAnswered(number, encode(answer)))
 
     def _send(self, message: messages.Message) -> None:

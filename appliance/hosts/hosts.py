@@ -26,6 +26,7 @@ from appliance.hosts.view import HostView
 from appliance.ipsec.kit import filled
 from appliance.policy.model import Address
 from appliance.store.hosts import AwaitedRow
+from appliance.withdrawal import take_effect
 
 
 class Hosts:
@@ -102,6 +103,7 @@ class Hosts:
             await self._tunnels.open()
             with self._certification.unless_revoked(name):
                 made = await self._certification.issue(name, request.request, request.days)
+            take_effect()
             self._certification.enrolled(name, wanted, made, who)
             return await self._certification.finish(name)
 
@@ -114,6 +116,7 @@ class Hosts:
             await self._tunnels.open()
             with self._certification.unless_revoked(name):
                 made = await self._certification.issue(name, request.request, request.days)
+            take_effect()
             self._certification.keep(name, row.address, made)
             self._certification.renewed(name, row.serial, made.serial, made.expires, who)
             return await self._certification.finish(name)
@@ -142,6 +145,7 @@ class Hosts:
             promised = self._table.address_for(name, request.address, self._awaited.addresses())
             await self._tunnels.open()
             authority = await self._certification.authority_certificate()
+            take_effect()
             row, text = self._awaited.add(
                 name,
                 seconds=request.token_seconds,

@@ -23,6 +23,7 @@ from appliance.hosts.enrolment_tokens import BadEnrolmentTokenError
 from appliance.hosts.table import HostForbiddenError, HostRefusedError
 from appliance.hosts.view import span
 from appliance.store.hosts import HostRow
+from appliance.withdrawal import WithdrawnError, take_effect
 
 _ANSWER_SECONDS = 1.0  # until the answer to a host has left through its tunnel
 _RENEWALS = 20  # in the life of a certificate: each leaves one on the list of revoked ones
@@ -57,9 +58,10 @@ class SelfService:
                 await self._tunnels.open()
                 with self._certification.unless_revoked(name):
                     made = await self._certification.issue(name, request.request, awaited.days)
+                take_effect()
             except HostForbiddenError:
                 raise
-            except HostRefusedError:
+            except (HostRefusedError, WithdrawnError):
                 self._certification.awaited.give_back(awaited)
                 raise
             self._certification.enrolled(
@@ -85,6 +87,7 @@ class SelfService:
                     proof=request.proof,
                     former=certificate.certificate.encode(),
                 )
+            take_effect()
             self._table.keep_next(name, made)
             self._note_renewal(name)
             await self._certification.store.settled()

@@ -21,9 +21,11 @@ from appliance.specifications.files import (
     checked,
     require_bounded,
 )
+from appliance.withdrawal import require_awaited
 
 _START_SECONDS = 60.0  # of a machine that has much else to start
 _WORK_SECONDS = 180.0  # of a machine that does much else; the compiler bounds its processor time
+_LOOK_SECONDS = 1.0  # between two looks whether the client of the order still waits
 _ENDED = (
     "the compiler ended while it read them, maybe of the memory or time that they take; the log says more"
 )
@@ -121,7 +123,7 @@ class SpecificationCompiler:
                     await self._there.wait()
                 if not goes_on():
                     raise SpecificationsRefusedError([_ENDED_BY_ORDER])
-                answer = await self._link.ask(question, _WORK_SECONDS)
+                answer = await self._answer(question)
             except ChannelClosedError:
                 if not goes_on():
                     raise SpecificationsRefusedError([_ENDED_BY_ORDER]) from None
@@ -135,6 +137,18 @@ class SpecificationCompiler:
                 raise SpecificationsRefusedError(answer.findings)
             return answer
         raise SpecificationsRefusedError([_ENDED])
+
+    async def _answer(self, question: Callable[[int], messages.Message]) -> Any:
+        """Ask, and end the compiler when the order is withdrawn meanwhile. Raises as `Link.ask`."""
+        asking = asyncio.ensure_future(self._link.ask(question, _WORK_SECONDS))
+        try:
+            while not (await asyncio.wait((asking,), timeout=_LOOK_SECONDS))[0]:
+                require_awaited()
+        except BaseException:
+            asking.cancel()
+            self._link.close()
+            raise
+        return asking.result()
 
     def _heard(self, message: Any) -> None:
         self._link.answered(message.number, message)

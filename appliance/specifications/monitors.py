@@ -58,6 +58,7 @@ from appliance.specifications.rollout import TRIAL, Parts, Revision, Rollout, Sw
 from appliance.specifications.switches import Switches, require_whole
 from appliance.store.revisions import Trial, UnknownRevisionError, wanted
 from appliance.store.state import MonitorRevisionRow, StateStore
+from appliance.withdrawal import WithdrawnError, require_awaited, take_effect
 
 _log = structlog.get_logger()
 _SWITCHES = "monitor switches"
@@ -243,6 +244,7 @@ class Monitors:
     async def _changing(self, expected: str | None) -> AsyncIterator[None]:
         """Around a change that is meant for this tag. Raises `MonitorsChangedError`."""
         async with self._one_change:
+            require_awaited()
             if expected is not None and expected != self.tag:
                 raise MonitorsChangedError(expected, self.tag)
             yield
@@ -435,12 +437,14 @@ class Monitors:
         before, others = switches.said, dict.fromkeys(changed, to)
         require_whole(switches.states | others, self.checked)
         retried = to == TRIAL or any(map(switches.on_trial, changed))
+        if not retried:
+            take_effect()  # else the rollout says when
         await self._count()
         switches.said = before | others
         if retried:
             try:
                 await self.rollout.take(self._revision(self.revision, self.sources, self.checked))
-            except SpecificationsRefusedError:
+            except (SpecificationsRefusedError, WithdrawnError):
                 switches.said = before
                 raise
         if seconds is None:
@@ -479,6 +483,7 @@ class Monitors:
         async with self._changing(request.expected):
             self._all_known(request.names)
             held = [name for name in dict.fromkeys(request.names) if name in self.rollout.held]
+            take_effect()
             if held:
                 await self._count()
             away = []
@@ -575,6 +580,9 @@ class Monitors:
             warnings = self._judged(checked, self._in_shadow(checked), forced=forced)
             require_whole(self.switches.states_of(checked) | in_force, checked)
             moved = await self.rollout.take(self._revision(before + 1, sources, checked))
+        except WithdrawnError:
+            self.switches.said = switched
+            raise
         except SpecificationsRefusedError as error:
             self.switches.said = switched
             hint = [f"not of the folder, and kept: {', '.join(kept)} (prune removes them)"] if kept else []

@@ -20,6 +20,7 @@ from appliance.channel import messages
 from appliance.specifications.allocation import Allocation, Plan
 from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError
 from appliance.specifications.relays import Relays
+from appliance.withdrawal import take_effect
 
 TRIAL: Literal["on trial"] = "on trial"
 Switch = bool | Literal["on trial"]
@@ -170,6 +171,7 @@ class Rollout:
 
     async def _try(self, coming: Revision, plan: Plan) -> None:
         await self._make(coming, _of(plan))
+        take_effect()  # relays that give nothing up go on with what they are told now
         answers: dict[int, asyncio.Future[list[str]]] = {}
         self._coming = (coming, plan)
         for relay in range(self.allocation.relays):

@@ -3,6 +3,7 @@
 What it may ask is the union `RestRequest`, which has no way to make a token.
 """
 
+import math
 from typing import Annotated
 
 import msgspec
@@ -26,13 +27,21 @@ class Asked(msgspec.Struct, frozen=True):
 class RequestMade(Message):
     """The api passes on what a client asks; `number` pairs it with its answer.
 
-    `shown` is the token or reading key that came with it, empty where none is needed. A change has `asked`, too.
+    `shown` is the token or reading key that came with it, empty where none is needed. A change has `asked`, too. What
+    has not taken effect at `until` (seconds of the monotonic clock, which all processes share) is withdrawn.
     """
 
     number: int
     request: RestRequest
     shown: str = ""
     asked: Asked | None = None
+    until: float = math.inf
+
+
+class RequestWithdrawn(Message):
+    """The client of the request with this number is gone: what it ordered is withdrawn if it has not taken effect."""
+
+    number: int
 
 
 class RequestAnswered(Message):
@@ -86,4 +95,4 @@ class RestServed(Message):
     pin: Annotated[str, msgspec.Meta(pattern="^(sha256//[A-Za-z0-9+/]{43}=)?$")]
 
 
-ApiLink = RequestMade | RequestAnswered | TokensStated | RestCalled | RestServed
+ApiLink = RequestMade | RequestWithdrawn | RequestAnswered | TokensStated | RestCalled | RestServed

@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 
 import httpx
 
-from appliance.cli.admin_socket import SECONDS, NotRunningError
+from appliance.cli.admin_socket import SECONDS, UNKNOWN, NotRunningError
 from appliance.config import is_loopback
 from appliance.order_proof import HEADER, proof_of, reading_key, statement
 from appliance.store.tokens import parse_token
@@ -126,9 +126,11 @@ class RestClient:
         except httpx.ConnectError as error:
             raise NotRunningError(self._why_not_connected(error)) from None
         except httpx.TimeoutException:
-            raise NotRunningError(f"{self.url}: no answer in time; is the appliance there?") from None
+            raise NotRunningError(
+                f"{self.url}: no answer in time; is the appliance there?{_unknown(method)}"
+            ) from None
         except httpx.HTTPError as error:
-            raise NotRunningError(f"{self.url}: the connection broke: {error}") from None
+            raise NotRunningError(f"{self.url}: the connection broke: {error}{_unknown(method)}") from None
 
     def _why_not_connected(self, error: Exception) -> str:
         text = str(error)
@@ -172,6 +174,11 @@ class RestClient:
         if kind == "unknown-path":
             return NotRunningError(f"{self.url}: this appliance's version does not know that over REST")
         return ProblemError(answer.status_code, kind, detail.split("\n"), problem.get("findings"))
+
+
+def _unknown(method: str) -> str:
+    """What to say of an order that was not answered."""
+    return "" if method == "GET" else f"; {UNKNOWN}"
 
 
 def _stated(request: httpx.Request, challenge: str) -> bytes:

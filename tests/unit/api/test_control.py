@@ -2,17 +2,27 @@
 
 import asyncio
 import socket
+import time
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from appliance.api import control as module
 from appliance.api.access import Bearer
 from appliance.api.control import ControlAwayError, ControlLink
-from appliance.channel.admin import AdminAnswer, StatusWanted, encode
+from appliance.channel.admin import AdminAnswer, PolicyConfirm, StatusWanted, encode
 from appliance.channel.answers.status import Status
 from appliance.channel.channel import Channel
-from appliance.channel.messages.api import ApiLink, RequestAnswered, RestCalled, TokenKept, TokensStated
+from appliance.channel.messages.api import (
+    ApiLink,
+    RequestAnswered,
+    RequestWithdrawn,
+    RestCalled,
+    TokenKept,
+    TokensStated,
+)
 from tests.support.answers import example
 from tests.support.heard import Heard
 
@@ -86,7 +96,7 @@ def test_a_question_ends_with_the_link_or_in_time() -> None:
         dying = asyncio.create_task(link.ask(StatusWanted(), bearer("w")))
         await there.until(2)
         there.channel.close()
-        with pytest.raises(ControlAwayError, match="not known"):
+        with pytest.raises(ControlAwayError, match="restarted before it answered: try again"):
             await dying
         there = control()
         replaced = asyncio.create_task(link.ask(StatusWanted(), bearer("w")))
@@ -94,6 +104,43 @@ def test_a_question_ends_with_the_link_or_in_time() -> None:
         control()
         with pytest.raises(ControlAwayError):
             await replaced
+
+    run(play)
+
+
+def test_an_order_without_an_answer_says_how_to_find_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A silent or dying control may have carried an order out: the answer says so, and names the command."""
+    monkeypatch.setattr(module, "_GRACE_SECONDS", 0.0)
+
+    async def play(link: ControlLink, control: Callable[[], Control], _tokens: list[TokenKept]) -> None:
+        there = control()
+        with pytest.raises(ControlAwayError, match=r"may have taken effect; .* audit search --since 5m"):
+            await link.ask(PolicyConfirm(), bearer("w"), seconds=0.01)
+        dying = asyncio.create_task(link.ask(PolicyConfirm(), bearer("w")))
+        await there.until(2)
+        there.channel.close()
+        with pytest.raises(ControlAwayError, match=r"may have taken effect; .* audit search --since 5m"):
+            await dying
+
+    run(play)
+
+
+def test_an_order_is_withdrawn_when_its_client_is_gone() -> None:
+    """Control hears at once that a client disconnected, and until when the order may take effect."""
+
+    async def play(link: ControlLink, control: Callable[[], Control], _tokens: list[TokenKept]) -> None:
+        there = control()
+        gone: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        began = time.monotonic()
+        asking = asyncio.create_task(link.ask(PolicyConfirm(), replace(bearer("w"), gone=gone), seconds=7.0))
+        (made,) = await there.until(1)
+        assert began + 7.0 <= made.until <= time.monotonic() + 7.0
+        gone.set_result(None)
+        assert (await there.until(2))[1] == RequestWithdrawn(made.number)
+        there.channel.send(
+            RequestAnswered(made.number, encode(AdminAnswer(False, error="withdrawn", trouble="busy")))
+        )
+        assert (await asking).error == "withdrawn"
 
     run(play)
 

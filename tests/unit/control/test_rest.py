@@ -17,6 +17,7 @@ from appliance.channel.messages.api import (
     Asked,
     RequestAnswered,
     RequestMade,
+    RequestWithdrawn,
     RestCalled,
     RestServed,
     TokenKept,
@@ -24,6 +25,7 @@ from appliance.channel.messages.api import (
 )
 from appliance.control.rest import RestLink
 from appliance.store.tokens import TokenRow, make_token
+from appliance.withdrawal import WithdrawnError, take_effect
 from tests.support.answers import example
 from tests.support.heard import Heard
 
@@ -59,6 +61,10 @@ class Everything:
         """Answer when told to."""
         if not isinstance(request, StatusWanted) or not self.only_slow:
             await self.go.wait()
+        try:
+            take_effect()
+        except WithdrawnError as error:
+            return AdminAnswer(False, error=str(error), trouble="busy")
         self.asked.append((request, who))
         if isinstance(request, PolicyLoad) and request.text == "defect":
             raise RuntimeError("secret detail")
@@ -198,6 +204,32 @@ def test_more_than_may_wait_are_told_so_at_once() -> None:
         world.go.set()
         heard = await api.until(201)
         assert sum(answer_of(one).ok for one in heard[1:]) == len(world.asked) <= 65
+
+    run(play)
+
+
+def test_what_no_client_waits_for_does_not_take_effect() -> None:
+    """An order whose time is over, whose client is gone, or whose api is, is withdrawn; the others take effect."""
+
+    async def play(world: Everything, link: RestLink) -> None:
+        world.go.clear()
+        api = Api(world, link)
+        api.channel.send(loading(1, "answered"))
+        api.channel.send(msgspec.structs.replace(loading(2, "late"), until=time.monotonic() - 1.0))
+        api.channel.send(loading(3, "gone"))
+        api.channel.send(RequestWithdrawn(3))
+        api.channel.send(RequestWithdrawn(77))
+        api.channel.send(RequestMade(4, StatusWanted(), "nobody's"))
+        async with asyncio.timeout(20):
+            while 4 not in link._withdrawn:  # what was sent before it has been read then
+                await asyncio.sleep(0)
+        world.go.set()
+        heard = {one.number: answer_of(one) for one in (await api.until(5))[1:]}
+        assert [heard[number].trouble for number in (1, 2, 3)] == ["", "busy", "busy"]
+        assert "nothing was changed" in heard[2].error
+        assert [request.text for request, _who in world.asked if isinstance(request, PolicyLoad)] == [
+            "answered"
+        ]
 
     run(play)
 

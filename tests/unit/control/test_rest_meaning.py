@@ -255,3 +255,38 @@ def test_what_orders_nothing_is_refused(change: dict[str, Any]) -> None:
     assert meant(good, order) == order
     with pytest.raises(NoOrderError):
         meant(msgspec.structs.replace(good, **change), order)
+
+
+def test_control_hears_of_a_client_that_disconnects() -> None:
+    """The bearer of an order ends with its client: a client that is killed withdraws what it ordered."""
+    gate, control, tokens = api()
+    seen: list[Any] = []
+
+    async def receive() -> Any:
+        if not seen:
+            seen.append("body")
+            return {"type": "http.request", "body": b"", "more_body": False}
+        return {"type": "http.disconnect"}
+
+    async def asked(request: AdminRequest[A], bearer: Bearer | None, seconds: float = 1.0) -> AdminAnswer[A]:
+        assert bearer is not None
+        assert bearer.gone is not None
+        async with asyncio.timeout(20):
+            await bearer.gone
+        seen.append(type(request))
+        return AdminAnswer(False, error="withdrawn", trouble="busy")
+
+    async def send(_message: Any) -> None:
+        """Nobody hears it."""
+
+    scope = {
+        "type": "http", "http_version": "1.1", "method": "POST", "path": "/v1/policy/confirm", "query_string": b"",
+        "raw_path": b"/v1/policy/confirm", "scheme": "http", "client": ("127.0.0.1", 1), "server": ("127.0.0.1", 80),
+        "headers": [
+            (b"host", b"127.0.0.1"), (b"if-match", b"*"), (b"authorization", f"Bearer {tokens['admin']}".encode()),
+        ],
+    }  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(control, "ask", asked)
+        asyncio.run(gate(scope, receive, send))
+    assert seen == ["body", admin.PolicyConfirm]

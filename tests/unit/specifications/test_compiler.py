@@ -12,6 +12,7 @@ from appliance.channel.channel import Channel
 from appliance.specifications import compiler as module
 from appliance.specifications.compiler import SpecificationCompiler
 from appliance.specifications.files import Sources, SpecificationsRefusedError
+from appliance.withdrawal import WithdrawnError, awaited
 
 SOURCES = Sources({"a.rv": "text"})
 FOUND = messages.Contents({"a": "a.rv"})
@@ -161,4 +162,25 @@ async def test_a_dry_run_begins_after_the_orders_and_the_dry_runs_before_it() ->
         finds(*heard[-1])
     assert [found.monitors for found in await asyncio.gather(order, *dry_runs)] == [{"a": "a.rv"}] * 3
     assert [wanted.dry_run for _channel, wanted in heard] == [False, True, True]
+    scene.close()
+
+
+async def test_a_compilation_ends_when_its_order_is_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A load whose client was killed keeps the compiler from no other order."""
+    monkeypatch.setattr(module, "_LOOK_SECONDS", 0.01)
+    heard: asyncio.Queue[Any] = asyncio.Queue()
+    scene = Scene(lambda _channel, wanted: heard.put_nowait(wanted), finds)
+    gone = False
+
+    async def order() -> None:
+        with awaited(lambda: gone):
+            await scene.compiler.check(SOURCES, ())
+
+    withdrawn = asyncio.ensure_future(order())
+    await heard.get()
+    gone = True
+    with pytest.raises(WithdrawnError):
+        await withdrawn
+    assert (await scene.compiler.check(SOURCES, ())).monitors == {"a": "a.rv"}
+    assert scene.calls == 2
     scene.close()

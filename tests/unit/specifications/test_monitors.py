@@ -23,6 +23,7 @@ from appliance.specifications.monitors import (
 )
 from appliance.specifications.revisions import Check
 from appliance.store.state import StateStore
+from appliance.withdrawal import WithdrawnError, awaited
 from tests.support.audit import HeardTrail
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
 from tests.support.stated import parts_here
@@ -55,6 +56,7 @@ class Desk:
         self.carried_out = asyncio.Event()
         self.carried_out.set()
         self.try_out: Check = here
+        self.check: Check = here
         self.live: Published = {}
 
     async def monitors(
@@ -79,7 +81,7 @@ class Desk:
             published=lambda: None,
             told=[],
             site_keys=site_keys,
-            check=here,
+            check=lambda sources, keys: self.check(sources, keys),  # noqa: PLW0108  of whatever it is then
             try_out=self.try_out,
             parts=parts_here,
             live=lambda: self.live,
@@ -265,6 +267,42 @@ async def test_a_time_off_survives_restarts_and_ends_when_somebody_switches(desk
     ):
         with pytest.raises(SpecificationsRefusedError, match="for up to 30 days"):
             await later.switch(wrong, "eve")
+
+
+async def test_a_load_whose_client_gave_up_never_takes_effect(desk: Desk) -> None:
+    """A slow load that is withdrawn while it is compiled, or while it waits for another change, changes nothing."""
+    begun, goes_on, gone = asyncio.Event(), asyncio.Event(), False
+
+    async def slow(sources: Sources, site_keys: Sequence[str]) -> Checked:
+        begun.set()
+        await goes_on.wait()
+        return await here(sources, site_keys)
+
+    monitors = await desk.monitors()
+    desk.check = slow
+
+    async def order(*changes: Callable[[], Any]) -> None:
+        with awaited(lambda: gone):
+            for change in changes:
+                await change()
+
+    load = partial(monitors.load, admin.MonitorLoad({"b.rv": B}, shadow=True, confirm_within=60.0), "eve")
+    first = asyncio.ensure_future(order(load))
+    await begun.wait()
+    switch = partial(monitors.switch, admin.MonitorSwitch(["a"], False), "eve")
+    second = asyncio.ensure_future(order(switch))
+    await asyncio.sleep(0)
+    desk.sent.clear()
+    tag, gone = monitors.tag, True
+    goes_on.set()
+    for withdrawn in (first, second):
+        with pytest.raises(WithdrawnError):
+            await withdrawn
+    assert (monitors.tag, monitors.names(), monitors.switches.states) == (tag, ["a"], {"a": True})
+    assert (monitors.confirm_by, monitors.switches.said, desk.sent) == (None, {}, [])
+    gone = False
+    await order(load)
+    assert monitors.names() == ["a", "b"]
 
 
 async def test_a_client_has_one_dry_run_at_a_time(desk: Desk) -> None:

@@ -1,0 +1,120 @@
+"""The admin socket: what a client that gives up has done."""
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from appliance.channel import admin
+from appliance.channel.admin import AdminAnswer, PolicyConfirm, decode, encode
+from appliance.channel.answers.policy import PolicyConfirmed
+from appliance.cli import admin_socket
+from appliance.cli.admin_socket import ADMIN_SOCKET, AdminSocket, NotRunningError
+from appliance.control.admin import AdminServer
+from appliance.control.administration import Administration
+from appliance.withdrawal import take_effect
+
+pytestmark = pytest.mark.anyio
+
+
+class Slow:
+    """Orders of which one is slow: it takes effect when `goes_on` is set."""
+
+    def __init__(self) -> None:
+        self.begun, self.goes_on = asyncio.Event(), asyncio.Event()
+        self.ended: asyncio.Queue[str] = asyncio.Queue()
+        self.done = 0
+
+    async def confirm(self, _request: admin.PolicyConfirm, who: str) -> PolicyConfirmed:
+        """Wait, then change something."""
+        self.begun.set()
+        try:
+            await self.goes_on.wait()
+            take_effect()
+            self.done += 1
+            return PolicyConfirmed(True, self.done)
+        finally:
+            self.ended.put_nowait(who)
+
+
+@contextlib.asynccontextmanager
+async def served(state: Path) -> AsyncIterator[Slow]:
+    """Serve the socket in a state directory."""
+
+    async def durable() -> None:
+        """It is on the disk."""
+
+    slow: Any = Slow()
+    looks: Any = object()
+    administration = Administration(looks, slow, durable=durable, require_room=lambda: None)
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listening.bind(str(state / ADMIN_SOCKET))
+    listening.listen()
+    server = AdminServer(administration)
+    await server.start(listening)
+    yield slow
+    assert server._server is not None
+    server._server.close()
+
+
+async def test_what_is_not_answered_in_time_is_withdrawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A tool whose time is over withdraws its order, and says that nothing was changed."""
+    async with served(tmp_path) as slow:
+        monkeypatch.setattr(socket.socket, "shutdown", _then(socket.socket.shutdown, slow.goes_on.set))
+        answer = await asyncio.to_thread(AdminSocket(tmp_path, 0.05).ask, PolicyConfirm())
+        assert (answer.ok, answer.trouble, slow.done) == (False, "busy", 0)
+        assert "nothing was changed" in answer.error
+
+
+async def test_an_order_that_took_effect_is_answered_late(tmp_path: Path) -> None:
+    """An order that takes effect before the tool gives up is answered as done."""
+    async with served(tmp_path) as slow:
+        slow.goes_on.set()
+        answer = await asyncio.to_thread(AdminSocket(tmp_path, 20.0).ask, PolicyConfirm())
+        assert (answer.ok, slow.done) == (True, 1)
+
+
+async def test_a_tool_without_an_answer_says_how_to_find_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where control does not even answer what became of the order, the tool names the command that finds out."""
+    monkeypatch.setattr(admin_socket, "_GRACE_SECONDS", 0.05)
+    wanted = pytest.raises(NotRunningError, match=r"may have taken effect; .* rosrv audit search --since 5m")
+    async with served(tmp_path):
+        with wanted:
+            await asyncio.to_thread(AdminSocket(tmp_path, 0.05).ask, PolicyConfirm())
+
+
+async def test_the_order_of_a_killed_tool_is_withdrawn(tmp_path: Path) -> None:
+    """A tool that is gone, as one that was killed, has changed nothing; the next is served."""
+    async with served(tmp_path) as slow:
+        _reader, writer = await asyncio.open_unix_connection(tmp_path / ADMIN_SOCKET)
+        writer.write(encode(PolicyConfirm()) + b"\n")
+        await slow.begun.wait()
+        writer.transport.abort()
+        await asyncio.sleep(0)
+        slow.goes_on.set()
+        assert await slow.ended.get() == "operator"
+        assert slow.done == 0
+        reader, writer = await asyncio.open_unix_connection(tmp_path / ADMIN_SOCKET)
+        writer.write(encode(PolicyConfirm()) + b"\n")
+        answer: AdminAnswer[PolicyConfirmed] = decode(await reader.readline(), PolicyConfirm())
+        assert (answer.ok, slow.done) == (True, 1)
+        writer.close()
+
+
+def _then(method: Any, after: Any) -> Any:
+    loop = asyncio.get_running_loop()
+
+    def both(*arguments: Any) -> Any:
+        result = method(*arguments)
+        loop.call_soon_threadsafe(after)
+        return result
+
+    return both

@@ -1,0 +1,40 @@
+"""Orders that are withdrawn before they take effect."""
+
+import asyncio
+
+import pytest
+
+from appliance.withdrawal import WithdrawnError, awaited, require_awaited, take_effect
+
+
+def test_an_order_whose_client_gave_up_does_not_take_effect() -> None:
+    """It is withdrawn up to the moment at which it takes effect, and not after it."""
+    gone = False
+    with awaited(lambda: gone):
+        require_awaited()
+        gone = True
+        with pytest.raises(WithdrawnError, match="nothing was changed"):
+            take_effect()
+        gone = False
+        take_effect()
+        gone = True
+        require_awaited()
+        take_effect()
+
+
+def test_outside_an_order_nothing_is_withdrawn() -> None:
+    """A start, a signal and a rollback by itself have no client; neither has a task that an order left behind."""
+    take_effect()
+
+    async def order() -> asyncio.Task[None]:
+        with awaited(lambda: True):
+            return asyncio.create_task(later())
+
+    async def later() -> None:
+        await asyncio.sleep(0)
+        take_effect()
+
+    async def play() -> None:
+        await (await order())
+
+    asyncio.run(play())
