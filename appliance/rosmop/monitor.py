@@ -42,6 +42,9 @@ class Home(Protocol):
     def leave(self) -> None:
         """See that Python has it."""
 
+    def show(self) -> None:
+        """Give Python a copy of it."""
+
     size: int
     """Bytes of `cells`; 0 where the state is more than numbers."""
 

@@ -122,7 +122,8 @@ def kept_monitor(monitor: Monitor, variables: Mapping[str, Any], types: bytes) -
     """The state of a monitor as data. Raises `StateTooLargeError`."""
     if monitor.slices is not None:
         raise StateTooLargeError("the states of its bindings are not kept")
-    monitor.come_home()
+    if monitor.home is not None:
+        monitor.home.show()
     return KeptMonitor(
         monitor.name,
         monitor.code.identity,

@@ -225,9 +225,14 @@ class Home:
 
     def leave(self) -> None:
         """Give it back to Python."""
+        if self._inside:
+            self.show()
+            self._inside, self.prepared, self.left = False, None, True
+
+    def show(self) -> None:
+        """Give Python a copy of what is in the module's memory."""
         if not self._inside:
             return
-        self._inside, self.prepared, self.left = False, None, True
         values = self._cells.unpack_from(self._memory, self._base)
         for running, state in zip(self._running, values, strict=False):
             running.run.state = state  # type: ignore[attr-defined]  # of tables

@@ -1,15 +1,17 @@
 """The files in which relays keep the state of their monitors (`relay/monitors/state_memory.py`).
 
-Nothing is read of them here but whether they have anything.
+Nothing is read of them here but whether they have anything. Each life of the appliance has a folder with a file for
+each relay; the kernel keeps what is in them when all processes die. Every relay may read the files of earlier lives,
+because a monitor may be on another relay now. These go when a later life is complete: each of its relays has written
+its own file. So an appliance that is killed while it starts loses nothing.
 
-Each relay writes into a file of its own, `relay-N`. What the kernel has of it outlives every process of the appliance.
-At the start the files of the life before become `relay-N.before`, which every relay may read: a monitor may be on
-another relay now. They are kept until each relay has written its own, so an appliance that is killed while it starts
-loses nothing. At an orderly end all is written to the disk, and then a file that says so and when: only then is a state
-used again after the machine was started again.
+At an orderly end all is written to the disk, and then a file that says so, and when. Only then is a state used again
+after the machine was started again.
 """
 
 import os
+import secrets
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +27,7 @@ SIZE = 16 << 20
 """Bytes of each file."""
 
 _ENDED = "ended"
-_BEFORE = ".before"
+_MOST_LIVES = 4  # that are kept where none is complete: what is older is hardly of use
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 _HEAD = 9  # bytes: the magic, and whether anything is written behind it
 
@@ -44,7 +46,7 @@ class MonitorMemory:
 
     def __init__(self, state: Path, relays: int) -> None:
         self._folder = state / FOLDER
-        self._boot = _BOOT.read_text("ascii").strip()
+        self._boot = _this_boot()
         self._offset = time.time_ns() - time.monotonic_ns()
         self._own: list[int] = []
         self._earlier: list[int] = []
@@ -52,11 +54,14 @@ class MonitorMemory:
         try:
             self._folder.mkdir(mode=0o700, exist_ok=True)
             self._ended = self._take_ended()
-            self._set_aside()
+            lives = self._lives()
             flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC
-            self._earlier = [os.open(path, flags) for path in sorted(self._folder.glob(f"*{_BEFORE}"))]
+            self._earlier = [os.open(path, flags) for life in lives for path in sorted(life.iterdir())]
+            own = self._folder / f"{int(lives[-1].name) + 1 if lives else 1:06}"
+            own.mkdir(mode=0o700)
             for index in range(relays):
-                self._own.append(_made(self._folder / f"relay-{index}"))
+                self._own.append(_made(own / f"relay-{index}"))
+            _sync(self._folder)
         except OSError as error:
             log.warning(
                 "monitors do not keep their state when the appliance ends: they hold their topics then",
@@ -100,21 +105,28 @@ class MonitorMemory:
         _sync(self._folder)
         return ended
 
-    def _set_aside(self) -> None:
-        """What the relays of the life before wrote last is `.before`; a relay that had written nothing has what was
-        that, until all have.
-        """
-        found = [path for path in sorted(self._folder.glob("relay-*")) if path.suffix != _BEFORE]
-        written = [path for path in found if _is_written(path)]
-        if found and written == found:
-            for path in self._folder.glob(f"*{_BEFORE}"):
-                path.unlink()
-        for path in found:
-            if path in written:
-                path.rename(path.with_name(path.name + _BEFORE))
+    def _lives(self) -> list[Path]:
+        """The folders of earlier lives, the oldest first, without those that are of no use any more."""
+        kept: list[Path] = []
+        for life in sorted((path for path in self._folder.iterdir() if path.is_dir()), reverse=True):
+            written = [_is_written(path) for path in life.iterdir()]
+            if not any(written) or len(kept) == _MOST_LIVES or (kept and _is_complete(kept[-1])):
+                shutil.rmtree(life)
             else:
-                path.unlink()
-        _sync(self._folder)
+                kept.append(life)
+        return kept[::-1]
+
+
+def _is_complete(life: Path) -> bool:
+    return all(map(_is_written, life.iterdir()))
+
+
+def _this_boot() -> str:
+    """What names this start of the machine; where the kernel does not say, something that no other life has."""
+    try:
+        return _BOOT.read_text("ascii").strip()
+    except OSError:
+        return secrets.token_hex(16)
 
 
 def _is_written(path: Path) -> bool:
@@ -130,7 +142,6 @@ def _made(path: Path) -> int:
         os.posix_fallocate(descriptor, 0, SIZE)
     except OSError:
         os.close(descriptor)
-        path.unlink()
         raise
     return descriptor
 

@@ -6,6 +6,7 @@ A directory that is there already is taken, and closed to others, only where it 
 state/            0711  root: others may pass through, not look around
 state/lock        0600  held while an appliance runs; names its process id
 state/admin.sock  0600  where the other verbs of `rosrv` find the running appliance
+state/monitors/   0700  root: what relays keep of the state of monitors (`monitor_memory.py`)
 state/run/        0755  the resolved configuration for the children
 state/relay/      0700  rosrv-relay    and so on, one folder for each role, for its user only
 state/control/    2710  rosrv:rosrv-api  as root: new files get the group, which may read those that say so (audit log)

@@ -20,7 +20,7 @@ from tests.support.waiting import eventually
 
 CLIENTS: list[Client] = ["rospy", "roscpp"]
 WORDS = """
-words() {
+begin words() {
     int heard = 0;
     std_msgs::String report;
     event said(std::string text) /chatter std_msgs/String '{data:text}' {
@@ -247,7 +247,7 @@ def test_a_bad_specification_is_refused_with_its_place_and_changes_nothing(
 
 def test_a_new_relay_begins_in_the_initial_state_and_says_so(appliance: Appliance, ros: RosSession) -> None:
     """As an alarm; the switches and what was loaded stay, and `hold` blocks until resumed."""
-    held = "hold " + WORDS.strip().replace("words()", "gate()").replace("/chatter", "/held")
+    held = WORDS.strip().replace("begin words()", "hold gate()").replace("/chatter", "/held")
     path = Path(appliance.directory) / "gate.rv"
     path.write_text(held)
     appliance.rosrv("monitor", "load", str(path))

@@ -65,6 +65,7 @@ def list_monitors(appliance: Appliance) -> None:
         say("no monitor is loaded: rosrv monitor load FILE…")
     if any(row.trial for row in body.monitors):
         say("(in brackets: what a monitor in shadow mode would have dropped and changed)", "dim")
+    _say_held(body.monitors)
     source = f" ({body.folder})" if body.folder else ""
     differs = (
         "; not what the folder has (rosrv monitor reload takes that, and removes nothing)"
@@ -330,5 +331,10 @@ def _say_idle(appliance: Appliance, files: Collection[str]) -> None:
     ):
         if names:
             say(f"{word}: {', '.join(names)}; rosrv monitor {verb} {' '.join(names)}", "yellow")
+    _say_held(rows)
+
+
+def _say_held(rows: Collection[MonitorState]) -> None:
+    """Print why monitors hold their topics because their state was lost, and what lets them go on."""
     for row in (row for row in rows if row.why_held):
         say(f"{row.name} holds its topics: {row.why_held}; rosrv monitor resume {row.name}", "yellow")

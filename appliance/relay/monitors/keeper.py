@@ -90,10 +90,9 @@ class Keeper:
             reason = self._distrust(head)
             if head.lost:
                 found.lost[""] = head.lost
-            for group, (base, cells) in zip(head.groups, sections, strict=False):
-                if not reason:
-                    found.groups.append((group.monitors, bytes(group.cells), base, cells))
-                found.lost |= dict.fromkeys(group.monitors, reason or _UNREADABLE)
+            lost = msgspec.msgpack.encode(reason), None  # also for what older memories have of these monitors
+            for group, section in zip(head.groups, sections, strict=False):
+                found.groups.append((group.monitors, bytes(group.cells), *(lost if reason else section)))
         return found if heads or found.lost else None
 
     def _readable(self, found: Recovered) -> Iterator[tuple[_Head, list[tuple[bytes, bytes | None]]]]:

@@ -156,6 +156,8 @@ class Middle:
                 result.hold_lost(
                     monitor, "it is on another relay process now, and its state was on the one before"
                 )
+            if monitor.why_held and monitor.name in began and not self._switches.get(monitor.name, True):
+                monitor.resume()  # it was disabled, and guarded nothing
         if self._keeper is not None:
             self._keeper.take(result)
         self.observer.keep([monitor.name for monitor in result.monitors], began, now)

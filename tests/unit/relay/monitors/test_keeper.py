@@ -182,3 +182,18 @@ def test_a_memory_that_cannot_be_read_is_no_reason_to_begin() -> None:
     begun(second, memory)
     assert drives(second) == "dropped"
     assert "cannot be read" in second.monitor("stop").why_held
+
+
+def test_a_newer_state_that_is_lost_is_not_replaced_by_an_older_one() -> None:
+    """Of several lives the last that had a monitor counts, whatever those before it left."""
+    older, newer = bytearray(SIZE), bytearray(SIZE)
+    first = stop()
+    begun(first, older)
+    press(second := stop(), begun(second, newer, OTHERS["a power cut"]))
+    for memories in ([older, newer], [newer, older]):
+        keeper = Keeper(GIVEN, bytearray(SIZE), memories)
+        left = keeper.recovered()
+        assert left is not None
+        third = stop()
+        third.recover(left.groups, left.lost, 0)
+        assert third.monitor("stop").held
