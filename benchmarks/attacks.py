@@ -313,8 +313,12 @@ def probe_messages(seconds: float, robot: Host, operator: Host, answers: Connect
                         raise ConnectionError("the relay closed the connection")
                     came, rest = time.monotonic(), rest + data
                     while len(rest) >= 12:
-                        delays.append(came - sent.pop(struct.unpack_from("<Q", rest, 4)[0]))
+                        began = sent.pop(struct.unpack_from("<Q", rest, 4)[0], None)
                         rest = rest[12:]
+                        if (
+                            began is not None
+                        ):  # else a message of the round before, which counts as lost there
+                            delays.append(came - began)
             except OSError:
                 missing, sent, rest, lost = missing + len(sent), {}, b"", True
                 source, sink = connect()
