@@ -35,6 +35,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from appliance.ros.errors import PeerError
 from appliance.ros.xmlrpc import parse_response
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
@@ -79,6 +80,7 @@ MD5 = {
 }
 CONTEXT = multiprocessing.get_context("fork")
 PATIENCE = 20.0  # seconds until a call counts as unanswered
+_TRIES = 20
 
 
 # TCPROS and the node API, as much of them as a load needs
@@ -243,14 +245,23 @@ DEFINITIONS = {
 
 
 def call(address: str, method: str, *params: Any, uri: str = MASTER) -> Any:
-    """One call of the Master API from an address, on a new connection."""
+    """One call of the Master API from an address, on a new connection; again where an attack is in its way."""
     place = uri.removeprefix("http://").rstrip("/")
     host, _, port = place.rpartition(":")
-    connection = http.client.HTTPConnection(host, int(port), timeout=PATIENCE, source_address=(address, 0))
-    with contextlib.closing(connection):
-        connection.request("POST", "/RPC2", xmlrpc.client.dumps(params, method).encode())
-        answer: Any = parse_response(connection.getresponse().read())
-        return answer
+    tries = 0
+    while True:
+        connection = http.client.HTTPConnection(
+            host, int(port), timeout=PATIENCE, source_address=(address, 0)
+        )
+        try:
+            with contextlib.closing(connection):
+                connection.request("POST", "/RPC2", xmlrpc.client.dumps(params, method).encode())
+                answer: Any = parse_response(connection.getresponse().read())
+                return answer
+        except (OSError, http.client.HTTPException, PeerError):
+            if (tries := tries + 1) == _TRIES:
+                raise
+            time.sleep(0.2)  # noqa: TID251  the pace of the load
 
 
 def subscribe(nodes: Nodes, address: str, node: str, topic: str) -> list[socket.socket]:
