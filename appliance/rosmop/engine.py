@@ -52,7 +52,7 @@ from appliance.rosmop.runtime.context import TRIAL_BUDGET, Context
 from appliance.rosmop.runtime.wire import Buffer, Message
 from appliance.rosmop.sharing import way_of
 from appliance.rosmop.slices import LIMIT
-from appliance.rosmop.walks import Prepared, Walker, Walks, walks_of
+from appliance.rosmop.walks import MESSAGE_FUEL, Prepared, Walker, Walks, walks_of
 
 _CHANGED = "its text, or the definition of a message, has changed, and its state is lost"
 
@@ -617,15 +617,20 @@ class MonitorSet:
         return self.process(topic, buffer, time_ns, sender) if taken is None else taken
 
     def taken(
-        self, topic: str, buffer: Buffer, time_ns: int, prepare: Callable[[Walker], Prepared]
+        self,
+        topic: str,
+        buffer: Buffer,
+        time_ns: int,
+        prepare: Callable[[Walker], Prepared],
+        fuel: int = MESSAGE_FUEL,
     ) -> Outcome | None:
         """What `process` says of a message on a topic, or `way_of` a service, if its walk takes it (`Walker.take`, with
-        what `prepare` says); None: nothing was done.
+        what `prepare` says, and so many instructions); None: nothing was done.
         """
         walker = self.walker(topic)
         if walker is None or not self.walks(walker, time_ns):
             return None
-        return walker.take(buffer, time_ns, prepare(walker))
+        return walker.take(buffer, time_ns, prepare(walker), fuel)
 
     def process_service(
         self, service: str, part: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY

@@ -408,7 +408,9 @@ class Walker:
         self._machine.refuel(FUEL)
         return Walked(following, run, ()) if walked is None else walked
 
-    def take(self, message: Buffer, time_ns: int, prepared: Prepared) -> Outcome | None:
+    def take(
+        self, message: Buffer, time_ns: int, prepared: Prepared, fuel: int = MESSAGE_FUEL
+    ) -> Outcome | None:
         """What is to be done with one message; None if it is left. Verdicts are not explained, and it is not said where
         it was changed.
 
@@ -421,7 +423,7 @@ class Walker:
         _LENGTH.pack_into(frame, 0, len(message))
         frame[4:] = message
         prepared.changed.clear()
-        walked = self.walk_one(frame, 0, 0, [], time_ns, prepared)
+        walked = self.walk_one(frame, 0, 0, [], time_ns, prepared, fuel)
         if walked is not None and not walked.position:
             return None
         outcome = Outcome(message, time_ns)

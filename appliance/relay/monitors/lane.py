@@ -20,21 +20,18 @@ from appliance.relay.connections.frames import Batch
 from appliance.relay.counts import Counts
 from appliance.relay.monitors.observations import SHOWN
 from appliance.relay.monitors.observer import Observer
+from appliance.relay.monitors.pace import Pace
 from appliance.relay.monitors.passage import Passage
 from appliance.relay.monitors.places import HEAD, Place, Senders, Sighting
 from appliance.relay.monitors.trials import Trials
 from appliance.rosmop.outcomes import Outcome
-from appliance.rosmop.runtime.context import FUEL_PER_SECOND, Published
+from appliance.rosmop.runtime.context import Published
 
 if TYPE_CHECKING:
     from appliance.rosmop.engine import MonitorSet
     from appliance.rosmop.walks import Prepared, Walked, Walker
 
-AGAIN = 0.1
-"""The part of the budget that messages of a publication have for a second after one that took longer."""
-
 _unpack_length = struct.Struct("<I").unpack_from
-_SECOND = 1_000_000_000
 _NEVER = 1 << 63
 
 
@@ -91,7 +88,7 @@ class Lane:
         self._counts: Counts | None = None
         self._defect: Walker | None = None
         self._source = middle.senders.number(place)
-        self._hurried_until = 0
+        self._pace = Pace()
 
     def through(self, batch: Batch) -> Batch | None:
         """The frames that go on, as the monitors leave them; None when none does. Their state is kept before that."""
@@ -161,7 +158,7 @@ class Lane:
             walked = walker.walk(*given)
             alone = walked is not None and walked.paused and walked.position == passage.position
             if alone:
-                walked = walker.walk_one(*given, self._fuel(passage.time))
+                walked = walker.walk_one(*given, self._pace.fuel(passage.time, middle.budget))
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, walker, passage.time)
             return False
@@ -178,13 +175,9 @@ class Lane:
             middle.look_again()
         if alone:
             if walked.paused:  # the engine would take much longer
-                self._hurried_until = passage.time + _SECOND
+                self._pace.cut(passage.time)
             return passage.position > begun
         return walked.paused or passage.position == passage.end
-
-    def _fuel(self, now: int) -> int:
-        part = AGAIN if now < self._hurried_until else 1.0
-        return int(FUEL_PER_SECOND * self._middle.budget * part)
 
     def _say(self, walked: Walked, passage: Passage) -> None:
         """Tell what was put out, and publish what was published."""
@@ -239,7 +232,7 @@ class Lane:
             body = view[first:following]
             before = bytes(body[:SHOWN]) if shows else b""
             sighting = Sighting(passage, position, bytes(body[:head]))
-            monitors.hurry(AGAIN if now < self._hurried_until else 1.0)
+            monitors.hurry(self._pace.part(now))
             try:
                 outcome = process(topic, body, now, sighting.sender(self._source))
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
@@ -262,7 +255,7 @@ class Lane:
             position = following
             looked += 1
             if outcome.faults and monitors.late:
-                self._hurried_until = now + _SECOND
+                self._pace.cut(now)
             if middle.over():
                 break
         passage.position = position

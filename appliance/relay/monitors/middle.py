@@ -34,6 +34,7 @@ from appliance.relay.monitors.loader import Loader, Result
 from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.observer import Observer, refusal
+from appliance.relay.monitors.pace import Pace
 from appliance.relay.monitors.places import NOWHERE, Place, Senders
 from appliance.relay.monitors.trials import Trials
 from appliance.relay.report import Reporter
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from appliance.rosmop.walks import Prepared, Walker
 
 _AFTER_DEFECT = 1.0
+_UNHURRIED = Pace()
 _NO_MEMORY = "the relay process before this one ended, and nothing keeps the state of monitors"
 
 
@@ -88,6 +90,8 @@ class Middle:
         self.blocked = ""
         self._awaited: SpecificationsStated | None = None
         self.sight = object()
+        self._paces: dict[Place, Pace] = {}
+        """Of the senders of requests and replies in the last two seconds."""
         self._prepared: dict[tuple[Place, str], Prepared] = {}
         """For the walks of requests and replies until there is another `sight`: at most a second."""
         self._timer: Timer | None = None
@@ -320,6 +324,8 @@ class Middle:
         if self.monitors is not None:
             self._margins.take(self.monitors, self.now())
         self.observations.tick()
+        now = self.now()
+        self._paces = {place: pace for place, pace in self._paces.items() if pace.part(now) < 1}
 
     def close(self) -> None:
         """The relay ends."""
@@ -347,13 +353,16 @@ class Middle:
         outcome = self._walked(self.monitors, place, way_of(service, part), body, now)
         if outcome is None:
             self.look_again()
-            self.monitors.hurry(1.0)
+            pace = self._paces.setdefault(place, Pace())
+            self.monitors.hurry(pace.part(now))
             try:
                 outcome = self.monitors.process_service(
                     service, part, bytearray(body), now, Sender(self.senders.number(place))
                 )
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
                 outcome = dropped(view, now, self.observer.defect(error, place, now))
+            if outcome.faults and self.monitors.late:
+                pace.cut(now)
             if self.monitors.tapped:
                 self.trials.wait(place, None)
         elif self.monitors.next_due != due:
@@ -386,7 +395,8 @@ class Middle:
             return prepared
 
         try:
-            outcome = monitors.taken(way, body, now, prepare)
+            fuel = self._paces.get(place, _UNHURRIED).fuel(now, self.budget)
+            outcome = monitors.taken(way, body, now, prepare, fuel)
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             observer.defect(error, place, now)
             return None
