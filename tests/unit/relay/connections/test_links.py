@@ -60,7 +60,7 @@ def test_thousands_of_messages_are_carried_out_a_quantum_at_a_time_and_in_order(
     """Other sockets have their turn in between, as messages cost a hundredth of a quantum here."""
     send(ends.raw, 1000)
     ends.loop.turn(1)
-    assert 0 < len(ends.received) <= 200
+    assert 0 < len(ends.received) <= 210
     while len(ends.received) < 1000:
         ends.loop.turn(1)
     assert [message.key for message in ends.received] == [str(number) for number in range(1000)]
