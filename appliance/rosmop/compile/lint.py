@@ -4,7 +4,8 @@ import re
 from collections.abc import Sequence
 from typing import Protocol
 
-from appliance.rosmop.logics.interface import CompiledProperty
+from appliance.rosmop.compiled import EventCode, PropertyCode
+from appliance.rosmop.logics.interface import Categories, ClockedProperty, CompiledProperty, FiniteProperty
 from appliance.rosmop.logics.lint import analyse
 from appliance.rosmop.positions import Finding
 from appliance.rosmop.syntax import tree
@@ -32,6 +33,55 @@ def lint_property(compiled: CompiledProperty, node: tree.Property) -> list[Findi
         trace = f" (shortest trace: {' '.join(fact.trace)})" if fact.trace else ""
         findings.append(Finding(position or node.position, "warning", fact.text + trace))
     return findings
+
+
+def kept_slices(
+    name: str, events: Sequence[EventCode], properties: Sequence[PropertyCode], nodes: Sequence[tree.Property]
+) -> list[Finding]:
+    """Warnings about what keeps the slices of a parametric specification for ever."""
+    found = [
+        Finding(
+            event.position,
+            "warning",
+            f"the slices of {shown(name)} never end: the timer {shown(event.name)} does more than to change their"
+            " variables, so each may act again at any time; give the time to a property (`pattern … within`, `tfsm`)",
+        )
+        for event in events
+        if event.period_ns is not None and event.acts
+    ]
+    for code, node in zip(properties, nodes, strict=True):
+        for_good = _for_good(code.property)
+        found += [
+            Finding(
+                handler.position,
+                "warning",
+                f"@{handler.category} is empty and for good: a binding that comes to it keeps its slice for ever, and"
+                " each later event of it is a verdict; leave the handler out",
+            )
+            for handler in node.handlers
+            if handler.category in for_good and not handler.body.statements
+        ]
+    return found
+
+
+def _for_good(compiled: CompiledProperty) -> set[str]:
+    """The categories of states that are never left."""
+    verdicts: Sequence[Categories]
+    if isinstance(compiled, FiniteProperty):
+        automaton = compiled.automaton
+        stays = [{*row} == {state} for state, row in enumerate(automaton.table)]
+        verdicts = automaton.verdicts
+    elif isinstance(compiled, ClockedProperty):
+        verdicts = compiled.verdicts
+        stays = [
+            wait is None and {target for target, _ in (*early, *late)} == {state}
+            for state, (early, late, wait) in enumerate(
+                zip(compiled.moves, compiled.late, compiled.waits, strict=True)
+            )
+        ]
+    else:
+        return set()
+    return {name for told, stay in zip(verdicts, stays, strict=True) if stay for name in told}
 
 
 def unused_events(specification: tree.Specification, properties: Sequence[_HasProperty]) -> list[Finding]:

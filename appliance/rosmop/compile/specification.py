@@ -23,7 +23,7 @@ from appliance.rosmop.compile.functions import (
     declare_functions,
     declare_variables,
 )
-from appliance.rosmop.compile.lint import lint_property, unused_events
+from appliance.rosmop.compile.lint import kept_slices, lint_property, unused_events
 from appliance.rosmop.compile.reach import identity, reached
 from appliance.rosmop.compile.scope import Shared, SpecificationNames
 from appliance.rosmop.compile.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
@@ -148,6 +148,8 @@ def _compile(
         return None
     known = tuple(code for code in properties if code is not None)
     shared.findings += unused_events(specification, known)
+    if names.parameters:
+        shared.findings += kept_slices(names.name, good, known, specification.properties)
     variables = {variable.name: variable.code for variable in names.variables.values()}
     uses = frozenset(names.uses)
     return SpecificationCode(

@@ -17,6 +17,7 @@ from appliance.rosmop.compile.sources import compiled_from
 from appliance.rosmop.compiled import Compiled
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.happened import Sender
+from appliance.rosmop.logics.interface import FORMULAS
 from appliance.rosmop.outcomes import Outcome
 from tests.support.examples import examples
 from tests.unit.rosmop.acting import definitions, message
@@ -80,7 +81,11 @@ def passed(monitors: MonitorSet, end: int) -> list[Outcome]:
 
 
 def naive(one: Made, trace: Timed, end: int) -> list[Entry]:
-    """By definition: each binding's part of the trace is given to the specification without parameters."""
+    """By definition: each binding's part of the trace is given to the specification without parameters.
+
+    Where there are only formulas a slice has not begun with a message that is dropped.
+    """
+    formulas = FORMULAS.issuperset(each.split(":")[0] for each in one.properties)
     expected: list[Entry] = []
     values = [dict.fromkeys(values[name] for _, _, values in trace) for name in one.parameters]
     for choice in itertools.product(*values):
@@ -95,13 +100,17 @@ def naive(one: Made, trace: Timed, end: int) -> list[Entry]:
         for place, (time, event, given) in enumerate(trace):
             if any(given[name] != binding[name] for name in one.binds[event]):
                 continue
+            begins = monitors is None
             if monitors is None:
                 if one.creation and event not in one.creation:
                     continue
                 monitors = running(one.text(binding=False), time)
             tell(passed(monitors, time), -1)
             bound |= set(one.binds[event])
-            tell([monitors.process(f"/{event}", body(given), time)], place)
+            outcome = monitors.process(f"/{event}", body(given), time)
+            tell([outcome], place)
+            if begins and outcome.result == "dropped" and formulas:
+                monitors = None
         if monitors is not None:
             tell(passed(monitors, end), -1)
     return expected
@@ -331,3 +340,50 @@ def test_the_example_of_the_page_works_as_it_is_written() -> None:
     outcomes = monitors.advance(100 * SECOND)
     stops = [(outcome.time // SECOND, one.topic) for outcome in outcomes for one in outcome.published]
     assert stops == [(34, "/stop")]
+
+
+DROPPING = ["pattern: globally: a forbids b within 2s", "pattern: globally: b requires a within 2s", "mtl: historically[0,2s] !c",
+            "pattern: globally: no a within 3s", "mtl: a since[0,2s] b", "ltl: [](a => o b)", "ere: (a b)* c",
+            "tfsm: s0 [ a -> s1, timeout 1s -> late ] s1 [ b -> s0, c -> s1 ] late [ a -> s0, default late ]"]  # fmt: skip
+WAITING = ["pattern: globally: a causes b within 2s @violation { %s }", "mtl: a => eventually[0,2s] b @violation { %s }",
+           "tfsm: s0 [ b -> s0, default s1 ] s1 [ a -> s1, default s0, timeout 2s -> s0 ] @timeout { %s }"]  # fmt: skip
+
+
+def test_what_a_drop_takes_back_is_taken_back_in_its_slice() -> None:
+    """Messages are dropped now and then, beside deadlines: as by definition, for each binding."""
+    for seed in range(examples(400)):
+        random = Random(seed)  # noqa: S311  draws examples, not keys
+        formula = random.choice(DROPPING)
+        category = {"ere": "fail", "tfsm": "s1"}.get(formula.split(":")[0], "violation")
+        drop = random.choice(("DROP;", "if (n % 2 == 0) { DROP; }", 'ROS_INFO("%d", n); DROP;'))
+        waits = random.choice(WAITING) % random.choice(
+            ("__RESET;", 'ROS_INFO("late %d", n);', "n = 0; __RESET;")
+        )
+        actions = {
+            event: random.choice(("", "n = n + 1;", "if (n > 2) { n = 0; return; } n = n + 1;"))
+            for event in "abc"
+        }
+        properties = [f"{formula} @{category} {{ {drop} }}", waits]
+        random.shuffle(properties)
+        one = Made("p", dict.fromkeys("abc", "p"), random.choice(("", "a")), tuple(properties), actions)
+        agree(one, trace_of(random, 16), random.choice((1, sys.maxsize)))
+
+
+def test_what_was_due_is_published_for_each_binding() -> None:
+    """`enforced by`: at the deadline of each goal its result is published, and the goal is over."""
+    enforced = STOP.replace(
+        "within 30s\n    @violation { PUBLISH(/stop, std_msgs/Empty, stop); __RESET; }",
+        "within 30s enforced by halt",
+    )
+    enforced = enforced.replace(
+        "static std_msgs::Empty stop;",
+        "static std_msgs::Empty stop; void halt() { PUBLISH(/stop, std_msgs/Empty, stop); }",
+    )
+    monitors = running(enforced, 0)
+    for number in range(3):
+        monitors.process("/goal", text(str(number)), number * SECOND)
+    monitors.process("/result", text("1"), 5 * SECOND)
+    outcomes = passed(monitors, 100 * SECOND)
+    assert [(each.time // SECOND, len(each.published)) for each in outcomes] == [(30, 1), (32, 1)]
+    assert monitors.monitors[0].slices is not None
+    assert monitors.monitors[0].slices.live == 0

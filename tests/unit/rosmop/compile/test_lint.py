@@ -28,3 +28,27 @@ def test_a_property_without_a_handler_is_taken_and_told() -> None:
     ]
     outcome = loaded.process("/u", message("std_msgs/Int32", data=1), 0)
     assert (outcome.result, outcome.verdicts) == ("passed", ())
+
+
+KEEPING = [
+    ("fsm: s0 [ e -> s1, f -> s0 ] s1 [ e -> s1, f -> s1 ] @s1 { }", "", 1),
+    ("fsm: s0 [ e -> s1, f -> s0 ] s1 [ e -> s1, f -> s1 ] @s1 { __RESET; }", "", 0),
+    ("fsm: s0 [ e -> s1, f -> s0 ] s1 [ e -> s1, f -> s0 ] @s1 { }", "", 0),
+    ("ere: e f @fail { }", "", 1),
+    ("ltl: [](e => o f) @violation { }", "", 1),
+    ("pattern: globally: e causes f within 1s @violation { }", "", 1),
+    ("pattern: globally: e causes f within 1s @violation { __RESET; }", "", 0),
+    ("ere: e f @match { __RESET; }", 'event t() every 1s { ROS_INFO("still there"); }', 1),
+    ("ere: e f @match { __RESET; }", "event t() every 1s { times = times + 1; }", 0),
+]
+
+
+@pytest.mark.parametrize(("formula", "timer", "count"), KEEPING)
+def test_what_keeps_slices_for_ever_is_said(formula: str, timer: str, count: int) -> None:
+    """Of a parametric specification: an empty handler of what is for good, and a timer that may always act."""
+    events = EVENTS.replace("()", "(int n)").replace("'{}'", "'{data:n}'")
+    text = f"s(int n) {{ int times = 0; {events} {timer} {formula} }}"
+    said = [one.text for one in load(text).warnings if "for ever" in one.text or "never end" in one.text]
+    assert len(said) == count
+    plain = f"s() {{ int times = 0; {EVENTS} {timer} {formula} }}"
+    assert not [one for one in load(plain).warnings if "slice" in one.text]
