@@ -75,6 +75,8 @@ EVENTS: dict[str, str] = {
     "token revoked": "An access token for REST was ended before its time.",
     "process started": "A process of the appliance started.",
     "process died": "A process of the appliance ended without being told to.",
+    "process failing": "A process of the appliance ends soon after every start; `reason` says why, `detail.output` has"
+    " the last lines that it printed. It is started again, ever later, up to once in a minute.",
     "appliance started": "The appliance is in service.",
     "appliance stopped": "The appliance ended in an orderly way.",
     "malformed": "A peer sent what is no request, or a publisher what is no header; it was refused: see `reason`.",
@@ -126,8 +128,8 @@ SEVERITIES: dict[str, Severity] = {
             "recording missed", "renewal refused", "specifications refused", "tunnel refused",
         ),
         Severity.ALARM: (
-            "forwarding gap", "monitors restarted", "probe failed", "protection forgotten", "publication refused",
-            "records lost", "topics held",
+            "forwarding gap", "monitors restarted", "probe failed", "process failing", "protection forgotten",
+            "publication refused", "records lost", "topics held",
         ),
     }.items()
     for name in names

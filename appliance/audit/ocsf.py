@@ -131,6 +131,7 @@ KINDS: dict[str, Kind] = {
     "token revoked": Kind(ENTITY, _DELETE, about="Token"),
     "process started": Kind(LIFECYCLE, _START),
     "process died": Kind(LIFECYCLE, _STOP),
+    "process failing": Kind(LIFECYCLE, _STOP),
     "appliance started": Kind(LIFECYCLE, _START),
     "appliance stopped": Kind(LIFECYCLE, _STOP),
     "malformed": Kind(API, _BY_CALL, _REJECTED),

@@ -12,7 +12,7 @@ from typing import Any
 
 from appliance.channel.channel import Channel, ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
-from appliance.channel.messages import LinkOpened, Message, Ping, Pong, Ready, RingGiven, Stop
+from appliance.channel.messages import Failed, LinkOpened, Message, Ping, Pong, Ready, RingGiven, Stop
 
 
 class Child:
@@ -51,6 +51,10 @@ class Child:
         except ChannelFullError:
             self._control.close()
             return False
+
+    def fail(self, reason: str, output: list[str]) -> None:
+        """Tell the supervisor why this process ends, and what the program that it ran printed last."""
+        self._answer(Failed(reason, output))
 
     def close(self) -> None:
         """Close the link to control."""

@@ -12,7 +12,7 @@ from rich.text import Text
 from appliance.api.moments import in_full
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.hosts import PortsSeen
-from appliance.channel.answers.status import FirewallState, IpsecState, PolicyState, Status
+from appliance.channel.answers.status import FirewallState, IpsecState, PolicyState, ProcessInfo, Status
 from appliance.channel.health import no_relay, probe_failed
 from appliance.cli.output import counted, moment, say_json
 from appliance.cli.status_view import age, doubted_clock, lacking_walls, processes_table, shortened
@@ -77,6 +77,7 @@ def troubles_of(body: Status) -> list[str]:
     if body.rosmaster != "reachable":
         found.append("the ROS Master is being rebuilt: calls wait")
     found += body.ipsec.troubles
+    found += [_failing(process) for process in body.processes if process.failing]
     for what, verb, deadline in (
         ("the policy goes", "policy", body.policy.confirm_by),
         ("the specifications go", "monitor", monitors.confirm_by),
@@ -139,6 +140,15 @@ def show(body: Status, troubles: list[str]) -> None:
     console.print(grid)
     table = processes_table(body.processes, console.width)
     console.print(table)
+
+
+def _failing(process: ProcessInfo) -> str:
+    """Why a process is started again and again, and what it printed last."""
+    lines = "".join(f"\n    {line}" for line in process.output)
+    printed = f"; it printed last:{lines}" if lines else ""
+    return (
+        f"{process.role} is failing, after {counted(process.restarts, 'restart')}: {process.failing}{printed}"
+    )
 
 
 def _policy(policy: PolicyState) -> Text:

@@ -24,7 +24,7 @@ from appliance.audit.retention import Retention
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.admin import HostsReload, PolicyReload
-from appliance.channel.answers.status import AuditState
+from appliance.channel.answers.status import AuditState, ProcessInfo
 from appliance.channel.channel import Channel
 from appliance.channel.messages.api import ApiLink
 from appliance.config import Settings, load_resolved
@@ -103,6 +103,7 @@ class _Control:
         self._parameters_dirty = asyncio.Event()
         self._reloading: set[asyncio.Task[None]] = set()
         self._one_reload = asyncio.Lock()
+        self._failing: frozenset[str] = frozenset()  # the roles of processes that keep ending
 
     async def run(self) -> None:
         """Serve from start to end; a start that fails is told to the supervisor."""
@@ -353,7 +354,8 @@ class _Control:
         match message:
             case messages.LinkOpened(role, index):
                 self._link(role, index, socket.socket(fileno=descriptors[0]))
-            case messages.ProcessesChanged():
+            case messages.ProcessesChanged(processes):
+                self._note_failing(processes)
                 self._parts.reconciler.wake()
             case messages.PolicyReloadRequested():
                 self._reload_on_signal()
@@ -369,6 +371,21 @@ class _Control:
                 _log.error(
                     "the supervisor said something that is not for control", message=type(message).__name__
                 )
+
+    def _note_failing(self, processes: list[ProcessInfo]) -> None:
+        """Record each process that has come to end soon after every start."""
+        failing = {process.role: process for process in processes if process.failing}
+        for role in failing.keys() - self._failing:
+            process = failing[role]
+            restarts, output = process.restarts, process.output
+            self._base.trail.happened(
+                "process failing",
+                f"{role}: {process.failing}",
+                resource=role,
+                restarts=restarts,
+                output=output,
+            )
+        self._failing = frozenset(failing)
 
     def _link(self, role: str, index: int, sock: socket.socket) -> None:
         """To another process."""

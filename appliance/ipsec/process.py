@@ -16,10 +16,11 @@ Invariants:
 
 import asyncio
 import os
+import signal
 import socket
 import sys
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
@@ -39,11 +40,14 @@ from appliance.ipsec.strongswan import configuration
 from appliance.whole_files import write_whole
 
 KEY_FILE = "appliance.key"
+TUN = Path("/dev/net/tun")
 REFUSALS_PER_SECOND = 20
 REFUSED_SOURCES = 20  # of packets, in one report
 REPORT_SECONDS = 2.0
 RENEW_SECONDS = 30 * 86_400.0
 _START_SECONDS = 15.0
+_OUTPUT_LINES = 40
+_LONGEST_LINE = 500  # characters
 
 T = TypeVar("T")
 
@@ -69,6 +73,7 @@ class TunnelProcess:
         self._packets: Counter[Refusal] = Counter()  # that ESP dropped since the last report
         self._second = (0, 0)  # of the last refusals, and how many they were
         self._tasks: set[asyncio.Future[Any]] = set()
+        self._output: deque[str] = deque(maxlen=_OUTPUT_LINES)  # what charon printed last
         self.failed = False
 
     async def run(self) -> None:
@@ -119,6 +124,8 @@ class TunnelProcess:
             await self._say_how_it_stands(vici)
 
     async def _start(self, wanted: messages.TunnelsStated) -> Vici:
+        if wanted.esp == "user space" and (obstacle := tun_obstacle()):
+            raise CharonError(obstacle)
         if wanted.esp == "kernel":
             await asyncio.to_thread(clear_leftovers, wanted.address)
         conf, sock = self._directory / "strongswan.conf", self._directory / "vici.sock"
@@ -164,17 +171,21 @@ class TunnelProcess:
 
     async def _read_log(self, charon: asyncio.subprocess.Process) -> None:
         assert charon.stderr is not None  # noqa: S101  a pipe was asked for
-        last = ""
         async for raw in charon.stderr:
-            last = raw.decode("utf-8", "replace").rstrip() or last
-            refusal = self._refusals.read(last)
+            line = raw.decode("utf-8", "replace").rstrip()
+            if line:
+                self._output.append(line[:_LONGEST_LINE])
+            refusal = self._refusals.read(line)
             if refusal is not None and refusal.packet:
                 if refusal in self._packets or len(self._packets) < REFUSED_SOURCES:
                     self._packets[refusal] += 1
             elif refusal is not None and self._may_tell():
                 self._tell(messages.TunnelRefused(refusal.remote, refusal.reason))
         status = await charon.wait()
-        raise CharonError(f"charon ended (status {status}), last it said: {last}")
+        how = f"by {signal.Signals(-status).name}" if status < 0 else f"with exit status {status}"
+        raise CharonError(
+            f"charon ended {how}; last it printed: {self._output[-1] if self._output else 'nothing'}"
+        )
 
     def _may_tell(self) -> bool:
         second, count = int(time.monotonic()), self._second[1]
@@ -211,6 +222,7 @@ class TunnelProcess:
             return
         error = task.exception()
         _log.error("the tunnels end and are started again", reason=str(error))
+        self._child.fail(str(error), list(self._output))
         self.failed = True
         self._ended.set()
 
@@ -228,6 +240,19 @@ def main(lifeline_fd: int, directory: Path) -> None:
     # A thread may wait for charon's answer, and nothing is left to be written: no waiting for it.
     sys.stderr.flush()
     os._exit(1 if process.failed else 0)
+
+
+def tun_obstacle() -> str:
+    """Return why this process cannot open the TUN device, and what to do; empty when it can."""
+    try:
+        os.close(os.open(TUN, os.O_RDWR | os.O_CLOEXEC))
+    except OSError as error:
+        who = f"user {os.geteuid()}"
+        return (
+            f"{TUN} cannot be opened by {who}, which ESP in user space needs: {error.strerror};"
+            f" load the kernel module `tun`, let {who} read and write the device, and restart the appliance"
+        )
+    return ""
 
 
 def _own_key(path: Path) -> bytes:

@@ -1,6 +1,10 @@
 """Where ESP runs: in the kernel where it has it, else in user space over a TUN device; found out by trying."""
 
+import errno
+import os
 import secrets
+import stat
+import struct
 import subprocess
 from pathlib import Path
 from typing import Literal
@@ -25,6 +29,52 @@ def choose_esp(namespace: Namespace) -> Esp:
         f"no tunnels: the kernel has no ESP ({refusal}), and there is no {TUN} for ESP in user space; load the"
         " kernel module `esp4` or `tun`, or give the container the device: --device /dev/net/tun"
     )
+
+
+def lend_tun(uid: int, gid: int, tun: Path | None = None) -> None:
+    """Let this user open the TUN device, and no other user who could not before: an entry in its access control list.
+
+    Raises `NetworkError` when the system refuses, with what to do.
+    """
+    device, shown = tun or TUN, ""
+    try:
+        about = device.stat()
+        mode = stat.S_IMODE(about.st_mode)
+        shown = f" (mode {mode:04o})"
+        if uid == 0 or mode & 0o006 == 0o006 or (about.st_gid == gid and mode & 0o060 == 0o060):
+            return
+        os.setxattr(device, _ACL, _with_user(_entries_of(device, mode), uid))
+    except OSError as error:
+        raise NetworkError(
+            f"no tunnels: ESP runs in user space here, and the user {uid} may not open {device}{shown}:"
+            f" {error.strerror}; let it: chgrp {gid} {device} && chmod 0660 {device}"
+        ) from error
+
+
+# An access control list as the kernel has it: a version, then tag, rights and id of each entry, sorted by tag.
+_ACL, _VERSION, _ENTRY = "system.posix_acl_access", struct.pack("<I", 2), struct.Struct("<HHI")
+_OWNER, _USER, _GROUP, _MASK, _OTHER = 1, 2, 4, 0x10, 0x20
+_NOBODY, _READ_WRITE = 0xFFFFFFFF, 6
+
+
+def _entries_of(device: Path, mode: int) -> list[tuple[int, int, int]]:
+    """Return the list that the device has: without one, what its mode says."""
+    try:
+        return list(_ENTRY.iter_unpack(os.getxattr(device, _ACL)[len(_VERSION) :]))
+    except OSError as error:
+        if error.errno != errno.ENODATA:
+            raise
+    return [(tag, mode >> bits & 7, _NOBODY) for tag, bits in ((_OWNER, 6), (_GROUP, 3), (_OTHER, 0))]
+
+
+def _with_user(entries: list[tuple[int, int, int]], uid: int) -> bytes:
+    """Return the list with this user, who may read and write; the mask lets pass what any entry has."""
+    kept = [row for row in entries if row[0] != _MASK and row[::2] != (_USER, uid)]
+    mask = _READ_WRITE
+    for tag, rights, _id in kept:
+        mask |= rights if tag not in (_OWNER, _OTHER) else 0
+    rows = sorted([*kept, (_USER, _READ_WRITE, uid), (_MASK, mask, _NOBODY)], key=lambda row: row[::2])
+    return _VERSION + b"".join(_ENTRY.pack(*row) for row in rows)
 
 
 def _try_kernel(namespace: Namespace) -> str | None:

@@ -28,7 +28,7 @@ from appliance.ipsec.leftovers import LeftoversError, clear_leftovers
 from appliance.ipsec.strongswan import USER_SPACE_INTERFACE
 from appliance.network import links
 from appliance.network.endpoint import Endpoint, only_address
-from appliance.network.esp import Esp, choose_esp
+from appliance.network.esp import Esp, choose_esp, lend_tun
 from appliance.network.firewall.firewall import Firewall
 from appliance.network.firewall.rules import FirewallSettings, Forwarder, OwnNode, PortRange
 from appliance.network.host_namespace import bridges, is_contained, lives_on_the_machines_network
@@ -39,6 +39,7 @@ from appliance.network.protect import local_port_range
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.users import account_of
 
+_TUNNELS = "rosrv-ipsec"  # the user of charon
 _PATIENCE_SECONDS = 5.0  # of an end with a call that hangs
 
 log = structlog.get_logger()
@@ -205,6 +206,9 @@ class Contained(Enclosure):
             if self.firewall is None:
                 raise NetworkError("the firewall is not in force")
             esp = choose_esp(self._namespace)
+            if esp == "user space":
+                account = account_of(_TUNNELS)
+                lend_tun(account.uid, account.gid)
             before, self._tunnels = self._tunnels, (str(ipaddress.ip_network(pool)), esp)
             if self._tunnels != before:
                 try:

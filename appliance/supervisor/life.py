@@ -68,6 +68,8 @@ class Life:
         self.answered: float | None = None
         self.walls: Walled | None = None
         self.congestion = ""  # of a relay's sockets
+        self.reason = ""  # why it cannot serve, in its own words
+        self.output: tuple[str, ...] = ()  # the last lines of the program that it ran
         self._asked = 0
         self._reports = reports
         self._loop = asyncio.get_running_loop()

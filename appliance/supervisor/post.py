@@ -15,7 +15,8 @@ from appliance.supervisor.walls.folders import furnished
 
 LOUD_AFTER = 5  # short lives in a row
 _BACKOFF = (0.0, 0.2, 0.5, 1.0)
-_LONG_LIFE_SECONDS = 10.0
+_LONGEST_DELAY = 60.0  # of what the others go on without
+LONG_LIFE_SECONDS = 10.0
 
 
 @dataclass
@@ -29,6 +30,9 @@ class Post:
     short_lives: int = 0  # in a row
     due: asyncio.TimerHandle | None = None
     wanted: bool = False  # of a role on demand: asked for since this life began
+    since: str = ""  # when its last life began
+    reason: str = ""  # why its last life ended: in its own words, if it had any
+    output: tuple[str, ...] = ()  # the last lines of what it ran
 
     @property
     def is_vacant(self) -> bool:
@@ -52,12 +56,23 @@ class Post:
     def bury(self, life: Life) -> float:
         """Note the death of who filled it; the seconds that it lived."""
         self.life = None
+        self.since = life.since
         lived = time.monotonic() - life.started
-        self.short_lives = self.short_lives + 1 if lived < _LONG_LIFE_SECONDS else 0
+        self.short_lives = self.short_lives + 1 if lived < LONG_LIFE_SECONDS else 0
         return lived
 
+    def recovers(self) -> bool:
+        """Forget that its lives kept ending when this one has lasted; whether that is so now."""
+        lasts = self.life is not None and time.monotonic() - self.life.started >= LONG_LIFE_SECONDS
+        if not (lasts and self.keeps_dying):
+            return False
+        self.short_lives, self.reason, self.output = 0, "", ()
+        return True
+
     def delay(self) -> float:
-        """The seconds until it is to be filled again: none after a long life."""
+        """Return the seconds until it is to be filled again: none after a long life, more after each short one."""
+        if self.keeps_dying and self.role.dispensable:
+            return min(2.0 ** (self.short_lives - LOUD_AFTER + 1), _LONGEST_DELAY)
         return _BACKOFF[min(max(self.short_lives - 1, 0), len(_BACKOFF) - 1)]
 
     def plan(self, facts: Facts, lifeline: int) -> Plan:

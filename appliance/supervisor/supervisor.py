@@ -17,7 +17,7 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -53,6 +53,8 @@ ADMIN = "admin"
 _READERS = "rosrv-api"  # the user whose group may read the audit log
 _START_SECONDS = 180.0  # without any progress
 _LOOK_SECONDS = 10.0
+OUTPUT_LINES = 40  # of a failing process, that are kept
+_LONGEST_LINE = 500  # characters
 _MOST_UNANSWERED = 4096  # hosts of which control asks the way
 
 _FROM_ANY: tuple[type[messages.Message], ...] = (
@@ -279,8 +281,8 @@ class Supervisor:
                 life.heard()
             case messages.Ready(detail):
                 self._child_ready(life, detail)
-            case messages.Failed(said):
-                self._cannot_serve(life, _printable(said))
+            case messages.Failed(said, output):
+                self._cannot_serve(life, _printable(said), output)
             case _:
                 self.control_said(life, message, descriptors)
 
@@ -296,11 +298,13 @@ class Supervisor:
             )
         self._tell_processes()
 
-    def _cannot_serve(self, life: Life, reason: str) -> None:
+    def _cannot_serve(self, life: Life, reason: str, output: Sequence[str]) -> None:
         """Before nodes may connect, it is for the person who starts the appliance; later the next life may succeed."""
         post = next(post for post in self.posts if post.life is life)
+        life.reason = reason
+        life.output = tuple(_printable(line)[:_LONGEST_LINE] for line in output[-OUTPUT_LINES:])
         if self.is_ready or post.role.dispensable:
-            log.error("process cannot serve", role=life.role, reason=reason)
+            log.error("process cannot serve", role=life.role, reason=reason, output=list(life.output))
             life.kill()
         else:
             self.stop(reason)  # which says it, as the last line
@@ -448,6 +452,8 @@ class Supervisor:
             for post in self.posts:
                 if post.life is not None:
                     self._look_at(post, post.life, slept)
+                if post.recovers():
+                    self._tell_processes()
             clock = messages.ClockRead(clock_is_synchronised())
             if clock != self._clock:
                 self._clock = clock
@@ -490,12 +496,16 @@ class Supervisor:
             self._ended(post)
             return
         log.error("process died", role=life.role, pid=life.pid, end=_end_of(code), lived=round(lived, 3))
+        post.reason, post.output = life.reason or f"it ended with {_end_of(code)}", life.output
         self._tell_processes()
         if post.keeps_dying:
             if not self.is_ready:
                 self.stop(f"{life.role} died {post.short_lives} times ({_end_of(code)}); the log says why")
                 return
-            log.critical("process keeps dying", role=life.role, times=post.short_lives)
+            log.critical(
+                "process keeps dying", role=life.role, times=post.short_lives, reason=post.reason,
+                again_in=post.delay(),
+            )  # fmt: skip
         self._fill_later(post)
 
     def _ended(self, post: Post) -> None:
@@ -511,13 +521,7 @@ class Supervisor:
         post.due = asyncio.get_running_loop().call_later(post.delay(), self.fill, post)
 
     def _tell_processes(self) -> None:
-        rows = [
-            messages.ProcessInfo(
-                post.role.name, life.pid, life.since, post.lives - 1, *life.enclosed, life.congestion
-            )
-            for post in self.posts
-            if (life := post.life) is not None
-        ]
+        rows = [_about(post) for post in self.posts if post.life is not None or post.keeps_dying]
         own = messages.ProcessInfo("supervisor", os.getpid(), self._since, 0)
         self._tell_control(messages.ProcessesChanged([own, *rows]))
 
@@ -539,6 +543,18 @@ def _log_fault(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> Non
     # A defect of ours in one callback must not take the robot's master away: it is shown, and the loop
     # goes on.
     log.critical("fault in the supervisor", fault=context["message"], exc_info=context.get("exception"))
+
+
+def _about(post: Post) -> messages.ProcessInfo:
+    """Return what control is told of a process that runs, or is to run again after it kept dying."""
+    failing, output = (post.reason, list(post.output)) if post.keeps_dying else ("", [])
+    life, restarts = post.life, post.lives - 1
+    if life is None:
+        return messages.ProcessInfo(post.role.name, 0, post.since, restarts, failing=failing, output=output)
+    walls, lacks = life.enclosed
+    return messages.ProcessInfo(
+        post.role.name, life.pid, life.since, restarts, walls, lacks, life.congestion, failing, output
+    )
 
 
 def _printable(text: str) -> str:

@@ -9,7 +9,7 @@ from appliance.channel.answers.hosts import PortsSeen
 
 
 class ProcessInfo(msgspec.Struct, frozen=True):
-    """One process of the appliance; `since` is RFC 3339 UTC."""
+    """One process of the appliance; `since` is RFC 3339 UTC, `pid` 0 while it waits to be started again."""
 
     role: str
     pid: int
@@ -23,6 +23,8 @@ class ProcessInfo(msgspec.Struct, frozen=True):
     ] = ""
     lacks: Annotated[list[str], told("what this machine's kernel lacks of them")] = []
     congestion: Annotated[str, told("the TCP congestion control of a relay's connections")] = ""
+    failing: Annotated[str, told("why it ends soon after every start; empty: it does not")] = ""
+    output: Annotated[list[str], told("the last lines that the program of a failing process printed")] = []
 
 
 class FirewallRule(msgspec.Struct, frozen=True):

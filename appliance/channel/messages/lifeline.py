@@ -39,9 +39,13 @@ class Ready(Message):
 
 
 class Failed(Message):
-    """A child cannot serve and says why; the supervisor shows it and stops the appliance."""
+    """A child cannot serve and says why; the supervisor shows it and stops the appliance, or starts the child again.
+
+    `output` are the last lines of a program that it ran.
+    """
 
     reason: str
+    output: list[str] = msgspec.field(default_factory=list)
 
 
 class Walled(Message):

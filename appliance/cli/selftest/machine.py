@@ -167,7 +167,12 @@ def _esp(namespace: Namespace) -> Iterator[Found]:
         yield warn("esp", str(error), "only tunnels of trusted hosts need it")
     else:
         tun = "" if TUN.exists() else f", {TUN} is not there"
-        yield ok("esp", f"in the {where}{tun}" if where == "kernel" else f"in {where}, over {TUN}")
+        if where == "kernel":
+            yield ok("esp", f"in the {where}{tun}")
+        elif os.access(TUN, os.R_OK | os.W_OK):
+            yield ok("esp", f"in {where}, over {TUN}, which its user is given")
+        else:
+            yield warn("esp", f"in {where}, and {TUN} cannot be opened", "load the kernel module `tun`")
 
 
 def _ports(settings: Settings) -> Iterator[Found]:

@@ -10,6 +10,8 @@ import pytest
 
 from appliance.channel.channel import Channel
 from appliance.channel.messages import (
+    Esp,
+    Failed,
     Lifeline,
     LinkOpened,
     Stop,
@@ -86,3 +88,55 @@ def test_charon_is_asked_one_thing_at_a_time(tmp_path: Path, monkeypatch: pytest
             one.close()
 
     asyncio.run(work())
+
+
+def failure_of(directory: Path, esp: Esp) -> Failed:
+    """What the supervisor hears when charon is to be started."""
+
+    async def work() -> Failed:
+        (ours, theirs), (lifeline, child) = socket.socketpair(), socket.socketpair()
+        own, supervisor, link = (
+            Channel(child, Lifeline),
+            Channel(lifeline, Lifeline),
+            Channel(ours, TunnelLink),
+        )
+        running = asyncio.create_task((failing := process.TunnelProcess(own, directory, make_key())).run())
+        heard: asyncio.Future[Failed] = asyncio.get_running_loop().create_future()
+
+        def received(message: Any, _descriptors: tuple[int, ...]) -> None:
+            if isinstance(message, Failed):
+                heard.set_result(message)
+
+        supervisor.attach(asyncio.get_running_loop(), received, lambda: None)
+        supervisor.send(LinkOpened("control", 0), (theirs.fileno(),))
+        theirs.close()
+        link.send(TunnelsStated(7, esp, "10.113.11.1", b"a", b"c", b"r", []))
+        await asyncio.wait_for(running, _LIMIT_SECONDS)
+        assert failing.failed
+        said = await asyncio.wait_for(heard, _LIMIT_SECONDS)
+        for one in (own, supervisor, link):
+            one.close()
+        return said
+
+    return asyncio.run(work())
+
+
+def test_what_charon_printed_last_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The supervisor hears how charon ended and its last 40 lines, each up to a length."""
+    program = tmp_path / "charon"
+    program.write_text("#!/bin/sh\nseq 1 100 >&2\nhead -c 9000 /dev/zero | tr '\\0' x >&2\nkill -SEGV $$\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(process, "PROGRAM", program)
+    monkeypatch.setattr(process, "clear_leftovers", lambda _address: None)
+    said = failure_of(tmp_path, "kernel")
+    assert said.output == [*map(str, range(62, 101)), "x" * 500]
+    assert said.reason.startswith("charon ended by SIGSEGV; last it printed: xxx")
+
+
+def test_charon_is_not_started_without_its_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where ESP is to run in user space and the TUN device cannot be opened, that is said, with what to do."""
+    monkeypatch.setattr(process, "PROGRAM", tmp_path / "none")
+    monkeypatch.setattr(process, "TUN", tmp_path / "tun")
+    said = failure_of(tmp_path, "user space")
+    assert said.reason.startswith(f"{tmp_path}/tun cannot be opened by user")
+    assert "load the kernel module `tun`" in said.reason

@@ -1,12 +1,17 @@
 """Tests of finding out where ESP can run."""
 
+import errno
+import os
+import shutil
 import subprocess
+import tempfile
 from pathlib import Path
 
 import pytest
 
 from appliance.network import esp
 from appliance.network.namespaces import Namespace, NetworkError
+from tests.support.requirements import need_root
 
 
 def answers(monkeypatch: pytest.MonkeyPatch, status: int) -> list[list[str]]:
@@ -29,6 +34,60 @@ def test_a_kernel_that_takes_the_cipher_is_used_and_left_as_it_was(monkeypatch: 
     assert given[0][-2:][0].startswith("0x")
     spi = given[0][given[0].index("spi") + 1]
     assert given[1][-1] == spi
+
+
+def test_the_device_is_lent_to_one_user(tmp_path: Path) -> None:
+    """A device that only root may open is opened by that user then, and by no other; its mode allows no more."""
+    need_root()
+    place = Path(tempfile.mkdtemp(dir="/dev/shm"))
+    try:
+        place.chmod(0o755)
+        device = place / "tun"
+        device.touch(0o600)
+        device.chmod(0o600)
+        for uid in (61016, 61016, 61099):  # also a second time, and for another as well
+            esp.lend_tun(uid, uid, device)
+            assert _opens(uid, device)
+        assert _opens(61016, device)
+        assert not _opens(61017, device)
+        assert device.stat().st_mode & 0o007 == 0
+        open_to_all = place / "open"
+        open_to_all.touch()
+        open_to_all.chmod(0o666)
+        esp.lend_tun(61016, 61016, open_to_all)
+        assert esp._ACL not in os.listxattr(open_to_all)
+    finally:
+        shutil.rmtree(place)
+
+
+def test_a_device_that_cannot_be_lent_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """What is missing and what to do is said before charon is started."""
+    (tmp_path / "tun").touch(0o600)
+
+    def refuse(*_arguments: object) -> None:
+        raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
+
+    monkeypatch.setattr(os, "setxattr", refuse)
+    with pytest.raises(NetworkError, match=r"may not open .*tun \(mode 0600\).* chgrp 7 .* chmod 0660"):
+        esp.lend_tun(7, 7, tmp_path / "tun")
+    with pytest.raises(NetworkError, match="No such file"):
+        esp.lend_tun(7, 7, tmp_path / "none")
+
+
+def _opens(uid: int, path: Path) -> bool:
+    """Whether a process of this user can open a file to read and write it."""
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            os.setgroups([])
+            os.setresgid(uid, uid, uid)
+            os.setresuid(uid, uid, uid)
+            os.open(path, os.O_RDWR)
+            status = 0
+        finally:
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
 def test_without_it_esp_runs_in_user_space(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

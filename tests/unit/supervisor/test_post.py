@@ -13,7 +13,7 @@ from appliance.supervisor.roles import Facts, Role
 
 def life(*, lived: float) -> Any:
     """A life that began so many seconds ago."""
-    return SimpleNamespace(started=time.monotonic() - lived)
+    return SimpleNamespace(started=time.monotonic() - lived, since="2026-01-01T00:00:00.000Z")
 
 
 @pytest.fixture
@@ -31,6 +31,21 @@ def test_who_dies_at_once_waits_longer_up_to_a_second(post: Post) -> None:
         delays.append(post.delay())
     assert delays == [0.0, 0.2, 0.5, 1.0, 1.0]
     assert post.keeps_dying
+
+
+def test_what_others_can_do_without_waits_up_to_a_minute() -> None:
+    """A tunnel process that dies on every start comes ever later, and is failing until a life of it lasts."""
+    post = Post(Role(name="charon", user="rosrv-ipsec", part="ipsec", entry="m:f", dispensable=True), 0)
+    delays = []
+    for _ in range(14):
+        post.bury(life(lived=0.1))
+        delays.append(post.delay())
+    assert delays[LOUD_AFTER - 1 :] == [2.0, 4.0, 8.0, 16.0, 32.0, *[60.0] * 5]
+    post.reason = "it has no device"
+    for lived, lasts in ((1.0, False), (60.0, True), (60.0, False)):
+        post.life = life(lived=lived)
+        assert post.recovers() == lasts
+    assert (post.short_lives, post.reason) == (0, "")
 
 
 def test_a_long_life_is_followed_at_once(post: Post) -> None:

@@ -33,6 +33,9 @@ class StandIn:
         self.told: list[str] = []
         self.killed = False
         self.pid = 1
+        self.since = ""
+        self.reason = ""
+        self.output: tuple[str, ...] = ()
         self.ready = False
         self.still_seconds = 0.0
 
