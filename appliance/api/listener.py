@@ -7,35 +7,36 @@ protocol of a connection, which is handed what the front lets pass. Invariants b
 2. A peer is known here that has shown a good token lately, or is on this machine; every other is a stranger. A stranger
    makes room for whoever has none, whatever it is doing; a known peer only for another of them, and only with what has
    waited for a second.
-3. Whoever sends anything after an answer has as long to begin, and to end the head of, the next request: neither an
+3. Connections are opened (with TLS: the handshake begins) by the processor time that their peers have used. All
+   strangers are one peer there.
+4. Whoever sends anything after an answer has as long to begin, and to end the head of, the next request: neither an
    empty line nor the rest of a body keeps a connection open.
 """
 
 import asyncio
-import errno
 import math
 import socket
 import ssl
 from collections.abc import Callable, Coroutine
+from functools import partial
 from typing import Any, cast
 
-import structlog
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.config import Config
 from uvicorn.server import ServerState
 
 from appliance.api.rates import peer_key
 from appliance.config import ApiLimits
+from appliance.policy.model import Address
+from appliance.rpc.acceptor import Acceptor
 from appliance.rpc.front import Front, HttpLimits
+from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.visitors import Stage, Visitors
 from appliance.shares.descriptors import connections_within
 from appliance.shares.pool import Standing
 from appliance.shares.table import REST_CONNECTIONS
 
-_log = structlog.get_logger()
-_GONE = frozenset({errno.ECONNABORTED, errno.EINTR, errno.EPROTO})
-_PAUSE = 0.2  # when the process has no descriptor left
-_BACKLOG = 256
+_HANDSHAKE_SECONDS = 0.002  # of processor time, that a TLS handshake takes on a slow machine
 _KEEP_ALIVE_SECONDS = 30
 _END_SECONDS = 1.0
 _CONNECTION = "rosrv.connection"  # the key of a request's state that has its connection
@@ -116,6 +117,12 @@ class _Connection(Front, asyncio.Protocol):
         self.allow(self.limits.linger_seconds)
 
 
+def _class_of(standing: Callable[[str], Standing], host: Address) -> str:
+    """As whom a peer has its turn to be opened: all that have shown no good token are one."""
+    peer = peer_key(str(host))
+    return "" if standing(peer) is Standing.STRANGER else peer
+
+
 def _patience(standing: Standing, stage: Stage, _own: bool) -> float:
     if standing is Standing.STRANGER:
         return 0.0
@@ -147,6 +154,8 @@ class Listener:
         )
         self.visitors: Visitors[str] = Visitors(standing, connections=bounds, patience=_patience)
         self._tasks: set[asyncio.Task[None]] = set()
+        self._acceptor: Acceptor | None = None
+        self._time = ProcessorTime(partial(_class_of, standing))
 
     def protocol_of(self, connection: _Connection) -> asyncio.Protocol:
         """What speaks HTTP and ASGI for this connection, made as uvicorn's own server makes it."""
@@ -171,13 +180,13 @@ class Listener:
 
     async def start(self, sock: socket.socket, context: ssl.SSLContext | None) -> None:
         """Begin to accept."""
-        sock.setblocking(False)
-        sock.listen(_BACKLOG)
-        self._begin(self._accept(sock, context))
+        self._acceptor = Acceptor(sock, self._time, partial(self._accepted, context))
         self._begin(self.visitors.sweep())
 
     async def stop(self) -> None:
         """Stop accepting, let what is being answered finish for a second, close the rest."""
+        if self._acceptor is not None:
+            self._acceptor.close()
         tasks = list(self._tasks)
         for task in tasks:
             task.cancel()
@@ -189,22 +198,17 @@ class Listener:
         for connection in self.visitors.connections:
             connection.abort()
 
-    async def _accept(self, listening: socket.socket, context: ssl.SSLContext | None) -> None:
-        loop = asyncio.get_running_loop()
-        with listening:
-            while True:
-                try:
-                    sock, address = await loop.sock_accept(listening)
-                except OSError as error:
-                    if error.errno not in _GONE:
-                        _log.error("REST cannot accept a connection", reason=str(error))
-                        await asyncio.sleep(_PAUSE)
-                    continue
-                connection = _Connection(self, sock)
-                if self.visitors.enter(connection, peer_key(address[0])):
-                    sock.close()
-                else:
-                    self._begin(self._open(connection, sock, context))
+    def _accepted(self, context: ssl.SSLContext | None, sock: socket.socket, host: Address) -> None:
+        connection = _Connection(self, sock)
+        if self.visitors.enter(connection, peer_key(str(host))):
+            sock.close()
+            return
+
+        def opened() -> None:
+            self._begin(self._open(connection, sock, context))
+            self._time.charge(host, _HANDSHAKE_SECONDS)
+
+        self._time.run(host, opened)
 
     async def _open(
         self, connection: _Connection, sock: socket.socket, context: ssl.SSLContext | None

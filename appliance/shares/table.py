@@ -271,10 +271,11 @@ REST_CONNECTIONS = Share(
     "connections to REST, TLS handshakes included",
     Bounds(whole=512, host=64, strangers=192, kept=320),
     "closed at once; a stranger here is a peer that showed no good token in the last 15 minutes, and the one that waits"
-    " longest makes room",
+    " longest makes room; next to be opened is the peer that has used least processor time, strangers together as one",
     "none",
     (
         "integration/master/test_shares.py::test_handshakes_with_rest",
+        "unit/api/test_listener.py::test_a_known_peer_is_opened_before_strangers_that_came_first",
         "unit/api/test_listener.py::test_strangers_in_the_handshake_make_room",
     ),
     setting="api_limits.connections",

@@ -7,6 +7,7 @@ import socket
 import ssl
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import uvloop
 from starlette.responses import PlainTextResponse
@@ -277,3 +278,30 @@ def test_a_handshake_that_fails_leaves_nothing(tmp_path: Path) -> None:
             await play()
 
     uvloop.run(bounded())
+
+
+def test_a_known_peer_is_opened_before_strangers_that_came_first() -> None:
+    """50 strangers connect, then a peer with a good token: the loop opens at most two more of theirs before its."""
+    opened: list[str] = []
+
+    class Noting(Listener):
+        def protocol_of(self, connection: Any) -> asyncio.Protocol:
+            opened.append(connection.transport.get_extra_info("peername")[0])
+            return super().protocol_of(connection)
+
+    async def whole() -> None:
+        sock = socket.create_server(("127.0.0.1", 0), backlog=128)
+        known = {"127.0.0.99": Standing.NAMED}
+        listener = Noting(application, ApiLimits(), lambda peer: known.get(peer, Standing.STRANGER))
+        addresses = [*(f"127.0.0.{number}" for number in range(10, 60)), "127.0.0.99"]
+        clients = [socket.create_connection(sock.getsockname(), source_address=(one, 0)) for one in addresses]
+        await listener.start(sock, None)
+        async with asyncio.timeout(30):
+            while len(opened) < len(addresses):
+                await asyncio.sleep(0)
+        assert opened.index("127.0.0.99") <= 3
+        for client in clients:
+            client.close()
+        await listener.stop()
+
+    uvloop.run(whole())
