@@ -3,23 +3,37 @@
 from collections.abc import Collection
 from dataclasses import fields
 
+from appliance.rosmop.certify.steps import check_steps
 from appliance.rosmop.compiled import Compiled, Part
 from appliance.rosmop.ir.abi import FeedModule
-from appliance.rosmop.ir.feed import written
+from appliance.rosmop.ir.feed import WrittenModule, written
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.machine import translated
 from appliance.rosmop.program import groups
 
 
 def part_of(compiled: Compiled, names: Collection[str], trials: Collection[str]) -> Part:
-    """What runs these specifications, of which some are on `trials`: the same whatever else is in the set."""
+    """What runs these specifications, of which some are on `trials`: the same whatever else is in the set.
+
+    Raises `StepDiffersError` where the module does something else than the automata: that is a defect.
+    """
     alone = compiled.alone(names)
-    return Part(alone, module_of(alone.without(trials)))
+    acting = alone.without(trials)
+    module = _written(acting)
+    check_steps(acting, module)
+    return Part(alone, _translated(module))
 
 
 def module_of(compiled: Compiled) -> FeedModule:
     """The module of all of these specifications, which `MonitorSet.take_module` takes."""
+    return _translated(_written(compiled))
+
+
+def _written(compiled: Compiled) -> WrittenModule:
     components = [group.component for group in groups(compiled.specifications)]
-    module = written(compiled.functions, components, Values(compiled.messages), compiled.stamped)
+    return written(compiled.functions, components, Values(compiled.messages), compiled.stamped)
+
+
+def _translated(module: WrittenModule) -> FeedModule:
     parts = {part.name: getattr(module, part.name) for part in fields(FeedModule)}
     return FeedModule(**parts | {"code": translated(module.code, module.memory)})

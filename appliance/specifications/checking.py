@@ -7,7 +7,8 @@ from appliance.channel.messages import Contents, PartNames
 from appliance.ros.definitions import Definitions
 from appliance.ros.errors import DefinitionError
 from appliance.ros.standard import standard_definitions
-from appliance.rosmop.certify.properties import certificates_of
+from appliance.rosmop.certify.properties import DEFECT, certificates_of
+from appliance.rosmop.certify.steps import StepDiffersError
 from appliance.rosmop.engine import MonitorSet
 from appliance.rosmop.modules import part_of
 from appliance.rosmop.sent import decoded, encoded, encoded_part
@@ -72,7 +73,11 @@ def _places(monitors: MonitorSet) -> dict[str, str]:
 def parts(compiled: bytes, wanted: Sequence[PartNames]) -> list[bytes]:
     """What each of these relays runs of a set (`Contents.compiled`). Raises `SpecificationsRefusedError`."""
     whole = decoded(compiled)
-    return [_bounded(encoded_part(part_of(whole, names.monitors, names.trials))) for names in wanted]
+    try:
+        return [_bounded(encoded_part(part_of(whole, names.monitors, names.trials))) for names in wanted]
+    except StepDiffersError as error:
+        text = f"the code of a step is not what its automaton says: {error}; {DEFECT}"
+        raise SpecificationsRefusedError([text]) from error
 
 
 def _bounded(data: bytes) -> bytes:

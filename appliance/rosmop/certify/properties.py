@@ -8,7 +8,7 @@ from appliance.rosmop.logics.tfsm import TimedMachine
 from appliance.rosmop.monitor import Monitor
 from appliance.rosmop.positions import Finding
 
-_DEFECT = "this is a defect of the appliance: nothing is loaded with it; report it with the specification"
+DEFECT = "this is a defect of the appliance: nothing is loaded with it; report it with the specification"
 
 
 def certificate_of(compiled: CompiledProperty) -> Certificate:
@@ -32,6 +32,6 @@ def certificates_of(monitors: Iterable[Monitor]) -> tuple[dict[str, list[str]], 
             certificate = certificate_of(compiled)
             mine.append(f"{compiled.logic}: {certificate.text}")
             if certificate.wrong:
-                text = f"the automaton of this property is not what is written: {certificate.text}; {_DEFECT}"
+                text = f"the automaton of this property is not what is written: {certificate.text}; {DEFECT}"
                 wrong.append(compiled.source.finding(0, text))
     return lines, wrong

@@ -90,6 +90,10 @@ class WrittenModule(FeedModule):
     """Where vectors stand that are kept or made."""
     places: Sequence[range]
     """What it uses for messages that it makes."""
+    handlers: Mapping[str, Sequence[int]]
+    """The numbers of the functions of each topic's verdicts (`Feed.verdicts`)."""
+    functions: int
+    """How many functions there are besides those that are exported for topics."""
 
 
 def written(
@@ -148,6 +152,8 @@ def written(
         {raw: writer.constants[raw] for raw in writer.strings},
         writer.rooms,
         writer.places,
+        {topic: [one.number for one in walks[topic].handlers()] for topic in feeds},
+        len(writer.written),
     )
 
 
@@ -210,7 +216,7 @@ class _Walk:
             [self._table(number, place) for place in range(len(event.advances))]
             for number, event in enumerate(events)
         ]
-        functions = [*self._written, *self._run()]
+        functions = [*self._written, *self.handlers()]
         says = any(written.says for written in functions)
         self._publishes = sorted({each for written in functions for each in written.publishes})
         self._says = says or bool(self._publishes)
@@ -262,15 +268,15 @@ class _Walk:
             self._counters,
             self._log,
             self._undo,
-            all(written.brief for written in (*self._written, *self._run())),
+            all(written.brief for written in (*self._written, *self.handlers())),
             [written.number for written in self._written],
             self._says,
             f"settle {self._cells.settle}" if self._settles else "",
             self._publishes,
         )
 
-    def _run(self) -> list[Written]:
-        """The handlers that run here."""
+    def handlers(self) -> list[Written]:
+        """The handlers that run here, by their verdicts."""
         return [written for _, written in self._handlers.values() if written is not None]
 
     def _drops(self, number: int) -> bool:
