@@ -62,7 +62,13 @@ class Doors:
         self._servers: list[HttpServer] = []
 
     async def open(
-        self, sock: socket.socket, handler: Handler, *, guarded: bool, at_once: AtOnce = not_at_once
+        self,
+        sock: socket.socket,
+        handler: Handler,
+        *,
+        guarded: bool,
+        at_once: AtOnce = not_at_once,
+        keep: bool = True,
     ) -> None:
         """Serve a listener; one that is not `guarded` is reached by the appliance's own processes only."""
         server = HttpServer(
@@ -73,6 +79,7 @@ class Doors:
             visitors=self.visitors if guarded else self._own_visitors,
             turns=self.turns if guarded else self._own_turns,
             time=self.time,
+            keep=keep,
             refuse=self.refuse if guarded else lambda _peer: None,
             troubled=self.troubled,
         )

@@ -232,7 +232,9 @@ class _Control:
             at_once=parts.pipeline.repetitions.answer,
         )
         await doors.open(sockets[_OWN], parts.pipeline.handler(parts.table, own=True), guarded=False)
-        await doors.open(sockets[INNER], parts.inner.handle, guarded=False)
+        # ROSMaster asks the kernel about every connection that it keeps, at each call that it makes.
+        inner = parts.inner
+        await doors.open(sockets[INNER], inner.handle, guarded=False, at_once=inner.acknowledge, keep=False)
         self._tokens = Tokens(base.store, base.trail, lambda: self._rest.state_tokens())  # noqa: PLW0108 - made below
         if self._lifeline.announced:
             self._tokens.told()

@@ -97,7 +97,8 @@ class HttpServer:
 
     `refuse(peer)` is asked when the head of a request is there: what it returns is given the beginning of the body, as
     far as it comes in time, and the bytes that it makes of it are sent instead of reading
-    the body, and the connection is closed. `troubled(peer, reason)` hears of every limit that was hit.
+    the body, and the connection is closed. Without `keep` each answer ends its connection.
+    `troubled(peer, reason)` hears of every limit that was hit.
     """
 
     sock: socket.socket
@@ -108,6 +109,7 @@ class HttpServer:
     visitors: Visitors[Address]
     turns: Turns
     time: ProcessorTime
+    keep: bool = True
     refuse: Callable[[Peer], Refusal | None] = lambda peer: None  # noqa: ARG005 - names the parameter
     troubled: Callable[[Peer, str], None] = lambda peer, reason: None  # noqa: ARG005 - same
     connections: "set[_Connection]" = field(default_factory=set, init=False)
@@ -321,7 +323,7 @@ class _Connection(Front, asyncio.BufferedProtocol):
         if self._refusal is not None:
             self._refuse_request(self._refusal)
             return
-        keep = self.parser.should_keep_alive()
+        keep = self.server.keep and self.parser.should_keep_alive()
         request = HttpRequest(self.peer, self._url.decode("latin-1"), bytes(self._body), time.monotonic_ns())
         if self.is_quiet and not self._pending and self._answered_at_once(request, keep=keep):
             if self._held:

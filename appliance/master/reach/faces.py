@@ -108,6 +108,10 @@ class InnerFace:
         self._registry = registry
 
     async def handle(self, request: HttpRequest) -> bytes:
+        """As `acknowledge`, for a server's handler."""
+        return self.acknowledge(request)
+
+    def acknowledge(self, request: HttpRequest) -> bytes:
         """Acknowledge one call of ROSMaster."""
         if request.path != PUBLISHER_PATH and self._registry.by_key(key_of(request)) is None:
             return build_fault(1, "nobody is here")

@@ -365,6 +365,23 @@ def test_requests_of_a_host_that_used_much_wait_for_another_hosts() -> None:
     run(test())
 
 
+@pytest.mark.parametrize("at_once", [False, True])
+def test_a_server_that_keeps_no_connection(at_once: bool) -> None:
+    """Each answer says that the connection ends, and ends it: ROSMaster checks all it has open at every call."""
+
+    async def test() -> None:
+        async with serving() as server:
+            server.http.keep = False
+            server.at_once = lambda _request: b"known" if at_once else None
+            client = await server.connect()
+            await client.send(post(b"x") * 2)
+            status, headers, _body = await client.response()
+            assert (status, headers["connection"]) == (200, "close")
+            assert await client.ended() == b""
+
+    run(test())
+
+
 def test_many_connections_are_accepted_in_one_turn() -> None:
     """Connections that wait in the kernel are accepted many at a time, whatever else the loop does in each turn."""
 
