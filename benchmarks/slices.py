@@ -16,7 +16,7 @@ from appliance.rosmop.engine import MonitorSet
 
 LIVE = 10_000
 MANY = 100_000
-TOGETHER = 2_000
+TOGETHER = 1_000
 ROUNDS = 7
 
 PROPERTIES = {

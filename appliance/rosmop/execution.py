@@ -37,7 +37,7 @@ EXPLAINED = 3
 millisecond.
 """
 
-SLICE_SECONDS = 30e-6
+SLICE_SECONDS = 50e-6
 """Processor time that a message has more for each slice that it concerns."""
 
 TICK_BUDGET = 2_000

@@ -57,7 +57,7 @@ LIMIT = 100_000
 GROWING_LIMIT = 1_000
 """The same where a run is more than the state of an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
 
-TOGETHER_LIMIT = 2_000
+TOGETHER_LIMIT = 1_000
 """The same where an event, or a tick, may concern all slices at once."""
 
 MAX_BINDING = 256
@@ -324,7 +324,7 @@ class Slices:
             self._remember(domain, key, self._holder)
             return None
         if not self._has_room(most):
-            self._refuse(domain, key, f"more than {self.limit} slices")
+            self._refuse(domain, key, self._full())
             return None
         if parent is self._first:
             runs = tuple(
@@ -334,6 +334,13 @@ class Slices:
         else:
             runs = tuple(map(copy, self._looked_at(parent).runs))
         return Slice(domain, key, runs, parent.values, self._holder)
+
+    def _full(self) -> str:
+        """Why the host can have no slice more."""
+        if self._holder is None:
+            return f"more than {self.limit} slices"
+        held = self._live.held(self._holder)
+        return f"its host has {held} of {self.limit} slices, which is as many as are left for all others"
 
     def _has_room(self, most: int) -> bool:
         """Whether the host may have so many slices more, or has some of its own to forget for them."""
@@ -406,6 +413,8 @@ class Slices:
                 slice_.due = None
                 heappop(self._deadlines)
                 self._await(slice_)
+            elif len(self._deadlines) > 2 * self.live + 64:
+                self._tidy()
             else:
                 heappop(self._deadlines)
         return None
@@ -421,10 +430,14 @@ class Slices:
         if deadline is None or (slice_.due is not None and slice_.due <= deadline):
             return
         slice_.due = deadline
-        if len(self._deadlines) > 2 * self.live + 64:  # most of them count no more
-            self._deadlines = [one for one in self._deadlines if one[0] == one[2].due and not one[2].gone]
-            heapify(self._deadlines)
         heappush(self._deadlines, (deadline, next(self._order), slice_))
+        if len(self._deadlines) > 2 * self.live + 64:
+            self._tidy()
+
+    def _tidy(self) -> None:
+        """Take out the entries that count no more: most of them."""
+        self._deadlines = [one for one in self._deadlines if one[0] == one[2].due and not one[2].gone]
+        heapify(self._deadlines)
 
     def restart(self, time_ns: int) -> None:
         """Let the properties with time begin anew in each slice."""

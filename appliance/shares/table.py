@@ -258,7 +258,7 @@ SLICES = Share(
     "a host gets no more than is left for all others, and hosts without a registration are one: where the"
     " specification only observes, the oldest slice of the same host is forgotten; where it drops, changes or"
     " publishes messages, the message with a new binding is a fault; no slice is removed for another host's. There are"
-    " 2,000 in all where an event or a timer does not bind all parameters, and 1,000 where a property has no tables",
+    " 1,000 in all where an event or a timer does not bind all parameters, or where a property has no tables",
     "`monitor fault`, a line of the monitor; `rosrv_monitor_slices`",
     (
         "unit/rosmop/test_slices_shares.py::test_a_guest_that_makes_up_ids_refuses_the_robot_nothing",

@@ -178,3 +178,32 @@ def test_slices_of_a_guest_take_no_tick_from_those_of_the_robot() -> None:
     monitors.process("/goal", message("std_msgs/Header", frame_id="r", seq=0), 1, ROBOT)
     (outcome,) = monitors.advance(10**9 + 1)
     assert [one.topic for one in outcome.published] == ["/stop"]
+
+
+def test_what_a_message_may_take_grows_with_the_slices_that_it_concerns() -> None:
+    """The robot's stop for all its goals is not cut off, though each handler takes some microseconds."""
+    text = STOPPED.replace("@again { DROP; }", '@stopped { ROS_INFO("stopped"); }') % "{ }"
+    monitors = begun(text, 1000)
+    for number in range(900):
+        send(monitors, "/goal", str(number), Sender(9))
+    turn = monitors.interpreter.turn
+    monitors.limit_time(lambda: 12e-6 * len(turn.log), 0.005)
+    outcome = monitors.process("/stop", b"", 2, ROBOT)
+    assert (len(outcome.verdicts), outcome.faults) == (900, ())
+
+
+def test_slices_of_a_guest_take_no_time_of_a_tick_from_those_of_the_robot() -> None:
+    """Each has processor time of its own at a tick, too."""
+    text = """goals(std::string id) {
+        static std_msgs::Empty stop; bool waits = true;
+        creation event goal(std::string id) /goal std_msgs/String '{data:id}' { }
+        event look() every 1s { for (int i = 0; i < 300; i++) { } if (waits) { waits = false; PUBLISH(/stop, std_msgs/Empty, stop); } }
+    }"""
+    monitors = begun(text, 1000)
+    for number in range(200):
+        send(monitors, "/goal", f"g{number}", GUEST)
+    send(monitors, "/goal", "r", ROBOT)
+    turn = monitors.interpreter.turn
+    monitors.limit_time(lambda: 0.004 * len(turn.published), 0.005)
+    (outcome,) = monitors.advance(10**9 + 1)
+    assert (len(outcome.published), outcome.faults) == (201, ())
