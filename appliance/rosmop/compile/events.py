@@ -18,6 +18,7 @@ from appliance.rosmop.compile.statements import check_topic, write
 from appliance.rosmop.compiled import EventCode
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.sites import Site
+from appliance.rosmop.positions import Finding
 from appliance.rosmop.runtime.numbers import f32
 from appliance.rosmop.syntax import tree
 from appliance.rosmop.syntax.errors import SpecificationError
@@ -132,13 +133,20 @@ def _bind(scope: Scope, event: tree.Event, trigger: tree.MessageTrigger, kind: s
             )
         parameters[parameter.name] = parameter
     bound = []
+    named = {binding.variable for binding in trigger.pattern}
+    unbound = parameters.keys() - named
     for binding in trigger.pattern:
         try:
+            if (
+                binding.variable is not None
+                and not unbound
+                and _binds_nothing(scope, binding, parameters, kind)
+            ):
+                continue
             bound.append(_bind_one(scope, binding, parameters, kind))
         except SpecificationError as error:
             scope.shared.findings += error.findings
             scope.misdeclared.add(binding.variable or "")
-    named = {binding.variable for binding in trigger.pattern}
     for parameter in event.parameters:
         if parameter.name not in named:
             raise SpecificationError.at(
@@ -146,6 +154,22 @@ def _bind(scope: Scope, event: tree.Event, trigger: tree.MessageTrigger, kind: s
                 f"the parameter {shown(parameter.name)} is bound to no field; write `field:{parameter.name}`",
             )
     return bound
+
+
+def _binds_nothing(
+    scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Parameter], kind: str
+) -> bool:
+    """Whether a variable of a pattern is no parameter of the event; ROSMOP accepts that, and so does this, warning.
+
+    Raises SpecificationError where its field is none.
+    """
+    name = binding.variable or ""
+    if name in parameters or name in scope.names.parameters:
+        return False
+    type_of_path(scope.messages, kind, binding.path)
+    text = f"{shown(name)} is not a parameter of the event, so it binds nothing; leave it out"
+    scope.shared.findings.append(Finding(binding.value_position, "warning", text))
+    return True
 
 
 def _bind_one(scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Parameter], kind: str) -> Bound:

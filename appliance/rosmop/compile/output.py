@@ -35,16 +35,17 @@ def formatted(scope: Scope, template: Value, arguments: Sequence[Value]) -> form
     size, strings = len(template.constant), False
     last = 0
     waiting = list(arguments)
-    for found in _CONVERSION.finditer(template.constant):
-        pieces.append(template.constant[last : found.start()].replace(b"%", b"%%"))
-        last = found.end()
+    for written in _CONVERSION.finditer(template.constant):
+        pieces.append(template.constant[last : written.start()].replace(b"%", b"%%"))
+        last = written.end()
+        found = _with_widths(written, waiting)
         if found[0] == b"%%":
             pieces.append(b"%%")
             continue
         if not waiting:
             raise SpecificationError.at(
                 template.position,
-                f"`{found[0].decode('utf-8', 'replace')}` has no argument; for a percent sign write `%%`",
+                f"`{written[0].decode('utf-8', 'replace')}` has no argument; for a percent sign write `%%`",
             )
         value = waiting.pop(0)
         piece, converted = _conversion(scope, found, value, template.position)
@@ -62,6 +63,25 @@ def formatted(scope: Scope, template: Value, arguments: Sequence[Value]) -> form
         return form.Literal(kinds.STRING, text.replace(b"%%", b"%"))
     charged = size if strings or size > _LONG else None
     return form.Format(text, tuple(values), charged, scope.lines.site)
+
+
+def _with_widths(found: re.Match[bytes], waiting: list[Value]) -> re.Match[bytes]:
+    """Return the conversion with the numbers that stand for `*` in the arguments, as C reads them; takes those."""
+    flags, width, precision, size, letter = (part or b"" for part in found.groups())
+    if width == b"*" and (number := _literal_width(waiting)) is not None:
+        flags, width = (flags, b"%d" % number) if number >= 0 else (flags + b"-", b"%d" % -number)
+    point = b"" if found[3] is None else b"." + precision
+    if precision == b"*" and (number := _literal_width(waiting)) is not None:
+        point = b".%d" % number if number >= 0 else b""
+    made = _CONVERSION.fullmatch(b"%" + flags + width + point + size + letter)
+    return made if made is not None else found
+
+
+def _literal_width(waiting: list[Value]) -> int | None:
+    """Take the next argument if it is a number that is known; None if it is not."""
+    if not waiting or type(waiting[0].constant) is not int:
+        return None
+    return waiting.pop(0).constant  # type: ignore[return-value] # as was just seen
 
 
 def _longest(found: re.Match[bytes]) -> int:

@@ -449,6 +449,18 @@ def test_a_pattern_that_does_not_fit(parameters: str, pattern: str, text: str, c
     assert (column, True) in found
 
 
+def test_an_unused_variable_binds_nothing() -> None:
+    """A variable of a pattern that no parameter names is accepted, as by ROSMOP, with a warning at its place."""
+    spec = "s() { event e(int x) /t std_msgs/ColorRGBA '{r:x, g:y}' { } }"
+    spec = spec.replace("int x", "float x")
+    [finding] = [one for one in load(spec).warnings if "`y`" in one.text]
+    assert (finding.severity, finding.position.column) == ("warning", spec.index("y}") + 1)
+    assert "`y` is not a parameter of the event, so it binds nothing" in finding.text
+    assert any("has no field `q`" in error.text for error in refused(spec.replace("g:y", "q:y")))
+    sliced = refused(spec.replace("s() {", "s(float y) {"))
+    assert any("there is no parameter `y`" in error.text for error in sliced)
+
+
 def test_a_path_that_skips_a_message_is_answered_with_the_right_one() -> None:
     """The mistake of ROSRV's own sample: `pose.position` of an odometry is `pose.pose.position`."""
     text = event("nav_msgs/Odometry", "double x", "pose: {position: {x:x}}", "")
