@@ -1,7 +1,7 @@
 """Makes audit records of what happens in control, and says when nothing may be answered because none can be made."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from appliance.audit.events import SEVERITIES
@@ -38,6 +38,8 @@ class AuditTrail:
         self._ids = log.ids
         self.strict = strict
         self._deny_when_failed = deny_when_failed
+        self.recordings: Callable[[str, str | None, Severity, str | None, int], dict[str, str]] | None = None
+        """What a record says of the recording that has it: `RecordingPlan.detail`, once there is one."""
         self.revision = 0
         self.meter = Meter()
 
@@ -105,11 +107,14 @@ class AuditTrail:
             detail["node"] = asker.node
         if decision.needs:
             detail["needs"] = decision.needs
+        now = time.time_ns()
+        severity = Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING
+        detail |= self._recorded("decision", word, severity, asker.host, now)
         return Record(
             id=self._ids.next(),
-            time=time.time_ns(),
+            time=now,
             event="decision",
-            severity=Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING,
+            severity=severity,
             decision=word,
             host=asker.host,
             caller_id=asker.caller_id,
@@ -159,14 +164,15 @@ class AuditTrail:
         `severity` is for an event that has not always the same (`audit/events.py`).
         `reads`: it changed nothing, so that its repetitions are counted.
         """
-        detail = {**(more or {}), **detail}
+        now, severity = time.time_ns(), severity or SEVERITIES.get(event, Severity.INFO)
+        detail = {**(more or {}), **detail, **self._recorded(event, decision, severity, host, now)}
         stranger = self._marked(host, decision, detail)
         return self._log.record(
             Record(
                 id=self._ids.next(),
-                time=time.time_ns(),
+                time=now,
                 event=event,
-                severity=severity or SEVERITIES.get(event, Severity.INFO),
+                severity=severity,
                 decision=decision,
                 host=host,
                 caller_id=caller_id,
@@ -180,6 +186,12 @@ class AuditTrail:
                 folds=reads or (decision is None and host is not None and bool(self.owing(host))),
             )
         )
+
+    def _recorded(
+        self, event: str, decision: str | None, severity: Severity, host: str | None, now: int
+    ) -> dict[str, str]:
+        """Which recording has what happens now, or why there is none; empty when it is no trigger of one."""
+        return {} if self.recordings is None else self.recordings(event, decision, severity, host, now)
 
     def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
         """Whether this is about a stranger whom something is refused; the detail says so then."""

@@ -334,7 +334,7 @@ class RecorderRules:
         default=["drop", "verdict", "fault", "alarm", "service"],
         description="what begins a recording, besides an operator; service: a node's call, if the policy lets it",
     )
-    per_hour: Count = key(default=6, description="recordings that triggers of one kind may begin")
+    per_hour: Count = key(default=6, description="recordings that one host may begin by one kind of trigger")
     disk: Annotated[int, Read(lambda its: its.Field(ge=64 << 20), "ByteSize")] = key(
         default=2 << 30, description="of all recordings; one has an eighth of it at most"
     )

@@ -66,7 +66,8 @@ EVENTS: dict[str, str] = {
     "recording fetched": "Somebody fetched the messages of a recording; `detail` has who.",
     "recording read": "Somebody read messages of a recording, decoded; `detail` has who, and of which topics.",
     "recording removed": "A recording was removed: `detail.who` has by whom; `recorder` to make room, or by age.",
-    "recording missed": "A trigger made no recording: `reason` says why (the hour's number, the disk).",
+    "recording missed": "A trigger made no recording: `reason` says why (the hour's number, the disk);"
+    " `detail.recording` is the one that its record had promised.",
     "topic looked into": "Somebody has messages of a topic shown; `detail` has who, and the `seconds` it covers.",
     "rest call": "A REST call was answered; `detail` has who (the token's name), method and status.",
     "evidence exported": "A bundle of evidence was made; `detail` has who, the hash of its manifest and its span.",

@@ -351,6 +351,7 @@ def _described(recording: Recording) -> Iterator[str]:
     yield f"  from {_moment(recording.began)} to {_moment(recording.ended)}"
     yield f"  policy revision {recording.policy}, specifications revision {recording.monitors}"
     yield f"  sha256 {recording.sha256}"
+    yield f"  charged to {recording.charged_to}"
     if recording.why_not:
         yield f"  missing: {recording.why_not}"
     for trigger in recording.triggers:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from ipaddress import ip_address, ip_network
 
 from appliance import late
+from appliance.audit.ids import IdSource
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.config import Settings
@@ -21,7 +22,7 @@ from appliance.control.lifeline import ControlLifeline
 from appliance.control.monitor_states import published_now
 from appliance.control.policies import Policies
 from appliance.control.recording_orders import RecordingOrders
-from appliance.control.standing import HostStanding
+from appliance.control.standing import HostStanding, charged_to
 from appliance.master import rosout
 from appliance.master.calls.call import served
 from appliance.master.calls.execution import Execution
@@ -61,6 +62,7 @@ from appliance.master.upkeep.reconcile import Reconciler
 from appliance.master.upkeep.reminders import Reminders
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
+from appliance.recorder.plan import RecordingPlan
 from appliance.ros import log_message
 from appliance.rpc.bulk import LargeWrites, bulk_turns
 from appliance.shares.pool import Pool
@@ -109,6 +111,9 @@ class Parts:
             base.settings.recorder,
             base.trail,
             lambda: messages.RevisionsStated(base.policies.revision, self.monitors.revision),
+            RecordingPlan(
+                base.settings.recorder, lambda host: charged_to(base.policies.current, host), IdSource().next
+            ),
         )
         self._make_graph()
         self._make_reach()

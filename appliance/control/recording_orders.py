@@ -8,12 +8,20 @@ from typing import Any, TypeVar
 
 from appliance.audit_trail import AuditTrail
 from appliance.channel import admin, messages
-from appliance.channel.answers.recordings import Recording, RecordingBegun, Recordings, Trigger, TriggerKind
+from appliance.channel.answers.recordings import (
+    OPERATORS,
+    Recording,
+    RecordingBegun,
+    Recordings,
+    Trigger,
+    TriggerKind,
+)
 from appliance.channel.answers.status import RecorderState
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
 from appliance.config import RecorderRules
 from appliance.control.errors import SenselessError, UnknownThingError
+from appliance.recorder.plan import RecordingPlan
 from appliance.recorder.shelf import MOST_LENT
 
 _PATIENCE_SECONDS = 10.0
@@ -30,13 +38,19 @@ class RecorderAwayError(Exception):
 class RecordingOrders:
     """Each method with a request answers it. They raise `RecorderAwayError`, `UnknownThingError`, `SenselessError`.
 
-    `in_force()` are the revisions that a recording is described with.
+    `in_force()` are the revisions that a recording is described with. `plan` says which recording has an act of a host.
     """
 
     def __init__(
-        self, rules: RecorderRules, trail: AuditTrail, in_force: Callable[[], messages.RevisionsStated]
+        self,
+        rules: RecorderRules,
+        trail: AuditTrail,
+        in_force: Callable[[], messages.RevisionsStated],
+        plan: RecordingPlan,
     ) -> None:
         self._rules = rules
+        self._plan = plan
+        trail.recordings = plan.detail
         self._trail = trail
         self._in_force = in_force
         self.link = Link(self._heard)
@@ -104,10 +118,13 @@ class RecordingOrders:
         record = self._trail.happened(
             "recording ordered", reason, who=who, before=before, after=after, **caller
         )
-        trigger = Trigger(time.time_ns(), what, record, text[:_LONGEST_NOTE])
-        return await self._ask(
+        charged_to = self._plan.charged_to(str(caller["host"])) if "host" in caller else OPERATORS
+        trigger = Trigger(time.time_ns(), what, record, text[:_LONGEST_NOTE], charged_to)
+        begun = await self._ask(
             lambda number: messages.RecordingWanted(number, trigger, before, after), messages.RecordingBegun
         )
+        self._plan.opened(charged_to, begun.id, begun.began, begun.ends)
+        return begun
 
     async def fetch(self, request: admin.RecordingFetch, who: str) -> Recording:
         """Say that somebody takes its messages, which he reads where they lie."""
@@ -154,7 +171,7 @@ class RecordingOrders:
             before=min(self._rules.before, max(0, now - since) / 1e9),
             after=0.0,
         )
-        trigger = Trigger(now, "order", record, f"{who}: of what is in memory")
+        trigger = Trigger(now, "order", record, f"{who}: of what is in memory", OPERATORS)
         lent = await self._ask(
             lambda number: messages.MemoryWanted(number, trigger, since, until), messages.MemoryLent
         )
@@ -206,15 +223,21 @@ class RecordingOrders:
         match message:
             case messages.RecordingsStated(recordings):
                 self._kept = {recording.id: recording for recording in recordings}
+                self._plan.stated(recordings)
             case messages.RevisionsWanted():
                 self.link.send(self._in_force())
             case messages.RecordingClosed(recording):
                 self._begun = None
+                self._plan.closed(recording)
                 self._closed(recording)
                 self._note(recording.id)
-            case messages.RecordingMissed(trigger, reason):
+            case messages.RecordingMissed(trigger, reason, planned):
                 self._begun = None
-                self._trail.happened("recording missed", reason, what=trigger.what, record=trigger.record)
+                about = {"what": trigger.what, "record": trigger.record, "charged_to": trigger.charged_to}
+                if planned:
+                    about["recording"] = planned
+                    self._plan.missed(trigger.charged_to, planned, reason, time.time_ns())
+                self._trail.happened("recording missed", reason, more=about)
             case messages.RecordingRemoved(_number, recording, who, reason):
                 self._kept.pop(recording.id, None)
                 self._trail.happened(
@@ -255,5 +278,6 @@ class RecordingOrders:
             began=recording.began,
             ended=recording.ended,
             complete=recording.complete,
+            charged_to=recording.charged_to,
             triggers=[f"{trigger.what} {trigger.record}" for trigger in recording.triggers],
         )

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from appliance.channel.answers.recordings import APPLIANCE, ROBOT, UNKNOWN
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.shares.pool import Standing
@@ -32,3 +33,14 @@ class HostStanding:
             return self(address_of(host))
         except ValueError:
             return Standing.NAMED
+
+
+def charged_to(policy: Policy, host: str) -> str:
+    """By what name recordings of a host's acts are charged: see `recorder.plan`."""
+    try:
+        address = address_of(host)
+    except ValueError:
+        return APPLIANCE
+    if address.is_loopback or any(address in network for network in policy.robot):
+        return ROBOT
+    return policy.counted_as(address).removesuffix("/32").removesuffix("/128") or UNKNOWN

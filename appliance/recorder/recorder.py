@@ -4,8 +4,8 @@
 
 Invariants:
 
-1. One recording is made at a time. A trigger within its time makes it longer, up to `longest`; a later one begins
-   another.
+1. One recording of each host is made at a time (`plan`). A trigger within its time prolongs it, up to `longest`; a
+   later one begins another. Control has planned which recording has a trigger, and its audit record says so.
 2. Whatever a trigger is, recordings take no more of the disk than they may, nor what is kept for the audit log.
 3. A recording that a fallen recorder began is finished by the next: whole while the memory is the same, else as far as
    it got, and that stands in it.
@@ -26,11 +26,12 @@ from appliance.audit.ids import IdSource
 from appliance.audit.query import Filter
 from appliance.audit.search import Follower, export, search
 from appliance.channel import messages
-from appliance.channel.answers.recordings import Trigger
+from appliance.channel.answers.recordings import Recording, Trigger
 from appliance.config import RecorderRules
+from appliance.recorder.plan import KEPT, HourlyLimit, lane, span
 from appliance.recorder.recording import MOST_TRIGGERS, Progress, RecordingInProgress, load_progress
 from appliance.recorder.shelf import MOST_LENT, Shelf
-from appliance.recorder.triggers import HourlyLimit, trigger_of
+from appliance.recorder.triggers import trigger_of
 
 SETTLE_SECONDS = 0.5
 """After its end a recording waits so long for what is on its way from the relay, and from the log."""
@@ -40,6 +41,7 @@ _PAGES = 20  # of the log in one step
 _MOST_RECORDS = 200_000  # of the log in one recording
 _SECOND = 1_000_000_000
 _TELL_AGAIN = 600 * _SECOND
+_MOST_TOLD = 4096
 _log = structlog.get_logger()
 
 
@@ -70,10 +72,12 @@ class Recorder:
         self._ids = IdSource(clock=clock)
         self._limit = HourlyLimit(rules.per_hour, shelf.recordings)
         self._follower: Follower | None = None
-        self._making: RecordingInProgress | None = None
+        self._making: list[RecordingInProgress] = []
         self._revisions = messages.RevisionsStated(0, 0)
-        self._revisions_asked = False
-        self._told: dict[str, int] = {}  # when it was told last that such a trigger made no recording
+        self._asked_for: set[str] = set()  # the recordings for whose end the revisions were asked
+        self._told: dict[
+            tuple[str, str], int
+        ] = {}  # when it was told last that such a trigger made no recording
         self._answers: list[messages.Message] = []
         self._take_up()
 
@@ -87,26 +91,28 @@ class Recorder:
                     "what control said cannot be done", order=type(message).__name__, reason=str(error)
                 )
         try:
-            for trigger in self._new_triggers():
-                self._triggered(trigger)
-            self._go_on()
+            for trigger, planned in self._new_triggers():
+                self._triggered(trigger, planned)
         except LogUnreadableError as error:
             _log.error("the audit log cannot be read; it is tried again", reason=str(error))
-        except OSError as error:
-            self._give_up(error)
-        self._remove_surplus(room=False)
+        for making in tuple(self._making):
+            try:
+                self._go_on(making)
+            except OSError as error:
+                self._give_up(making, error)
+        self._remove_outdated()
         answers, self._answers = self._answers, []
         return answers
 
     def close(self) -> None:
-        """Leave the recording that is being made to the next recorder."""
-        if self._making is not None:
-            self._making.leave()
+        """Leave the recordings that are being made to the next recorder."""
+        for making in self._making:
+            making.leave()
 
     @property
     def pause(self) -> float:
         """Seconds until the next step is due."""
-        return _IDLE_SECONDS if self._making is None else _BUSY_SECONDS
+        return _BUSY_SECONDS if self._making else _IDLE_SECONDS
 
     # --- what control says --------------------------------------------------------------------------------
 
@@ -129,18 +135,16 @@ class Recorder:
                 self._remove(number, recording_id, who)
 
     def _order(self, wanted: messages.RecordingWanted) -> None:
-        try:
-            why_not = self._record(wanted.trigger, wanted.before, wanted.after)
-        except OSError as error:
-            self._give_up(error)
-            why_not = str(error)
-        if self._making is None or why_not:
+        making, why_not = self._record(wanted.trigger, wanted.before, wanted.after)
+        if making is None:
             self._answers.append(messages.RecordingRefused(wanted.number, why_not))
             if wanted.trigger.what == "service":  # an operator reads the refusal, of a node's nobody may
                 self._missed(wanted.trigger, why_not)
         else:
-            progress = self._making.progress
-            self._answers.append(messages.RecordingBegun(wanted.number, progress.id, progress.ends))
+            progress = making.progress
+            self._answers.append(
+                messages.RecordingBegun(wanted.number, progress.id, progress.ends, progress.began)
+            )
 
     def _lend(self, wanted: messages.MemoryWanted) -> None:
         """Write what is in memory of that time where it can be read, beside the recordings and not among them."""
@@ -189,15 +193,22 @@ class Recorder:
 
     # --- triggers -----------------------------------------------------------------------------------------
 
-    def _new_triggers(self) -> list[Trigger]:
+    def _new_triggers(self) -> list[tuple[Trigger, str]]:
+        """What has happened, each with the recording that control has planned for it (empty: none)."""
         follower = self._follower or self._begin_to_follow()
-        found: list[Trigger] = []
+        found: list[tuple[Trigger, str]] = []
         for _page in range(_PAGES):
             entries = follower.poll()
             if not entries:
                 break
-            triggers = (trigger_of(entry.record, self._rules.triggers) for entry in entries)
-            found += [trigger for trigger in triggers if trigger is not None]
+            for record in (entry.record for entry in entries):
+                trigger = trigger_of(record, self._rules.triggers)
+                if trigger is None:
+                    continue
+                if "not_recorded" in record.detail:
+                    self._missed(trigger, str(record.detail["not_recorded"]))
+                else:
+                    found.append((trigger, str(record.detail.get("recording", ""))))
         return found
 
     def _begin_to_follow(self) -> Follower:
@@ -207,47 +218,80 @@ class Recorder:
         self._follower = Follower(self._log, Filter(), first[0].sequence - 1 if first else None)
         return self._follower
 
-    def _triggered(self, trigger: Trigger) -> None:
-        if any(kept.began <= trigger.time <= kept.ended for kept in self._shelf.recordings):
+    def _triggered(self, trigger: Trigger, planned: str) -> None:
+        if planned and self._shelf.knows(planned):
+            kept = self._shelf.find(planned)
+            if kept is not None and trigger.time > kept.ended:
+                self._missed(
+                    trigger, f"recording {planned} had ended: {kept.why_not or 'its time was over'}", planned
+                )
             return
-        why_not = self._record(trigger, self._rules.before, self._rules.after)
-        if why_not:
-            self._missed(trigger, why_not)
+        if any(
+            lane(kept.charged_to) == lane(trigger.charged_to) and kept.began <= trigger.time <= kept.ended
+            for kept in self._shelf.recordings
+        ):
+            return
+        making, why_not = self._record(trigger, planned=planned)
+        if making is None:
+            self._missed(trigger, why_not, planned)
 
-    def _missed(self, trigger: Trigger, why: str) -> None:
+    def _missed(self, trigger: Trigger, why: str, planned: str = "") -> None:
         """Have it recorded that such a trigger began no recording, which is said again after a while."""
-        now = self._clock()
-        if abs(now - self._told.get(trigger.what, -_TELL_AGAIN)) >= _TELL_AGAIN:  # or the clock was set back
-            self._told[trigger.what] = now
-            self._answers.append(messages.RecordingMissed(trigger, why))
+        now, kind = self._clock(), (trigger.charged_to, trigger.what)
+        if (
+            planned or abs(now - self._told.get(kind, -_TELL_AGAIN)) >= _TELL_AGAIN
+        ):  # or the clock was set back
+            if len(self._told) > _MOST_TOLD:
+                self._told.clear()
+            self._told[kind] = now
+            self._answers.append(messages.RecordingMissed(trigger, why, planned))
 
-    def _record(self, trigger: Trigger, before: float, after: float) -> str:
-        """Have a recording with this trigger in it; why there is none, or empty. Raises `OSError`."""
-        ends = trigger.time + int(after * _SECOND)
-        if self._making is not None:
-            progress = self._making.progress
-            latest = progress.began + int(self._rules.longest * _SECOND)
-            if trigger.time <= progress.ends:
-                progress.ends = max(progress.ends, min(ends, latest))
-                known = any(trigger.record == other.record for other in progress.triggers)
-                if not known and len(progress.triggers) < MOST_TRIGGERS:
-                    progress.triggers.append(trigger)
-                return ""
-            self._close()
+    def _record(
+        self, trigger: Trigger, before: float | None = None, after: float | None = None, planned: str = ""
+    ) -> tuple[RecordingInProgress | None, str]:
+        """Have a recording with this trigger in it: the one that is made, or why there is none."""
+        charged_to, now = trigger.charged_to, trigger.time
+        for making in tuple(self._making):
+            progress = making.progress
+            if lane(progress.charged_to) == lane(charged_to):
+                if now <= progress.ends:
+                    _prolong(progress, trigger, after)
+                    return making, ""
+                try:
+                    self._close(making)
+                except OSError as error:
+                    self._give_up(making, error)
         if self._shelf.free < 2 * self._reserve + self._shelf.largest:
-            return "the disk is nearly full"
-        if trigger.what != "order" and not self._limit.take(trigger.what, self._clock()):
-            return f"this hour has its {self._rules.per_hour} recordings of this kind (recorder.per_hour)"
-        self._remove_surplus(room=True)
-        began = trigger.time - int(before * _SECOND)
-        if self._memory <= trigger.time:  # else the clock was set back since
-            began = max(self._memory, began)
-        ends = min(ends, began + int(self._rules.longest * _SECOND))
-        progress = Progress(self._ids.next(), self._memory, began, ends, [trigger])
-        self._making = self._in_progress(progress)
+            return None, "the disk is nearly full"
+        if (
+            not planned
+            and trigger.what != "order"
+            and not self._limit.take(charged_to, trigger.what, self._clock())
+        ):
+            return None, self._limit.refusal(charged_to)
+        why_not = self._make_room(charged_to)
+        if why_not:
+            return None, why_not
+        own = [kept.ended for kept in self._shelf.recordings if lane(kept.charged_to) == lane(charged_to)]
+        ended = max(own, default=0)
+        times = span(self._rules, now, ended, before, after)
+        began = (
+            max(self._memory, times.began) if self._memory <= now else times.began
+        )  # the clock was set back since
+        latest = began + int(self._rules.longest * _SECOND)
+        progress = Progress(
+            planned or self._ids.next(), self._memory, began, min(times.ends, latest), [trigger],
+            charged_to=charged_to, hold=times.hold, latest=latest,
+        )  # fmt: skip
+        try:
+            making = self._in_progress(progress)
+        except OSError as error:
+            self._shelf.discard_part(progress.id)
+            return None, str(error)
+        self._making.append(making)
         self._answers.append(messages.RevisionsWanted())
-        _log.info("a recording begins", recording=progress.id, trigger=trigger.what)
-        return ""
+        _log.info("a recording begins", recording=progress.id, trigger=trigger.what, charged_to=charged_to)
+        return making, ""
 
     def _in_progress(self, progress: Progress) -> RecordingInProgress:
         folder = self._shelf.part(progress.id)
@@ -255,30 +299,27 @@ class Recorder:
 
     # --- the recording ------------------------------------------------------------------------------------
 
-    def _go_on(self) -> None:
-        if self._making is None:
-            return
-        now, progress = self._clock(), self._making.progress
+    def _go_on(self, making: RecordingInProgress) -> None:
+        now, progress = self._clock(), making.progress
         if now < progress.began:
             progress.why_not = "the clock was set back while it was made"
             now = progress.began
         if now <= progress.ends:
-            self._making.step()
-        elif not self._revisions_asked:
-            self._revisions_asked = True
+            making.step()
+        elif progress.id not in self._asked_for:
+            self._asked_for.add(progress.id)
             self._answers.append(messages.RevisionsWanted())
         if self._shelf.free < self._reserve:
             progress.why_not = "the disk was nearly full"
         if progress.why_not:
             progress.ends = min(now, progress.ends)
         if progress.why_not or now >= progress.ends + int(SETTLE_SECONDS * _SECOND):
-            self._close()
+            self._close(making)
 
-    def _close(self) -> None:
+    def _close(self, making: RecordingInProgress) -> None:
         """The recording is over: its last messages, the audit records of its time, and its description."""
-        assert self._making is not None  # noqa: S101  somebody has looked
-        self._making.step()
-        self._finish(self._making)
+        making.step()
+        self._finish(making)
 
     def _finish(self, making: RecordingInProgress) -> None:
         progress = making.progress
@@ -289,20 +330,23 @@ class Recorder:
             records = []
             progress.why_not = progress.why_not or f"the audit log could not be read: {error}"
         recording = making.finish(records, self._revisions)
-        self._making, self._revisions_asked = None, False
+        self._forget(making)
         self._shelf.keep(recording)
         self._answers.append(messages.RecordingClosed(recording))
         _log.info("a recording is closed", recording=recording.id, size=recording.size)
 
-    def _give_up(self, error: OSError) -> None:
+    def _give_up(self, making: RecordingInProgress, error: OSError) -> None:
         """The disk does not take it: what was written of it goes."""
         _log.error("a recording cannot be made", reason=str(error))
-        if self._making is not None:
-            self._making.leave()
-            progress = self._making.progress
-            self._shelf.discard_part(progress.id)
-            self._making, self._revisions_asked = None, False
-            self._answers.append(messages.RecordingMissed(progress.triggers[0], str(error)))
+        making.leave()
+        progress = making.progress
+        self._shelf.discard_part(progress.id)
+        self._forget(making)
+        self._answers.append(messages.RecordingMissed(progress.triggers[0], str(error), progress.id))
+
+    def _forget(self, making: RecordingInProgress) -> None:
+        self._making = [other for other in self._making if other is not making]
+        self._asked_for.discard(making.progress.id)
 
     def _take_up(self) -> None:
         """Go on with what a fallen recorder began, or finish it; where nothing is known of it, take it away."""
@@ -314,8 +358,8 @@ class Recorder:
                 shutil.rmtree(folder)
                 continue
             try:
-                if progress.memory == self._memory and self._making is None:
-                    self._making = self._in_progress(progress)
+                if progress.memory == self._memory:
+                    self._making.append(self._in_progress(progress))
                     _log.warning("a recording that was begun goes on", recording=progress.id)
                     continue
                 progress.why_not = "the appliance ended while it was made"
@@ -324,10 +368,37 @@ class Recorder:
             except OSError as error:
                 _log.error("it cannot be finished; the next start tries again", reason=str(error))
 
-    def _remove_surplus(self, *, room: bool) -> None:
+    def _remove_outdated(self) -> None:
         try:
-            for recording, reason in self._shelf.surplus(self._clock(), room=room):
-                self._shelf.remove(recording, "", reason)
-                self._answers.append(messages.RecordingRemoved(0, recording, "", reason))
+            for recording, reason in self._shelf.outdated(self._clock()):
+                self._remove_for(recording, reason)
         except OSError as error:
             _log.error("a recording cannot be removed", reason=str(error))
+
+    def _make_room(self, charged_to: str) -> str:
+        """Remove what is in the way of a recording of this host; why there is no room all the same."""
+        while True:
+            try:
+                found, why = self._shelf.in_the_way(
+                    charged_to, [making.progress.charged_to for making in self._making]
+                )
+                if found is None:
+                    return why
+                self._remove_for(found, why)
+            except OSError as error:
+                return str(error)
+
+    def _remove_for(self, recording: Recording, reason: str) -> None:
+        self._shelf.remove(recording, "", reason)
+        self._answers.append(messages.RecordingRemoved(0, recording, "", reason))
+
+
+def _prolong(progress: Progress, trigger: Trigger, after: float | None) -> None:
+    """A trigger within the time of a recording is one of its own."""
+    hold = progress.hold if after is None else int(after * _SECOND)
+    progress.ends = max(progress.ends, min(trigger.time + hold, progress.latest))
+    if trigger.charged_to in KEPT and progress.charged_to not in KEPT:
+        progress.charged_to = trigger.charged_to  # from now on no host displaces it
+    known = any(trigger.record == other.record for other in progress.triggers)
+    if not known and len(progress.triggers) < MOST_TRIGGERS:
+        progress.triggers.append(trigger)

@@ -20,7 +20,7 @@ import msgspec
 
 from appliance.audit.output import Entry, as_json
 from appliance.audit.record import Severity
-from appliance.channel.answers.recordings import LeftOutTopic, RecordedTopic, Recording, Trigger
+from appliance.channel.answers.recordings import OPERATORS, LeftOutTopic, RecordedTopic, Recording, Trigger
 from appliance.channel.messages import RevisionsStated
 from appliance.recorder.bag import BagWriter, Message
 from appliance.recorder.never import NAMED
@@ -76,6 +76,11 @@ class Progress(msgspec.Struct):
     """Messages of connections beyond `_MOST_HEADERS`."""
     why_not: str = ""
     """Why it ended before its time."""
+    charged_to: str = OPERATORS
+    hold: int = 0
+    """A trigger prolongs it to so long after itself (nanoseconds)."""
+    latest: int = 0
+    """Nothing prolongs it beyond."""
     left_out: list[LeftOutTopic] = []
     claims: int = 0
     """Topics that were left out because of what their publishers say."""
@@ -209,6 +214,7 @@ class RecordingInProgress:
             complete=not why_not,
             why_not=why_not,
             left_out=progress.left_out,
+            charged_to=progress.charged_to,
         )
         about = msgspec.json.format(msgspec.json.encode(recording)) + b"\n"
         write_whole(self._folder / ABOUT, about, 0o640)

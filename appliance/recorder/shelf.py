@@ -5,9 +5,12 @@ What is removed is `.ID.gone/` until the audit log has that, without its bag; `.
 Invariants:
 
 1. A folder with the name of a recording is whole: it gets that name when all that is in it is on disk.
-2. All of them together never have more than `disk` bytes: room for the largest is made before one is begun. Of the kind
-   of trigger whose recordings have most of it, the oldest goes: who causes many loses none of others. So it does where
-   their descriptions have more than `_MOST_DESCRIBED` bytes, for control is told of all of them in one message.
+2. All of them together never have more than `disk` bytes: room for the largest is made before one is begun. A host but
+   the robot's makes room from its own where it would have more than a quarter of it; all of these together have three
+   quarters at most. One of theirs never takes the place of one of the robot's or of operators', who need not have less
+   than half of the disk because of others. Of those that make room the oldest goes, of the kind of trigger that has
+   most. So it is with the number of recordings, and where their descriptions have more than `_MOST_DESCRIBED` bytes:
+   control is told of all of them in one message.
 3. `noted` in a folder says that the audit log has the recording; what was not noted is told again.
 4. `lent` in a folder says that it is no recording that is kept: there are `MOST_LENT` at most, of which the oldest goes
    with the next, but not while who asked for it may be about to open it (`_OPENING_SECONDS`), and a recorder that
@@ -20,7 +23,7 @@ Invariants:
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -28,6 +31,7 @@ import msgspec
 import structlog
 
 from appliance.channel.answers.recordings import Recording
+from appliance.recorder.plan import KEPT
 
 BAG, ABOUT, PROGRESS = "recording.bag", "recording.json", "progress"
 MOST_KEPT = 500
@@ -150,6 +154,10 @@ class Shelf:
         """The recording of this id; None when there is none."""
         return next((found for found in self.recordings if found.id == recording_id), None)
 
+    def knows(self, recording_id: str) -> bool:
+        """Whether there is a recording of this id, or was one that was removed a moment ago."""
+        return self.find(recording_id) is not None or self._gone(recording_id).exists()
+
     def remove(self, recording: Recording, who: str, reason: str) -> None:
         """Take a recording away, for somebody or for a reason. Raises `OSError`."""
         kept, gone = self._folder / recording.id, self._gone(recording.id)
@@ -186,10 +194,10 @@ class Shelf:
         """Those of which it is not known whether the audit log has them."""
         return [found for found in self.recordings if not (self._folder / found.id / _NOTED).exists()]
 
-    def surplus(self, now: int, *, room: bool) -> Iterator[tuple[Recording, str]]:
-        """What is to be removed now (nanoseconds since the epoch), and why; `room`: another recording begins.
+    def outdated(self, now: int) -> Iterator[tuple[Recording, str]]:
+        """What is too old now (nanoseconds since the epoch), and why; to be removed before the next is asked for.
 
-        Each is to be removed before the next is asked for. What was lent for long enough goes, too. Raises `OSError`.
+        What was lent for long enough goes, too. Raises `OSError`.
         """
         self._take_back(now, 0, LENT_SECONDS)
         while self._seconds is not None and self.recordings:
@@ -197,23 +205,46 @@ class Shelf:
             if self._since[oldest.id] + int(self._seconds * 1e9) > self._clock():
                 break
             yield oldest, "it is older than recorder.days"
-        while room and self.recordings:
-            if sum(self._sizes().values()) + self.largest > self._disk:
-                why = "recorder.disk is used up"
-            elif len(self.recordings) >= MOST_KEPT:
-                why = f"there are {MOST_KEPT} recordings"
-            elif sum(self._described.values()) > _MOST_DESCRIBED:
-                why = f"the descriptions of all recordings have more than {_MOST_DESCRIBED} bytes"
-            else:
-                break
-            sizes = self._sizes()
-            fullest = max(sizes, key=lambda what: sizes[what])
-            yield next(found for found in self.recordings if _kind(found) == fullest), why
 
-    def _sizes(self) -> Counter[str]:
+    def in_the_way(self, charged_to: str, making: Sequence[str] = ()) -> tuple[Recording | None, str]:
+        """The next recording to remove so that one of this host can be made, and why; an empty reason: there is room.
+
+        None with a reason: no other is to make room. `making` are the hosts whose recordings are being made now.
+        """
+        held = self._sizes(lambda found: found.charged_to)
+        held.update({name: number * self.largest for name, number in Counter((*making, charged_to)).items()})
+        guests = {name: size for name, size in held.items() if name not in KEPT}
+        kept_here = {found.charged_to for found in self.recordings}
+        if charged_to not in KEPT and held[charged_to] > self._disk // 4 and charged_to in kept_here:
+            return self._oldest({charged_to}), f"{charged_to} has its share of recorder.disk"
+        if charged_to not in KEPT and sum(guests.values()) > self._disk * 3 // 4:
+            why = "hosts but the robot have their share of recorder.disk"
+        elif sum(held.values()) > self._disk:
+            why = "recorder.disk is used up"
+        elif len(self.recordings) + len(making) >= MOST_KEPT:
+            why = f"there are {MOST_KEPT} recordings"
+        elif sum(self._described.values()) > _MOST_DESCRIBED:
+            why = f"the descriptions of all recordings have more than {_MOST_DESCRIBED} bytes"
+        else:
+            return None, ""
+        others, own = kept_here - KEPT, kept_here & KEPT
+        if others and (charged_to not in KEPT or not own or sum(guests.values()) * 2 > self._disk):
+            return self._oldest({max(others, key=lambda name: held[name])}), why
+        return (self._oldest(own), why) if own and charged_to in KEPT else (None, why)
+
+    def _oldest(self, charged_to: Collection[str]) -> Recording:
+        """Of these hosts' recordings the oldest of the kind of trigger that has most."""
+        kinds = self._sizes(lambda found: _kind(found) if found.charged_to in charged_to else "")
+        del kinds[""]
+        fullest = max(kinds, key=lambda kind: kinds[kind])
+        return next(
+            found for found in self.recordings if found.charged_to in charged_to and _kind(found) == fullest
+        )
+
+    def _sizes(self, of: Callable[[Recording], str]) -> Counter[str]:
         sizes: Counter[str] = Counter()
         for recording in self.recordings:
-            sizes[_kind(recording)] += recording.size
+            sizes[of(recording)] += recording.size
         return sizes
 
 

@@ -230,12 +230,18 @@ RECORDER_MEMORY = Share(
     setting="recorder.memory (a host's part is half of it, a topic's a quarter)",
 )
 RECORDER_DISK = Share(
-    "bytes of recordings (a host here is one recording)",
-    Bounds(whole=2 << 30, host=256 << 20, strangers=0, kept=0),
-    "the oldest recording of the kind of trigger that has most goes; a kind begins six recordings an hour",
-    "`recording removed`, `recording missed`",
+    "bytes of recordings (a stranger here is a host that no rule names, or what no host did; kept is the robot's and"
+    " operators')",
+    Bounds(whole=2 << 30, host=512 << 20, strangers=512 << 20, kept=512 << 20),
+    "the host that would have more makes room from its own, the oldest of the kind of trigger that has most; no host"
+    " displaces a recording of the robot, which gets half of the whole back from others; a host begins six recordings"
+    " an hour by each kind of trigger, and two hosts but the robot are recorded at once",
+    "`recording removed`, `recording missed`; `detail.not_recorded` of the record",
     (
-        "unit/recorder/test_shelf.py::test_who_has_most_makes_room",
+        "unit/recorder/test_shelf.py::test_a_guest_makes_room_from_its_own",
+        "unit/recorder/test_shelf.py::test_no_guest_displaces_a_recording_of_the_robot",
+        "unit/recorder/test_plan.py::test_a_guests_flood_leaves_the_robot_its_recording",
+        "unit/recorder/test_plan.py::test_unknown_hosts_are_one",
         "unit/recorder/test_recorder.py::test_a_flood_of_triggers_fills_no_disk",
     ),
     setting="recorder.disk (one recording has an eighth of it)",

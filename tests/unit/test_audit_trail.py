@@ -10,6 +10,8 @@ from appliance.audit.budget import Budget
 from appliance.audit.ids import IdSource
 from appliance.audit.record import Severity
 from appliance.audit_trail import NOT_RECORDED, AuditTrail
+from appliance.config import RecorderRules
+from appliance.recorder.plan import RecordingPlan
 from appliance.shares.pool import Standing
 from appliance.shares.table import AUDIT_BYTES
 
@@ -92,3 +94,18 @@ def test_what_a_host_beyond_its_share_causes_is_counted() -> None:
     one.happened("connection opened", "", host="10.0.0.1")
     assert [record.folds for record in log.records] == [False, False, True, False, False]
     assert GUEST in one.owing(GUEST)
+
+
+def test_the_record_of_a_drop_says_which_recording_has_it() -> None:
+    """Whatever a specification names its values; so does an alarm; what is no trigger says nothing."""
+    log = Log()
+    one = trail(log, deny=False)
+    rules = RecorderRules(enabled=True, per_hour=1, triggers=["drop", "alarm", "denial"])
+    one.recordings = RecordingPlan(rules, lambda host: host, IdSource().next).detail
+    one.happened("message dropped", "too fast", host="10.0.0.9", more={"recording": "forged"})
+    one.happened("message changed", "", host="10.0.0.9")
+    one.happened("monitor fault", "", severity=Severity.ALARM, host="10.0.0.7")
+    drop, change, alarm = (record.detail for record in log.records)
+    assert (len(drop["recording"]), drop["charged_to"]) == (20, "10.0.0.9")
+    assert change == {}
+    assert alarm["charged_to"] == "10.0.0.7"

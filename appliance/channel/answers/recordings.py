@@ -6,6 +6,9 @@ import msgspec
 
 from appliance.channel.answers.field_docs import NanoMoment, told
 
+ROBOT, OPERATORS, APPLIANCE, UNKNOWN = "robot", "operators", "appliance", "unknown hosts"
+"""Recordings are charged to these, or to a host or network as the policy names it."""
+
 TriggerKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "service", "order"]
 EventKind = Literal["drop", "change", "verdict", "denial", "alarm", "fault", "notice"]
 
@@ -17,6 +20,9 @@ class Trigger(msgspec.Struct, frozen=True):
     what: TriggerKind
     record: Annotated[str, told("id of the audit record that says it")]
     text: str
+    charged_to: Annotated[
+        str, told("whose act it was: robot, operators, appliance, unknown hosts, a host or network")
+    ] = APPLIANCE
 
 
 class RecordedTopic(msgspec.Struct, frozen=True):
@@ -56,6 +62,7 @@ class Recording(msgspec.Struct, frozen=True):
     left_out: Annotated[
         list[LeftOutTopic], told("the first topics that recorder.never left out, and why")
     ] = []
+    charged_to: Annotated[str, told("whose share of the hour and of the disk it takes")] = OPERATORS
 
 
 class RecordingBegun(msgspec.Struct, frozen=True):

@@ -68,11 +68,12 @@ class RecordingWanted(Message):
 
 
 class RecordingBegun(Message):
-    """What was asked for as `number` is or becomes a part of recording `id`, which ends at `ends` (ns) or later."""
+    """What was asked for as `number` is in recording `id`, from `began` to `ends` (ns) or later."""
 
     number: int
     id: str
     ends: int
+    began: int = 0
 
 
 class RecordingRemovalWanted(Message):
@@ -120,10 +121,14 @@ class RecordingRefused(Message):
 
 
 class RecordingMissed(Message):
-    """Something that is a trigger made no recording, and why; told once in a while only."""
+    """Something that is a trigger made no recording, and why; told once in a while only.
+
+    `planned` is the recording that the trigger's record promised, if it did.
+    """
 
     trigger: Trigger
     reason: str
+    planned: str = ""
 
 
 RecorderLink = (

@@ -8,6 +8,7 @@ from typing import Any, cast
 import msgspec
 import pytest
 
+from appliance.audit.ids import IdSource
 from appliance.audit_trail import AuditTrail
 from appliance.channel import admin, messages
 from appliance.channel.answers.recordings import Recording, Trigger
@@ -15,6 +16,7 @@ from appliance.channel.channel import Channel
 from appliance.config import RecorderRules
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.recording_orders import RecorderAwayError, RecordingOrders
+from appliance.recorder.plan import RecordingPlan
 from appliance.recorder.shelf import MOST_LENT
 
 KEPT = Recording(
@@ -28,6 +30,7 @@ class Trail:
     def __init__(self) -> None:
         self.events: list[tuple[str, dict[str, Any]]] = []
         self.failure: str | None = None
+        self.recordings: Any = None
 
     def happened(self, event: str, _reason: str, **detail: Any) -> str:
         """As `AuditTrail`."""
@@ -48,6 +51,7 @@ class Scene:
             RecorderRules(**{"enabled": True} | rules),
             cast(AuditTrail, self.trail),
             lambda: messages.RevisionsStated(4, 2),
+            RecordingPlan(RecorderRules(**{"enabled": True} | rules), lambda host: host, IdSource().next),
         )
 
     def attach(self, answer: Callable[[Any], list[messages.Message]]) -> Channel:

@@ -2,7 +2,8 @@
 
 import ipaddress
 
-from appliance.control.standing import HostStanding
+from appliance.channel.answers.recordings import APPLIANCE, ROBOT, UNKNOWN
+from appliance.control.standing import HostStanding, charged_to
 from appliance.policy.compiler import compile_policy
 from appliance.shares.pool import Standing
 
@@ -24,3 +25,21 @@ def test_standing_follows_reloads_and_registrations() -> None:
     policies.reverse()
     assert (standing(NAMED), standing(OTHER)) == (Standing.STRANGER, Standing.NAMED)
     assert standing(ipaddress.ip_address("127.0.0.1")) is Standing.NAMED
+
+
+def test_recordings_are_charged_by_the_policys_names() -> None:
+    """The robot's machine is the robot, hosts of one network are one, and so are all unknown hosts."""
+    policy = compile_policy(
+        "[Nodes]\n/a = robot 10.0.0.9 10.1.0.0/16\n",
+        file="p.ini",
+        robot=[ipaddress.ip_address("172.17.0.1")],
+    )
+    hosts = ("172.17.0.1", "127.0.0.1", "10.0.0.9", "10.1.2.3", "10.9.9.9", "")
+    assert [charged_to(policy, host) for host in hosts] == [
+        ROBOT,
+        ROBOT,
+        "10.0.0.9",
+        "10.1.0.0/16",
+        UNKNOWN,
+        APPLIANCE,
+    ]

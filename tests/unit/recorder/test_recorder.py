@@ -206,7 +206,7 @@ def test_triggers_that_overlap_make_one_recording(scene: Scene) -> None:
     assert len(recording.triggers) == 15
     scene.happen()
     scene.later(0.1)
-    assert scene.closed(scene.later(10))[0].began == scene.clock.now - int(20.1 * SECOND)
+    assert scene.closed(scene.later(11))[0].began == recording.ended
 
 
 def test_a_flood_of_triggers_fills_no_disk(tmp_path: Path) -> None:
@@ -225,6 +225,58 @@ def test_a_flood_of_triggers_fills_no_disk(tmp_path: Path) -> None:
     [begun] = [answer for answer in scene.later(0, order) if isinstance(answer, messages.RecordingBegun)]
     assert (begun.number, begun.ends) == (7, scene.clock.now + 2 * SECOND)
     assert scene.closed(scene.later(3))[0].id == begun.id
+    scene.log.close()
+
+
+def planned(scene: Scene, recording_id: str, charged_to: str) -> str:
+    """Something happens for which control has planned a recording."""
+    return scene.happen(detail={"recording": recording_id, "charged_to": charged_to})
+
+
+def test_what_control_planned_is_carried_out(scene: Scene) -> None:
+    """A recording has the id that the audit record promises; what follows while it is open is in it, too."""
+    first = planned(scene, "a" * 20, "10.0.0.9")
+    scene.later(1)
+    second = planned(scene, "a" * 20, "10.0.0.9")
+    [recording] = scene.closed(scene.later(1) + scene.later(10))
+    assert (recording.id, recording.charged_to) == ("a" * 20, "10.0.0.9")
+    assert [trigger.record for trigger in recording.triggers] == [first, second]
+    scene.happen(detail={"not_recorded": "this hour is used up"})
+    answers = scene.later(1) + scene.later(10)
+    assert scene.closed(answers) == []
+    [missed] = [answer for answer in answers if isinstance(answer, messages.RecordingMissed)]
+    assert missed.reason == "this hour is used up"
+
+
+def test_a_guest_neither_prolongs_nor_cuts_the_robots_recording(scene: Scene) -> None:
+    """Each has its own at the same time, over the life of a recorder, too."""
+    planned(scene, "a" * 20, "10.0.0.9")
+    scene.later(1)
+    planned(scene, "b" * 20, "robot")
+    scene.later(1)
+    scene.begin_anew()
+    answers: list[messages.Message] = []
+    for _second in range(20):
+        planned(scene, "a" * 20, "10.0.0.9")
+        answers += scene.later(1)
+    [robot] = scene.closed(answers)
+    assert (robot.id, robot.charged_to, len(robot.triggers)) == ("b" * 20, "robot", 1)
+    assert robot.ended - robot.triggers[0].time == 5 * SECOND
+    [guest] = scene.closed(scene.later(10))
+    assert (guest.id, len(guest.triggers)) == ("a" * 20, 21)
+
+
+def test_a_promise_that_cannot_be_kept_is_told_with_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a full disk control is told which recording there is not, each time."""
+    scene = Scene(tmp_path)
+    monkeypatch.setattr(Shelf, "free", property(lambda _self: 0))
+    for name in ("a" * 20, "b" * 20):
+        record = planned(scene, name, "robot")
+        [missed] = [one for one in scene.later(1) if isinstance(one, messages.RecordingMissed)]
+        assert (missed.planned, missed.trigger.record) == (name, record)
+        assert missed.reason == "the disk is nearly full"
     scene.log.close()
 
 

@@ -6,19 +6,32 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from appliance.channel.answers.recordings import Recording, Trigger, TriggerKind
+from appliance.channel.answers.recordings import OPERATORS, ROBOT, Recording, Trigger, TriggerKind
 from appliance.recorder.shelf import ABOUT, Shelf
 
 MIB = 1 << 20
 SECOND = 1_000_000_000
 
 
-def recording(number: int, what: TriggerKind = "drop", size: int = MIB) -> Recording:
+def recording(
+    number: int, what: TriggerKind = "drop", size: int = MIB, charged_to: str = OPERATORS
+) -> Recording:
     """The recording of this second."""
     time = number * SECOND
     trigger = Trigger(time, what, "record", "")
     return Recording(
-        f"{number:020x}", time, time, [trigger], [], 1, 1, size=size, sha256="", complete=True, why_not=""
+        f"{number:020x}",
+        time,
+        time,
+        [trigger],
+        [],
+        1,
+        1,
+        size=size,
+        sha256="",
+        complete=True,
+        why_not="",
+        charged_to=charged_to,
     )
 
 
@@ -34,10 +47,21 @@ def put(shelf: Shelf, kept: Recording) -> Recording:
 def cleared(shelf: Shelf, now: int = 0, *, room: bool = False) -> list[tuple[Recording, str]]:
     """What goes, as the recorder lets it go."""
     gone = []
-    for kept, why in shelf.surplus(now, room=room):
+    for kept, why in shelf.outdated(now):
         shelf.remove(kept, "", why)
         gone.append((kept, why))
-    return gone
+    return gone + (room_for(shelf, OPERATORS)[0] if room else [])
+
+
+def room_for(shelf: Shelf, charged_to: str) -> tuple[list[tuple[Recording, str]], str]:
+    """What goes for a recording of this host, and why there is no room all the same."""
+    gone: list[tuple[Recording, str]] = []
+    while True:
+        kept, why = shelf.in_the_way(charged_to)
+        if kept is None:
+            return gone, why
+        shelf.remove(kept, "", why)
+        gone.append((kept, why))
 
 
 def test_what_is_kept_is_found_again(tmp_path: Path) -> None:
@@ -81,6 +105,50 @@ def test_who_has_most_makes_room(tmp_path: Path) -> None:
     assert not cleared(shelf, room=True)
     put(shelf, recording(8, "drop", 8 * MIB))
     assert cleared(shelf, room=True) == [(recording(3, "drop", 8 * MIB), "recorder.disk is used up")]
+
+
+def test_a_guest_makes_room_from_its_own(tmp_path: Path) -> None:
+    """However many recordings a guest causes, it has a quarter of the disk, and those of other hosts stay."""
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    put(shelf, recording(1, size=8 * MIB, charged_to=ROBOT))
+    put(shelf, recording(2, size=8 * MIB, charged_to="10.0.0.7"))
+    for number in range(3, 50):
+        gone, why_not = room_for(shelf, "10.0.0.9")
+        assert why_not == ""
+        assert {found.charged_to for found, _why in gone} <= {"10.0.0.9"}
+        put(shelf, recording(number, size=8 * MIB, charged_to="10.0.0.9"))
+    held = [found.charged_to for found in shelf.recordings]
+    assert (held.count("10.0.0.9"), held[:2]) == (2, [ROBOT, "10.0.0.7"])
+
+
+def test_no_guest_displaces_a_recording_of_the_robot(tmp_path: Path) -> None:
+    """Ten guests take what is free and then from each other; the robot gets half of the disk back from them."""
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+
+    def arrive(number: int, charged_to: str) -> str:
+        _gone, why_not = room_for(shelf, charged_to)
+        if not why_not:
+            put(shelf, recording(number, size=8 * MIB, charged_to=charged_to))
+        return why_not
+
+    for number in range(30):
+        assert arrive(number, f"10.0.0.{number % 10}") == ""
+    assert len(shelf.recordings) == 6, "three quarters"
+    for number in range(30, 50):
+        assert arrive(number, ROBOT) == ""
+    held = [found.charged_to for found in shelf.recordings]
+    assert held.count(ROBOT) == 4
+    for number in range(50, 60):
+        assert arrive(number, f"10.0.0.{number % 10}") == ""
+    assert [found.charged_to for found in shelf.recordings].count(ROBOT) == 4
+
+
+def test_where_the_robot_has_all_a_guest_has_no_recording(tmp_path: Path) -> None:
+    """And it is said why."""
+    shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
+    for number in range(8):
+        put(shelf, recording(number, size=8 * MIB, charged_to=ROBOT))
+    assert room_for(shelf, "10.0.0.9") == ([], "recorder.disk is used up")
 
 
 def test_descriptions_have_room_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

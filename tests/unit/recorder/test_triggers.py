@@ -1,4 +1,4 @@
-"""Which records are triggers, and that a flood of one kind hides no other."""
+"""Which records are triggers."""
 
 from typing import get_args, get_type_hints
 
@@ -7,10 +7,8 @@ import pytest
 from appliance.audit.record import Record, Severity
 from appliance.channel.answers.recordings import TriggerKind
 from appliance.config import RecorderRules
-from appliance.recorder.triggers import HourlyLimit, trigger_of
-from tests.unit.recorder.test_shelf import SECOND, recording
+from appliance.recorder.triggers import trigger_of
 
-HOUR = 3600 * SECOND
 KINDS: tuple[TriggerKind, ...] = get_args(TriggerKind)
 
 
@@ -50,13 +48,3 @@ def test_all_kinds_but_orders_can_be_configured() -> None:
     """The words of the configuration are those of the recordings."""
     configurable = get_args(get_args(get_type_hints(RecorderRules)["triggers"])[0])
     assert set(configurable) == set(KINDS) - {"order"}
-
-
-def test_each_kind_has_its_own_hour() -> None:
-    """Also over the life of a recorder: those that are kept count."""
-    limit = HourlyLimit(2, [recording(1, "drop")])
-    now = 10 * SECOND
-    assert [limit.take("drop", now) for _try in range(3)] == [True, False, False]
-    assert limit.take("fault", now)
-    assert limit.take("drop", SECOND + HOUR)
-    assert not limit.take("drop", SECOND + HOUR)
