@@ -1,13 +1,17 @@
 """Monitors over REST: loaded, tried, replaced, switched and removed while the appliance runs."""
 
 import json
+import os
+import subprocess
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.support.appliance import Appliance
+from tests.support.command import ROSRV
 from tests.support.nodes import RosSession, has_ros
 from tests.support.requirements import needs
 from tests.support.rest import Answer, Rest
@@ -351,3 +355,55 @@ def test_what_a_monitor_does_is_counted_and_remembered(appliance: Appliance, tmp
 
     row = eventually(counted, "the relay reports its counters")
     assert row["events"] >= row["drops"]
+
+
+def nested_repetitions(count: int) -> dict[str, str]:
+    """Specifications whose automata take the compiler about a second each."""
+    formula = "(a | b)* a"
+    for _ in range(12):
+        formula = f"({formula} (a|b))"
+    events = " ".join(f"event {name}() /{name} std_msgs/Bool '{{}}' {{ }}" for name in "ab")
+    text = "\n".join(f"n{number}() {{ {events} ere: {formula} @match {{ }} }}" for number in range(count))
+    return {"nested.rv": text}
+
+
+def _compiling(appliance: Appliance) -> bool:
+    """Whether the compiler works: it has used more processor time than its start takes."""
+    compiler = appliance.processes().get("compiler")
+    if compiler is None:
+        return False
+    fields = Path(f"/proc/{compiler['pid']}/stat").read_text().rpartition(")")[2].split()
+    return int(fields[11]) + int(fields[12]) > 2.5 * os.sysconf("SC_CLK_TCK")
+
+
+def test_a_load_ends_the_dry_run_of_an_operator(appliance: Appliance) -> None:
+    """An operator's costly dry run is answered with its end, and the administrator's load comes into force."""
+    made = appliance.rosrv("token", "add", "trying", "--role", "operator", "--json").stdout
+    operator = appliance.rest().with_token(json.loads(made)["token"])
+    with ThreadPoolExecutor(1) as pool:
+        trying = pool.submit(load, operator, nested_repetitions(118), None, "?dry_run=1")
+        eventually(lambda: _compiling(appliance), "the dry run is compiled")
+        loaded = load(appliance.rest(), {"count.rv": OTHER})
+        assert (loaded.status, loaded.json["monitors"]) == (200, ["count"])
+        tried = trying.result()
+    assert tried.status == 422
+    assert "because an order needed the compiler" in tried.json["detail"]
+    assert appliance.rest().get("/v1/monitors").json["revision"] == loaded.json["revision"]
+
+
+def test_the_load_of_a_tool_that_was_killed_never_comes_into_force(
+    appliance: Appliance, tmp_path: Path
+) -> None:
+    """A load that is compiled when its tool is killed is withdrawn, and the next one does not wait for it."""
+    (tmp_path / "nested.rv").write_text(nested_repetitions(118)["nested.rv"])
+    before = appliance.rest().get("/v1/monitors").json["tag"]
+    tool = subprocess.Popen(
+        [ROSRV, "monitor", "load", str(tmp_path / "nested.rv"), "--state", str(appliance.state)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    eventually(lambda: _compiling(appliance), "the load is compiled")
+    tool.kill()
+    tool.wait()
+    loaded = load(appliance.rest(), {"count.rv": OTHER}, f'"{before}"')
+    assert (loaded.status, loaded.json["monitors"]) == (200, ["count"])
