@@ -171,8 +171,6 @@ def disable(
         None if time_off is None else span_given("--for", time_off, "30s, 10m, 2h or 1d", "rosrv monitor")
     )
     _switch(appliance, admin.MonitorSwitch(names, False, for_seconds=seconds), "disabled")
-    if seconds is None and not appliance.as_json:
-        say("without an end: --for TIME enables them again automatically", "yellow")
 
 
 @speaks
