@@ -1,5 +1,6 @@
 """Expressions. One function for each kind of expression of `syntax/tree.py`; types are checked here."""
 
+import math
 import re
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -196,6 +197,12 @@ def _step(scope: Scope, node: tree.Step) -> Value:
 
 def _binary(scope: Scope, node: tree.Binary) -> Value:
     operands, site = (value_of(scope, node.left), value_of(scope, node.right)), scope.site(node)
+    if node.operator in operators.COMPARISONS and any(
+        isinstance(operand.constant, float) and math.isnan(operand.constant) for operand in operands
+    ):
+        truth = "always true" if node.operator == "!=" else "never true"
+        text = f"`{node.operator}` with NaN is {truth}; to find NaN write `std::isnan(…)`"
+        scope.shared.findings.append(Finding(node.position, "warning", text))
     value = folded(
         operands,
         lambda left, right: operators.binary(

@@ -27,6 +27,7 @@ from appliance.rosmop.compile.lint import kept_slices, lint_property, unused_eve
 from appliance.rosmop.compile.reach import identity, reached
 from appliance.rosmop.compile.scope import Shared, SpecificationNames
 from appliance.rosmop.compile.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
+from appliance.rosmop.compile.slips import slips
 from appliance.rosmop.compiled import Compiled, PropertyCode, SpecificationCode
 from appliance.rosmop.ir import form
 from appliance.rosmop.logics.catalogue import compile_property
@@ -148,6 +149,7 @@ def _compile(
         return None
     known = tuple(code for code in properties if code is not None)
     shared.findings += unused_events(specification, known)
+    shared.findings += slips(specification)
     if names.parameters:
         shared.findings += kept_slices(names.name, good, known, specification.properties)
     variables = {variable.name: variable.code for variable in names.variables.values()}

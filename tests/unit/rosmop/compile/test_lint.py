@@ -52,3 +52,35 @@ def test_what_keeps_slices_for_ever_is_said(formula: str, timer: str, count: int
     assert len(said) == count
     plain = f"s() {{ int times = 0; {EVENTS} {timer} {formula} }}"
     assert not [one for one in load(plain).warnings if "slice" in one.text]
+
+
+SLIPS = [
+    (
+        "if (v = 0.8) { v = 1; }",
+        "`=` assigns, and the condition is the value that was assigned; to compare write `==`",
+    ),
+    ("if (v > 1 && !(n = 2)) { v = 1; }", "`=` assigns"),
+    ("while (n = 0) { n++; }", "`=` assigns"),
+    ("v = (n = 2) ? 1 : 2;", "`=` assigns"),
+    ("v == 3;", "this statement has no effect: `==` compares; to assign write `=`"),
+    ("n + 1;", "this statement has no effect; remove it, or assign its value to a variable"),
+    ("v;", "this statement has no effect"),
+    ("if (v == NAN) { v = 1; }", "`==` with NaN is never true; to find NaN write `std::isnan(…)`"),
+    ("if (v != 0.0 * INFINITY) { v = 1; }", "`!=` with NaN is always true"),
+    ("if (v < -NAN) { v = 1; }", "`<` with NaN is never true"),
+    ("if (v < std::numeric_limits<double>::quiet_NaN()) { v = 1; }", "`<` with NaN is never true"),
+    ("if ((n = 3) > 2 && v == 0.8) { v = 1; } n++; f(n); std::cout << v; v += 1; isnan(v);", None),
+]
+
+
+@pytest.mark.parametrize(("body", "warning"), SLIPS)
+def test_slips_that_cpp_allows_are_said(body: str, warning: str | None) -> None:
+    """An assignment as a condition, a statement without effect, a comparison with NaN: at their place."""
+    own = "double v = 0; int n = 0; void f(int k) { n = k; }"
+    text = f"s() {{ {own}\nevent e() /t std_msgs/Int32 '{{}}' {{ {body} }} }}"
+    said = load(text).warnings
+    assert len(said) == (warning is not None)
+    for finding in said:
+        assert warning is not None
+        assert finding.text.startswith(warning)
+        assert finding.position.line == 2
