@@ -36,7 +36,7 @@ from appliance.relay.context import RelayContext
 from appliance.relay.grants import StatedTable, Statement
 from appliance.relay.limits import Limits
 from appliance.relay.looks import Looks
-from appliance.relay.loop import Loop
+from appliance.relay.loop import UNKNOWN, Loop
 from appliance.relay.monitors.middle import Middle
 from appliance.relay.monitors.own import OwnPublisher
 from appliance.relay.monitors.places import Place
@@ -44,6 +44,7 @@ from appliance.relay.recorder_ring import Recorded
 from appliance.relay.report import Reporter
 from appliance.shares.pool import Standing
 
+_TIDIED = 16  # topics between two readings of the processor time
 _Grant = tuple[str, str, str, str, str]  # kind, key, name of the topic or service, host, caller id
 
 
@@ -90,6 +91,7 @@ class Engine:
         self._looks = Looks(self._reporter.send)
         self._recorded: Recorded | None = None
         self._later: deque[tuple[messages.Message, tuple[int, ...]]] = deque()
+        self._tidying: Iterator[None] = iter(())
         loop.after(limits.report_every, self._tick)
 
     def attach(self, link: Link | None) -> None:
@@ -330,8 +332,16 @@ class Engine:
         relayed, publisher = self.topics.pop((key, topic))
         if self._own.get(topic) is publisher:
             del self._own[topic]
-        relayed.cut_all(reason)
-        publisher.close()
+        publisher.close()  # nothing more comes to those that are still connected
+        self._cut_members(relayed, reason)
+
+    def _cut_members(self, relayed: RelayedTopic, reason: str) -> None:
+        """Close the connections for a topic that is gone, a quantum at a time: there may be thousands."""
+        for member in relayed.members:
+            member.cut(reason)
+            if self._loop.over():
+                self._loop.later(lambda: self._cut_members(relayed, reason), relayed.host or UNKNOWN)
+                return
         row = relayed.traffic()
         if row is not None:
             self._last_rows.append(row)
@@ -543,13 +553,29 @@ class Engine:
         return rows
 
     def _tick(self) -> None:
-        for topic, publisher in list(self.topics.values()):
-            topic.tidy()
-            if isinstance(publisher, Publisher):
-                publisher.look()
-        for client in list(self.clients):
-            client.look()
+        """A second is over."""
+        self._tidying = self._tidy()
+        self._go_on_tidying()
+
+    def _go_on_tidying(self) -> None:
+        """Tidy up for a quantum at a time: there may be thousands of topics."""
+        for _ in self._tidying:
+            if self._loop.over():
+                self._loop.after(0, self._go_on_tidying)
+                return
         self._own_service.tidy()
         self.middle.tick()
         self._reporter.tick(self._rows, self.memory.held())
         self._loop.after(self._limits.report_every, self._tick)
+
+    def _tidy(self) -> Iterator[None]:
+        for number, (topic, publisher) in enumerate(list(self.topics.values())):
+            topic.tidy()
+            if isinstance(publisher, Publisher):
+                publisher.look()
+            if not number % _TIDIED:
+                yield
+        for number, client in enumerate(list(self.clients)):
+            client.look()
+            if not number % _TIDIED:
+                yield

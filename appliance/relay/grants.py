@@ -71,6 +71,7 @@ class StatedTable:
 
     def __init__(self) -> None:
         self._facts: dict[_Fact, Message] = {}
+        self._by_key: dict[str, dict[_Fact, None]] = {}
         self._hosts: Counter[str] = Counter()
         self._clients: dict[_Fact, dict[str, None]] = {}  # names, by service and host
         self._restated: set[_Fact] | None = None
@@ -103,6 +104,7 @@ class StatedTable:
         fact = _fact(message)
         self._take_out(fact)
         self._facts[fact] = message
+        self._by_key.setdefault(fact[1], {})[fact] = None
         self._hosts[_host(fact, message)] += 1
         if isinstance(message, ClientGranted):
             self._clients.setdefault(fact[:4], {})[message.caller_id] = None
@@ -112,7 +114,7 @@ class StatedTable:
     def withdraw(self, message: Message) -> None:
         """Control says that something is so no longer; unknown things are fine."""
         if isinstance(message, NodeWithdrawn):
-            for fact in [fact for fact in self._facts if fact[1] == message.key]:
+            for fact in list(self._by_key.get(message.key, ())):
                 self._forget(fact)
         else:
             self._forget(_fact(message))
@@ -164,6 +166,10 @@ class StatedTable:
     def _take_out(self, fact: _Fact) -> None:
         message = self._facts.pop(fact, None)
         if message is not None:
+            of_key = self._by_key[fact[1]]
+            del of_key[fact]
+            if not of_key:
+                del self._by_key[fact[1]]
             host = _host(fact, message)
             self._hosts[host] -= 1
             if not self._hosts[host]:

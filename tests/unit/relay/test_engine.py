@@ -812,3 +812,33 @@ def test_a_client_that_never_reads_gets_no_second_request_through(world: World) 
     world.gets_header(client)
     world.gets(client, encode_service_reply(bytes(3 * MIB + MIB // 2)))
     world.gets(service, encode_frame(b"2"))
+
+
+def test_subscribers_of_a_topic_that_is_gone_are_cut_a_quantum_at_a_time(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that takes all the time is followed by others' messages; in the end all connections are closed."""
+    _publisher, first = world.subscribed()
+    others = [world.connect(encode_header(ASK)) for _ in range(5)]
+    for subscriber in others:
+        world.gets_header(subscriber)
+    topic = world.engine.topics["k", "/chatter"][0]
+    monkeypatch.setattr(world.loop, "over", lambda: True)
+    world.state(PublicationWithdrawn("k", "/chatter"))
+    assert len(topic.members) == 5
+    for subscriber in (first, *others):
+        world.ends(subscriber)
+    assert not topic.members
+
+
+def test_a_second_is_reported_although_tidying_up_takes_many_turns(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Thousands of topics are tidied up a quantum at a time."""
+    for number in range(50):
+        world.state(PublicationPlaced("k", f"/topic{number}", "*"))
+    world.subscribed()
+    world.hears(TrafficReported)
+    monkeypatch.setattr(world.loop, "over", lambda: True)
+    world.connect(encode_header(ASK))
+    world.hears(TrafficReported)
