@@ -781,3 +781,16 @@ def test_slices_are_charged_to_the_host_that_publishes(world: Monitored) -> None
     world.state(NodePlaced("robot", "/robot", "10.0.0.1"), world.listen())
     numbers = [middle.senders.number(Place("k", "/t", host)) for host in ("10.0.0.1", "10.0.0.8", "10.0.0.9")]
     assert [middle._holder_of(number) for number in (*numbers, 999)] == ["10.0.0.1", "", "", ""]
+
+
+def test_each_binding_has_its_deadline_in_the_relay(world: Monitored) -> None:
+    """A name that is not said again in time is told of, though no message comes: each with its binding."""
+    text = """again(std::string name) {
+        event said(std::string name) /chatter std_msgs/String '{data:name}' { }
+        pattern: globally: said causes said within 50ms @violation { ROS_ERROR("%s is late", name.c_str()); __RESET; }
+    }"""
+    assert world.load(text) == SpecificationsTaken(1, ["again"], [])
+    publisher, _ = world.typed()
+    publisher.send(string("one") + string("two"))
+    for name in ("one", "two"):
+        assert world.event("log", monitor="again", text=f"{name} is late")
