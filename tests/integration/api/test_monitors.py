@@ -391,14 +391,17 @@ def test_a_load_ends_the_dry_run_of_an_operator(appliance: Appliance) -> None:
     assert appliance.rest().get("/v1/monitors").json["revision"] == loaded.json["revision"]
 
 
+@pytest.mark.parametrize("way", ["state", "api"])
 def test_the_load_of_a_tool_that_was_killed_never_comes_into_force(
-    appliance: Appliance, tmp_path: Path
+    appliance: Appliance, tmp_path: Path, way: str
 ) -> None:
     """A load that is compiled when its tool is killed is withdrawn, and the next one does not wait for it."""
     (tmp_path / "nested.rv").write_text(nested_repetitions(118)["nested.rv"])
     before = appliance.rest().get("/v1/monitors").json["tag"]
+    place = ["--state", str(appliance.state)] if way == "state" else ["--api", str(appliance.ready["api"])]
     tool = subprocess.Popen(
-        [ROSRV, "monitor", "load", str(tmp_path / "nested.rv"), "--state", str(appliance.state)],
+        [ROSRV, "monitor", "load", str(tmp_path / "nested.rv"), *place],
+        env={**os.environ, "ROSRV_TOKEN": appliance.token},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
