@@ -159,6 +159,7 @@ def test_a_drop_makes_a_recording_that_stock_tools_read(
     heard = [event["data"] for event in listener.seen(event="received")]
     assert (row["complete"], row["why_not"]) == (True, "")
     assert row["triggers"][0]["what"] == "drop"
+    assert (dropped["detail"]["recording"], dropped["detail"]["charged_to"]) == (row["id"], "robot")
     bag = fetched(appliance, row["id"], tmp_path)
     chatter = said(ros, bag, "/chatter")
     assert chatter[:20] == heard[:20]
