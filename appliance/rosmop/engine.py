@@ -32,6 +32,7 @@ from appliance.rosmop.execution import Asked, Execution, OnFault
 from appliance.rosmop.happened import NOBODY, Sender
 from appliance.rosmop.ir.abi import FeedModule
 from appliance.rosmop.kept_runs import StateTooLargeError
+from appliance.rosmop.kept_slices import SliceParts
 from appliance.rosmop.monitor import Group, Monitor, Step, monitors_of
 from appliance.rosmop.outcomes import Outcome
 from appliance.rosmop.positions import Finding, Position
@@ -429,6 +430,11 @@ class MonitorSet:
             group.home.left = False
         return data
 
+    def slice_parts(self, group: Group) -> list[tuple[str, SliceParts]]:
+        """Keep the slices of a group's parametric specifications by parts: what they have changed, by name."""
+        sliced = [(monitor.name, monitor.slices) for monitor in group.monitors]
+        return [(name, SliceParts(slices)) for name, slices in sliced if slices is not None]
+
     def recover(
         self, kept: Sequence[KeptGroup], lost: Mapping[str, str], time_ns: int, *, restarted: bool = False
     ) -> Outcome:
@@ -437,7 +443,7 @@ class MonitorSet:
         Those of which the state is `lost` (why; "": of all), or cannot be used, begin; they hold their topics if
         `hold_lost` says so. With `restarted`, those with the modifier `hold` hold them in any case.
         """
-        states, unread = states_of(kept)
+        states, slices, unread = states_of(kept)
         fresh, reasons = [], {**lost, **unread}
         for monitor in self._monitors:
             state = states.get(monitor.name)
@@ -449,7 +455,14 @@ class MonitorSet:
             try:
                 if (state.identity, state.types) != (monitor.code.identity, self._types[monitor.name]):
                     raise ValueError(_CHANGED)
-                restore(monitor, state, self.interpreter.variables, self.compiled, time_ns)
+                restore(
+                    monitor,
+                    state,
+                    slices[monitor.name],
+                    self.interpreter.variables,
+                    self.compiled,
+                    time_ns=time_ns,
+                )
             except ValueError as error:
                 reasons[monitor.name] = str(error)
                 fresh.append(monitor)

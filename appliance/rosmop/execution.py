@@ -353,7 +353,7 @@ class Execution:
         if (after := slices.quiet(step.index, slice_)) is not None:
             outcome.events = (*outcome.events, step.name)
             self._note(step.monitor)
-            return partial(slice_.stand, after)
+            return partial(slices.stand, slice_, after)
         if slices.is_whole(slice_):
             return self._in_slice(step.monitor, slice_, outcome, message, act)
         return self._in_seed(step.monitor, slice_, outcome, message, act)

@@ -1,7 +1,7 @@
 """Counts what hosts have of something finite, the oldest first."""
 
 from collections import OrderedDict
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
 from typing import Generic, TypeVar
 
 Thing = TypeVar("Thing", bound=Hashable)
@@ -45,6 +45,10 @@ class Quota(Generic[Thing]):
     def oldest(self, holder: Holder) -> Thing:
         """Return what the holder has had for longest."""
         return next(iter(self._of[holder]))
+
+    def all(self) -> Iterator[tuple[Holder, Thing]]:
+        """Return all things with their holders, those of each the oldest first."""
+        return ((holder, thing) for holder, things in self._of.items() for thing in things)
 
     def clear(self) -> None:
         """Nobody has anything."""

@@ -13,6 +13,7 @@ goes on with.
 import hashlib
 import struct
 from collections.abc import Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -22,6 +23,7 @@ from appliance.rosmop.compiled import Compiled
 from appliance.rosmop.ir import form
 from appliance.rosmop.ir.values import Values
 from appliance.rosmop.kept_runs import StateTooLargeError, kept, run_of
+from appliance.rosmop.kept_slices import KeptPart, KeptSlice, restore_slices
 from appliance.rosmop.monitor import CellNames, Monitor
 from appliance.rosmop.types import kinds
 from appliance.rosmop.types.kinds import Type
@@ -54,6 +56,8 @@ class KeptMonitor(msgspec.Struct, frozen=True, array_like=True):
     timers: list[KeptTimer]
     runs: list[Any]
     variables: dict[str, Any]
+    first: tuple[list[Any], list[Any]] = ([], [])
+    """Of a parametric specification the values of its parameters, and its slices' own variables, as slices begin."""
 
 
 def encoded(states: Sequence[KeptMonitor]) -> bytes:
@@ -75,30 +79,40 @@ KeptGroup = tuple[Sequence[str], bytes, bytes, bytes | None]
 """
 
 
-def states_of(groups: Sequence[KeptGroup]) -> tuple[dict[str, KeptMonitor], dict[str, str]]:
-    """The states that were kept, of a monitor that is in several the last, and why others cannot be read."""
+def states_of(
+    groups: Sequence[KeptGroup],
+) -> tuple[dict[str, KeptMonitor], dict[str, list[KeptSlice]], dict[str, str]]:
+    """The states that were kept, of a monitor that is in several the last, their slices, and why others are lost."""
     found: dict[str, KeptMonitor] = {}
+    slices: dict[str, list[KeptSlice]] = {}
     lost: dict[str, str] = {}
     for group in groups:
         try:
             states = _decoded(group)
         except (msgspec.MsgspecError, ValueError, struct.error, LookupError, TypeError) as error:
             states = f"its state cannot be read: {error}"
+        if isinstance(states, KeptPart):
+            slices.setdefault(group[0][0], []).extend(states.slices)
+            continue
         for name in group[0]:
+            if isinstance(states, list):
+                slices[name] = []
             found.pop(name, None)
             lost[name] = states if isinstance(states, str) else "its state was not written"
         found |= {state.name: state for state in states if isinstance(state, KeptMonitor)}
-    return found, {name: why for name, why in lost.items() if name not in found}
+    return found, slices, {name: why for name, why in lost.items() if name not in found}
 
 
-_DECODER: msgspec.msgpack.Decoder[list[KeptMonitor] | str] = msgspec.msgpack.Decoder(list[KeptMonitor] | str)
+_DECODER: msgspec.msgpack.Decoder[list[KeptMonitor] | KeptPart | str] = msgspec.msgpack.Decoder(
+    list[KeptMonitor] | KeptPart | str
+)
 _NAMES = msgspec.msgpack.Decoder(CellNames | None)
 
 
-def _decoded(group: KeptGroup) -> list[KeptMonitor] | str:
+def _decoded(group: KeptGroup) -> list[KeptMonitor] | KeptPart | str:
     _, names_of, base, cells = group
     states, names = _DECODER.decode(base), _NAMES.decode(names_of)
-    if isinstance(states, str) or cells is None or names is None:
+    if not isinstance(states, list) or cells is None or names is None:
         return states
     return _with_cells(states, cells, names)
 
@@ -120,8 +134,10 @@ def _with_cells(states: list[KeptMonitor], cells: bytes, names: CellNames) -> li
 
 def kept_monitor(monitor: Monitor, variables: Mapping[str, Any], types: bytes) -> KeptMonitor:
     """The state of a monitor as data. Raises `StateTooLargeError`."""
-    if monitor.slices is not None:
-        raise StateTooLargeError("the states of its bindings are not kept")
+    slices = monitor.slices
+    first: tuple[list[Any], list[Any]] = ([], [])
+    if slices is not None:
+        first = [*slices.first.key[1:]], [*slices.first.values]
     if monitor.home is not None:
         monitor.home.show()
     return KeptMonitor(
@@ -135,8 +151,9 @@ def kept_monitor(monitor: Monitor, variables: Mapping[str, Any], types: bytes) -
         monitor.held,
         monitor.why_held,
         [KeptTimer(timer.due, timer.ticked) for timer in monitor.timers],
-        [kept(running.run) for running in monitor.properties],
+        [kept(running.run) for running in monitor.properties] if slices is None else [],
         {name: variables[code] for name, code in monitor.code.variables.items()},
+        first,
     )
 
 
@@ -153,25 +170,35 @@ def shape(monitor: Monitor, variables: Mapping[str, Any]) -> bytes:
 
 
 def restore(
-    monitor: Monitor, state: KeptMonitor, variables: dict[str, Any], compiled: Compiled, time_ns: int
+    monitor: Monitor,
+    state: KeptMonitor,
+    slices: Sequence[KeptSlice],
+    variables: dict[str, Any],
+    compiled: Compiled,
+    *,
+    time_ns: int,
 ) -> None:
-    """Give a monitor that has just been made this state. Raises `ValueError`, and nothing has changed."""
-    code, values, types, known = monitor.code, state.variables, compiled.types, Values(compiled.messages)
-    if (len(state.runs), len(state.timers)) != (len(monitor.properties), len(monitor.timers)):
+    """Give a monitor that has just been made this state. Raises `ValueError`; then it has to begin."""
+    code, values, types = monitor.code, state.variables, compiled.types
+    fits = partial(_fits, Values(compiled.messages))
+    properties = monitor.properties if monitor.slices is None else ()
+    if (len(state.runs), len(state.timers)) != (len(properties), len(monitor.timers)):
         raise ValueError("it has other properties or timers")
     if values.keys() != code.variables.keys() or not all(
-        _fits(types[code.variables[name]], value, known) for name, value in values.items()
+        fits(types[code.variables[name]], value) for name, value in values.items()
     ):
         raise ValueError("it has other variables")
     runs = [
         run_of(running.code.property, data, time_ns)
-        for running, data in zip(monitor.properties, state.runs, strict=True)
+        for running, data in zip(properties, state.runs, strict=True)
     ]
     for name, value in values.items():
         variables[code.variables[name]] = value
-    for running, run in zip(monitor.properties, runs, strict=True):
+    for running, run in zip(properties, runs, strict=True):
         running.run = run
         running.history.forget(run, time_ns)
+    if monitor.slices is not None:
+        restore_slices(monitor.slices, code, state.first, slices, types=types, fits=fits, time_ns=time_ns)
     for timer, ticking in zip(monitor.timers, state.timers, strict=True):
         timer.due, timer.ticked = ticking.due, ticking.ticked
     monitor.enabled = state.enabled
@@ -192,20 +219,20 @@ _HELD: Mapping[type, type | tuple[type, ...]] = MappingProxyType(
 )
 
 
-def _fits(kind: Type, value: Any, known: Values) -> bool:
+def _fits(known: Values, kind: Type, value: Any) -> bool:
     """Whether a value is one of a type, as variables hold it."""
     if isinstance(kind, kinds.Vector):
         return (
             isinstance(value, list)
             and kind.length in (None, len(value))
-            and all(_fits(kind.element, one, known) for one in value)
+            and all(_fits(known, kind.element, one) for one in value)
         )
     if isinstance(kind, kinds.Record):
         parts = known.fields(kind)
         return (
             isinstance(value, list)
             and len(value) == len(parts)
-            and all(_fits(part, one, known) for part, one in zip(parts, value, strict=True))
+            and all(_fits(known, part, one) for part, one in zip(parts, value, strict=True))
         )
     return isinstance(value, _HELD.get(type(kind), ()))
 

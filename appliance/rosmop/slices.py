@@ -66,6 +66,9 @@ MAX_BINDING = 256
 Key = tuple[Any, ...]
 """A binding: True, and the values of the parameters that it has, in their order."""
 
+Binding = tuple[int, Key]
+"""The parameters that are bound, as a set of bits, and their values."""
+
 _NAN = float("nan")  # one is found again, though it is not equal to itself
 
 
@@ -85,6 +88,8 @@ class Slice:
     gone: bool = False
     due: int | None = None
     """The time of its entry in the heap of deadlines that counts."""
+    turn: int = 0
+    """The number of that entry: of several at one time the least comes first."""
 
     @property
     def deadline(self) -> int | None:
@@ -130,6 +135,8 @@ class Slices:
         """The binding of the last event of which there can be no slice."""
         self.why = ""
         """Why not."""
+        self.changed: dict[Binding, Holder] | None = None
+        """The bindings whose state has changed since it was last kept, with their hosts; None if it is not kept."""
         self.behind: list[Slice] = []
         """The slices that matter to the last event and have deadlines before it that have not passed yet."""
         self._code = code
@@ -223,10 +230,12 @@ class Slices:
             if state < 0:
                 return None
             run.state = state
+            self._note(slice_)
             return True
         after = [*map(getitem, calm, _states(slice_.runs))]
         if min(after, default=0) >= 0:
             slice_.stand(after)
+            self._note(slice_)
             return True
         return None
 
@@ -242,6 +251,11 @@ class Slices:
         after = [*map(getitem, calm, _states(slice_.runs))]
         return after if min(after, default=0) >= 0 else None
 
+    def stand(self, slice_: Slice, states: Sequence[int]) -> None:
+        """The automata of a slice are in these states."""
+        slice_.stand(states)
+        self._note(slice_)
+
     def targets(self, event: EventCode, key: Key, time_ns: int, source: int) -> Sequence[Slice]:
         """The slices that an event belongs to: first those with all parameters, in the order in which they began.
 
@@ -252,7 +266,7 @@ class Slices:
         self.behind = []
         self._now = time_ns
         if self._floating:
-            key = tuple(_NAN if value != value else value for value in key)  # noqa: PLR0124  NaN
+            key = _of_nan(key)
         domain = _domain(event)
         if domain == self._all:
             known = self._known[domain].slices
@@ -376,6 +390,7 @@ class Slices:
         slice_.runs, slice_.values = runs, values
         if slice_.gone:
             return
+        self._note(slice_)
         if not slice_.kept:
             if not happened:
                 return
@@ -429,8 +444,9 @@ class Slices:
         deadline = slice_.deadline
         if deadline is None or (slice_.due is not None and slice_.due <= deadline):
             return
-        slice_.due = deadline
-        heappush(self._deadlines, (deadline, next(self._order), slice_))
+        slice_.due, slice_.turn = deadline, next(self._order)
+        self._note(slice_)
+        heappush(self._deadlines, (deadline, slice_.turn, slice_))
         if len(self._deadlines) > 2 * self.live + 64:
             self._tidy()
 
@@ -446,11 +462,66 @@ class Slices:
             for slice_ in known.slices.values():
                 if slice_ is not None:
                     slice_.due = None
+                    self._note(slice_)
                     slice_.runs = tuple(
                         declared.property.start(time_ns) if declared.property.timed else run
                         for declared, run in zip(self._properties, slice_.runs, strict=True)
                     )
                     self._await(slice_)
+
+    # What is kept
+
+    def keep(self) -> None:
+        """Note from now on which bindings change; those that there are now, at once."""
+        self.changed = {
+            (domain, key): None if slice_ is None else slice_.holder
+            for domain, known in self._known.items()
+            for key, slice_ in known.slices.items()
+        }
+        for holder, binding in self._ended.all():
+            self.changed[binding] = holder
+
+    def _note(self, slice_: Slice) -> None:
+        if self.changed is not None:
+            self.changed[slice_.domain, slice_.key] = slice_.holder
+
+    @property
+    def first(self) -> Slice:
+        """What the first slices begin as."""
+        return self._first
+
+    def state(self, binding: Binding) -> Slice | None:
+        """The slice of a binding; None for one that has ended. Raises `KeyError` for one that is not known."""
+        domain, key = binding
+        return self._known[domain].slices[key]
+
+    def restore(
+        self,
+        zero: Sequence[Any],
+        values: Sequence[Any],
+        live: Sequence[Slice],
+        ended: Sequence[tuple[Binding, Holder]],
+    ) -> None:
+        """Go on with the slices that another process had, each in the order in which they began or ended.
+
+        Raises `KeyError` for a binding that there cannot be.
+        """
+        for code, value in zip(self._parameters, zero, strict=True):
+            self._namespace[code[1]] = value
+        self._namespace.update(zip(self._own, values, strict=True))
+        self.begin(self._properties, tuple(declared.property.start(0) for declared in self._properties))
+        for slice_ in live:
+            slice_.key = _of_nan(slice_.key)
+            slice_.kept = True
+            self._put(slice_.domain, slice_.key, slice_)
+            self._live.take(slice_.holder, (slice_.domain, slice_.key))
+            if slice_.due is not None:
+                self._deadlines.append((slice_.due, slice_.turn, slice_))
+        heapify(self._deadlines)
+        self._order = count(max((slice_.turn for slice_ in live), default=-1) + 1)
+        for (domain, key), holder in ended:
+            self._put(domain, _of_nan(key), None)
+            self._ended.take(holder, (domain, _of_nan(key)))
 
     # What is known
 
@@ -474,6 +545,7 @@ class Slices:
                 run.take_back(mark)
             both = zip(runs, slice_.runs, self._formulas, strict=True)
             slice_.runs = tuple(before if formula else now for before, now, formula in both)
+            self._note(slice_)
             if begun and slice_.kept:
                 self._undo_end(slice_)
                 self._leave(slice_)
@@ -537,6 +609,8 @@ class Slices:
             for part, keys in known.parts.items():
                 keys.setdefault(_key(values, part), {})[key] = None
         known.slices[key] = slice_
+        if slice_ is not None:
+            self._note(slice_)
 
     def _remember(self, domain: int, key: Key, holder: Holder) -> None:
         """No slice begins with this binding, until the host has so many of them that it is forgotten."""
@@ -550,16 +624,25 @@ class Slices:
             self._forget(*oldest)
         self._put(domain, key, None)
         self._ended.take(holder, (domain, key))
+        if self.changed is not None:
+            self.changed[domain, key] = holder
 
     def _forget(self, domain: int, key: Key) -> None:
         known = self._known[domain]
         del known.slices[key]
+        if self.changed is not None:
+            self.changed[domain, key] = None
         values = dict(zip(_members(domain), key[1:], strict=True))
         for part, keys in known.parts.items():
             same = keys[_key(values, part)]
             del same[key]
             if not same:
                 del keys[_key(values, part)]
+
+
+def _of_nan(key: Key) -> Key:
+    """The key with the one NaN that is found again."""
+    return tuple(_NAN if value != value else value for value in key)  # noqa: PLR0124  NaN
 
 
 def _states(runs: Sequence[Run]) -> list[int]:

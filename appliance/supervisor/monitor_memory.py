@@ -23,7 +23,7 @@ from appliance.channel.messages import StateGiven
 from appliance.whole_files import write_whole
 
 FOLDER = "monitors"
-SIZE = 16 << 20
+SIZE = 32 << 20
 """Bytes of each file."""
 
 _ENDED = "ended"

@@ -20,6 +20,7 @@ from appliance.relay.monitors.state_memory import Memory, StateMemory, read
 
 if TYPE_CHECKING:
     from appliance.rosmop.engine import MonitorSet
+    from appliance.rosmop.kept_slices import SliceParts
     from appliance.rosmop.monitor import Group
     from appliance.rosmop.remembered import KeptGroup
 
@@ -59,9 +60,13 @@ class _Entry:
     """A group of monitors and its section; `base` and `cells` are what was written last."""
 
     group: "Group"
-    section: int
+    section: int = 0
     base: bytes = b""
     cells: bytes | None = None
+    refused: bool = False
+    """There is no room for it: it is lost when the process ends."""
+    slices: "list[tuple[str, SliceParts, list[bytes]]]" = field(default_factory=list)
+    """Of each parametric specification its parts, which have the sections behind this one, and as they were written."""
 
 
 class Keeper:
@@ -121,7 +126,7 @@ class Keeper:
     def take(self, monitors: "MonitorSet") -> None:
         """Keep the state of these from now on."""
         self._monitors = monitors
-        self._entries = [_Entry(group, number) for number, group in enumerate(monitors.groups)]
+        self._entries = [_Entry(group, slices=_parts(monitors, group)) for group in monitors.groups]
         self._by_way = {way: entry for entry in self._entries for way in entry.group.ways}
         self._lay_out()
 
@@ -142,6 +147,8 @@ class Keeper:
             self._keep(entry)
 
     def _keep(self, entry: _Entry) -> None:
+        if entry.refused:
+            return
         group = entry.group
         home = group.home
         if not group.changed:
@@ -153,11 +160,24 @@ class Keeper:
                     entry.cells = cells
                     self._memory.write_cells(entry.section, cells)
                 return
+        if not self._keep_slices(entry):
+            self._lay_out()
+            return
         base = self._base(group)
         if base != entry.base or entry.cells is not None:
             entry.base, entry.cells = base, None
             if not self._memory.write_base(entry.section, base):
                 self._lay_out()
+
+    def _keep_slices(self, entry: _Entry) -> bool:
+        """Write the parts of slices that have changed; False where one has no room."""
+        first, fits = entry.section + 1, True
+        for _, parts, written in entry.slices:
+            for number, data in parts.changed().items():
+                written[number] = data
+                fits = fits and self._memory.write_base(first + number, data)
+            first += len(written)
+        return fits
 
     def _base(self, group: "Group") -> bytes:
         assert self._monitors is not None  # noqa: S101  the group is of its
@@ -165,32 +185,51 @@ class Keeper:
 
     def _lay_out(self) -> None:
         for entry in self._entries:
-            entry.base, entry.cells = self._base(entry.group), None
-        largest = sorted(self._entries, key=lambda entry: -len(entry.base))
-        while not self._memory.lay_out(self._head(), [self._section(entry) for entry in self._entries]):
-            if not largest:
+            if not entry.refused:
+                entry.base, entry.cells = self._base(entry.group), None
+                for _, parts, written in entry.slices:
+                    for number, data in parts.changed().items():
+                        written[number] = data
+        while not self._memory.lay_out(
+            self._head(), [section for entry in self._entries for section in _sections(entry)]
+        ):
+            rest = [entry for entry in self._entries if not entry.refused]
+            if not rest:
                 self._entries, self._by_way = [], {}
                 self._memory.lay_out(self._head(_NO_ROOM), [])
                 return
-            largest.pop(0).base = msgspec.msgpack.encode(_NO_ROOM)
-
-    @staticmethod
-    def _section(entry: _Entry) -> tuple[bytes, int]:
-        home = entry.group.home
-        return entry.base, 0 if home is None else home.size
+            largest = max(rest, key=lambda entry: sum(len(data) for data, _ in _sections(entry)))
+            largest.refused, largest.slices = True, []
+            largest.base = msgspec.msgpack.encode(_NO_ROOM)
+        section = 0
+        for entry in self._entries:
+            entry.section = section
+            section += len(_sections(entry))
 
     def _head(self, lost: str = "") -> bytes:
-        groups = [
-            _GroupHead(
-                [monitor.name for monitor in entry.group.monitors],
-                msgspec.Raw(msgspec.msgpack.encode(home.names if (home := entry.group.home) else None)),
-            )
-            for entry in self._entries
-        ]
+        groups = []
+        for entry in self._entries:
+            home = entry.group.home
+            names = msgspec.Raw(msgspec.msgpack.encode(None if home is None else home.names))
+            groups.append(_GroupHead([monitor.name for monitor in entry.group.monitors], names))
+            for name, _, written in entry.slices:
+                groups += [_GroupHead([name], _NO_CELLS)] * len(written)
         head = _Head(self._given.boot, self.offset, self.offset + time.monotonic_ns(), groups, lost)
         return msgspec.msgpack.encode(head)
 
 
+def _parts(monitors: "MonitorSet", group: "Group") -> "list[tuple[str, SliceParts, list[bytes]]]":
+    return [(name, parts, parts.all()) for name, parts in monitors.slice_parts(group)]
+
+
+def _sections(entry: _Entry) -> list[tuple[bytes, int]]:
+    """The sections of a group: its state with the bytes of its cells, and the parts of its slices."""
+    home = entry.group.home
+    own = [(entry.base, 0 if home is None else home.size)]
+    return own + [(data, 0) for _, _, written in entry.slices for data in written]
+
+
+_NO_CELLS = msgspec.Raw(b"\xc0")
 _HEADS = msgspec.msgpack.Decoder(_Head)
 
 

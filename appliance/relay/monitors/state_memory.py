@@ -26,7 +26,7 @@ _ROW = struct.Struct("<III")  # of a section: where it begins in its half, room 
 _LENGTH = struct.Struct("<I")
 _FLAGS = 16  # bytes before the places of a section: its byte, and the lengths of both bases from byte 8 on
 _BASE, _CELLS, _HAS_CELLS = 1, 2, 4
-_LEAST_ROOM = 256
+_LEAST_ROOM, _MOST_SPARE = 256, 8192
 
 Memory = Any
 """What is read and written by slices: a view of a mapped file."""
@@ -56,7 +56,7 @@ class StateMemory:
         rows, at = [], _HEAD.size + len(head) + _ROW.size * len(sections)
         for base, cells in sections:
             at = _even(at)
-            room = max(_LEAST_ROOM, _even(2 * len(base)))
+            room = max(_LEAST_ROOM, _even(len(base) + min(len(base), _MOST_SPARE)))
             rows.append((at, room, cells))
             at += _size(room, cells)
         if at > half or len(sections) > MOST_SECTIONS:

@@ -197,3 +197,76 @@ def test_a_newer_state_that_is_lost_is_not_replaced_by_an_older_one() -> None:
         third = stop()
         third.recover(left.groups, left.lost, 0)
         assert third.monitor("stop").held
+
+
+SLICED = """
+goals(std::string id) {
+    int total = 0; static int all = 0; bool late = false;
+    creation event goal(std::string id) /goal std_msgs/String '{data:id}' { total = total + 1; all = all + 1; }
+    event done(std::string id) /done std_msgs/String '{data:id}' { if (late) { return; } total = total + all; }
+    event look() every 3ms { if (total > 5) { late = true; } }
+    PROPERTY
+}
+"""
+PROPERTIES = (
+    "fsm: a [ goal -> b, default a ] b [ goal -> c, done -> d, default b ] c [ default c ] d [ default d ]\n"
+    '@c { ROS_WARN("twice"); } @d { }',
+    "pattern: globally: goal causes done within 4ms\n@violation { total = 100; }",
+    "mtl: goal -> eventually[0,5ms] done\n@violation { late = true; }",
+    "ptltl: done -> <*> goal\n@violation { DROP; }",
+    "",
+)
+
+
+@pytest.mark.parametrize("shown", PROPERTIES)
+@pytest.mark.parametrize("seed", range(12))
+def test_slices_go_on_where_a_killed_process_had_them(shown: str, seed: int) -> None:
+    """Their variables, automata, deadlines, which have ended, and the order in which they began."""
+    random = Random(seed)  # noqa: S311  draws examples, not keys
+    monitors = MonitorSet.load({"s.rv": SLICED.replace("PROPERTY", shown)}, standard_definitions())
+    whole, memory = again(monitors), bytearray(4 * SIZE)
+    whole.start(0)
+    keeper = begun(monitors, memory)
+    now = 0
+    for _ in range(150):
+        now += random.choice((0, 100_000, 900_000, 6_000_000))
+        if random.random() < 0.1:
+            monitors = again(monitors)
+            keeper = begun(monitors, memory)
+            assert monitors.began == ()
+        topic, name = random.choice(("/goal", "/goal", "/done")), b"g%d" % random.randrange(12)
+        body = len(name).to_bytes(4, "little") + name
+        mine, other = (one.judge(topic, bytearray(body), now) for one in (monitors, whole))
+        keeper.keep_all() if mine.before else keeper.keep(topic)
+        check_same(unexplained(mine), unexplained(other))
+        live = [one.monitor("goals").slices for one in (monitors, whole)]
+        assert live[0] is not None
+        assert live[1] is not None
+        assert live[0].live == live[1].live
+
+
+def test_many_slices_are_kept_and_a_message_writes_a_part_of_them() -> None:
+    """With two thousand a message writes a hundredth; where they have no room, none is restored, and that holds."""
+    text = SLICED.replace("PROPERTY", PROPERTIES[0]).replace("event look() every 3ms", "void look()")
+    monitors = MonitorSet.load({"s.rv": text}, standard_definitions())
+    memory = bytearray(8 * SIZE)
+    keeper = begun(monitors, memory)
+    for number in range(2_000):
+        name = b"g%d" % number
+        monitors.judge("/goal", len(name).to_bytes(4, "little") + name, number)
+    keeper.keep("/goal")
+    before = bytes(memory)
+    monitors.judge("/done", b"\x02\0\0\0g7", 20_000)
+    keeper.keep("/done")
+    changed = sum(one != other for one, other in zip(before, memory, strict=True))
+    assert 0 < changed < 10_000
+    second = again(monitors)
+    begun(second, memory)
+    slices = second.monitor("goals").slices
+    assert slices is not None
+    assert slices.live == 2_000
+    small = bytearray(SIZE // 8)
+    Keeper(GIVEN, small).take(second)
+    third = again(monitors)
+    begun(third, small)
+    assert "more than is kept" in third.monitor("goals").why_held
