@@ -57,11 +57,11 @@ class Syntax:
     """Spellings of other logics, and what to write instead."""
 
     def signs(self) -> list[str]:
-        """The spellings that are not words."""
+        """Return the spellings that are not words."""
         spellings = [*BOOLEAN_SIGNS, "[", "]", ",", *self.unary, *self.refused]
         for level in self.levels:
             spellings += level.operators
-        return sorted({text for text in spellings if not (text[0].isalpha() or text[0] == "_")})
+        return sorted({text for text in spellings if not text.isidentifier()})
 
 
 def read_formula(source: Source, syntax: Syntax) -> Formula:

@@ -45,10 +45,13 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[Token]:
             0,
             f"a formula of more than {MAX_CHARACTERS} characters; split it into several properties",
         )
-    alternatives = "|".join(_sign_pattern(sign) for sign in sorted(signs, key=len, reverse=True))
+    longest_first = [_sign_pattern(sign) for sign in sorted(signs, key=len, reverse=True)]
+    lettered = "|".join(sign for sign in longest_first if sign[0].isalpha()) or "(?!)"
+    alternatives = "|".join(longest_first)
     pattern = re.compile(
         r"(?P<space>\s+|//[^\n]*|/\*.*?\*/)"
         r"|(?P<number>\d+(?:\.\d+)?|\.\d+)"
+        f"|(?P<lettered>{lettered})"
         r"|(?P<name>[A-Za-z_][A-Za-z_0-9]*)"
         f"|(?P<sign>{alternatives})",
         re.DOTALL | re.ASCII,
@@ -59,7 +62,7 @@ def tokenize(source: Source, signs: Sequence[str]) -> list[Token]:
         match = pattern.match(source.text, offset)
         if match is None:
             raise source.error(offset, f"{_shown(source.text[offset])} has no meaning in {source.logic}")
-        kind = match.lastgroup or ""
+        kind = "sign" if match.lastgroup == "lettered" else match.lastgroup or ""
         if kind != "space":
             text = match.group()
             tokens.append(Token(text if kind == "sign" else kind, text, offset))

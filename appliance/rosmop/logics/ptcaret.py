@@ -5,6 +5,7 @@ into: from the event ``begin`` to the ``end`` that belongs to it, both included,
 ``end`` is over. ``(*a) x``, ``<*a> x``, ``[*a] x`` and ``x Sa y`` look at that past. Derived from them:
 
 - ``@b x``: ``x`` held at the ``begin`` of the innermost open call; ``@c x``: at the event before it;
+- ``x Ss@b y``: ``y`` held at the ``begin`` of an open call, and ``x`` at those since; ``…s@c``, ``…s@bc`` as below;
 - ``<*s@b> x``, ``[*s@b] x``: at some, at every ``begin`` of an open call; ``…s@c``: at the event before it; ``…s@bc``:
   at an event ``begin`` or ``call`` that is not within a call that has returned.
 
@@ -43,11 +44,14 @@ SYNTAX = Syntax(
         **{f"<*s@{where}>": f"some {where}" for where in ("b", "c", "bc")},
         **{f"[*s@{where}]": f"every {where}" for where in ("b", "c", "bc")},
     },
-    levels=boolean_levels([Level({"S": "since", "~S": "dual since", "Sa": "abstract since"}, "left")]),
-    refused={
-        **PTLTL.refused,
-        "Ss": "has no meaning here; for `x Ss@b y` write `(begin -> x) Sa (begin and y)`",
-    },
+    levels=boolean_levels(
+        [
+            Level({"S": "since", "~S": "dual since"}, "left"),
+            Level({"Sa": "abstract since"}, "left"),
+            *(Level({f"Ss@{where}": f"stack-since {where}"}, "left") for where in ("bc", "c", "b")),
+        ]
+    ),
+    refused={**PTLTL.refused, "Ss": "has no meaning here; write `Ss@b`, `Ss@c` or `Ss@bc`, without a space"},
 )
 
 
@@ -61,7 +65,7 @@ def compile_ptcaret(source: Source) -> CompiledProperty:
             0, f"the abstract past needs the events `begin` and `end` of the specification; it has no {names}"
         )
     if CALL not in source.events and any(node.name == CALL for node in nodes(formula)):
-        raise source.error(0, "`@bc` needs the event `call` of the specification")
+        raise source.error(0, "this formula needs the event `call` of the specification")
     program = Program(formula, source.events)
     return CaretProperty(source, fold(program, [program.result]))
 
@@ -116,6 +120,8 @@ def plain(formula: Formula) -> Formula:
     """The formula without the derived operators."""
     operands = tuple(plain(operand) for operand in formula.operands)
     operator, _, where = formula.operator.partition(" ")
+    if operator == "stack-since":
+        return _stack_since(where, *operands)
     if operator not in ("at", "some", "every"):
         return Formula(formula.operator, operands, formula.name, formula.bounds, formula.offset)
     inner = operands[0]
@@ -130,3 +136,13 @@ def plain(formula: Formula) -> Formula:
     if operator == "some":
         return Formula("abstract once", (both,))
     return Formula("abstract since", (Formula("not", (there,)), both))
+
+
+def _stack_since(where: str, left: Formula, right: Formula) -> Formula:
+    """`left Ss@where right`, as MOP's plugin writes it out."""
+    begin, call = Formula("event", name=BEGIN), Formula("event", name=CALL)
+    both = Formula("or", (begin, call))
+    guard = {"b": begin, "c": call, "bc": both}[where]
+    place = both if where == "bc" else begin
+    there = Formula("previously", (right,)) if where == "c" else right
+    return Formula("abstract since", (Formula("implies", (guard, left)), Formula("and", (place, there))))

@@ -113,6 +113,12 @@ DERIVED: list[tuple[str, Tree]] = [
     ("<*s@b> (*) a", ("ab once", ("and", BEGIN, X))),
     ("[*s@c] a", ("ab historically", ("implies", BEGIN, ("previously", A)))),
     ("<*s@bc> (*) a", ("ab once", ("and", ("or", BEGIN, CALL), X))),
+    ("call Ss@b (*) a", ("ab since", ("implies", BEGIN, CALL), ("and", BEGIN, X))),
+    ("(*) a Ss@c a", ("ab since", ("implies", CALL, X), ("and", BEGIN, X))),
+    ("(*) a Ss@bc (*) a", ("ab since", ("implies", ("or", BEGIN, CALL), X), ("and", ("or", BEGIN, CALL), X))),
+    ("a Sa begin S call", ("ab since", A, ("since", BEGIN, CALL))),
+    ("a S begin Sa call", ("ab since", ("since", A, BEGIN), CALL)),
+    ("call Ss@b a Sa begin", ("ab since", ("implies", BEGIN, CALL), ("and", BEGIN, ("ab since", A, BEGIN)))),
 ]
 
 
@@ -125,7 +131,13 @@ def test_derived_operators(text: str, tree: Tree) -> None:
         assert told(compiled("ptcaret", text, EVENTS), trace) == verdicts(tree, trace)
 
 
-IN_A_FILE = [*(text for text, _tree in DERIVED), "a => @b  a", "!@c a // @fail", "@b @c a"]
+IN_A_FILE = [
+    *(text for text, _tree in DERIVED),
+    "a Ss@bc a Ss@c a Ss@b a",
+    "a => @b  a",
+    "!@c a // @fail",
+    "@b @c a",
+]
 BEHIND = {"": [], "@violation { } @c { }": ["violation", "c"], "// why\n@c /* {} */ { }": ["c"]}
 
 
@@ -164,7 +176,8 @@ def test_too_many_open_calls_are_a_fault_and_change_nothing() -> None:
             "needs the events `begin` and `end` of the specification; it has no `end`",
         ),
         ("<*s@bc> a", ("a", "begin", "end"), "needs the event `call`"),
-        ("a Ss@b a", ("a", "begin", "end"), "write `(begin -> x) Sa (begin and y)`"),
+        ("a Ss a", ("a", "begin", "end"), "write `Ss@b`, `Ss@c` or `Ss@bc`, without a space"),
+        ("a Ss@c a", ("a", "begin", "end"), "needs the event `call`"),
         ("[] a", ("a",), "is about the future"),
     ],
 )
