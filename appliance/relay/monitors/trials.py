@@ -193,7 +193,7 @@ class Trials:
 
     def _rests(self, trial: MonitorSet) -> bool:
         """Whether it has spent more than it may, and has to wait for the next second."""
-        spent = any(monitor.context.budget < 0 for monitor in trial.monitors)
+        spent = trial.late or any(monitor.context.budget < 0 for monitor in trial.monitors)
         if spent:
             self._resting.add(trial)
         return spent

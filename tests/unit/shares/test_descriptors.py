@@ -14,6 +14,7 @@ from appliance.shares.table import (
     DESCRIPTORS,
     NODE_PORTS,
     RELAY_CONNECTIONS,
+    RELAY_MESSAGE,
     REST_CONNECTIONS,
     RVMASTER_CONNECTIONS,
     RVMASTER_FAREWELLS,
@@ -47,6 +48,7 @@ def test_the_configuration_has_the_tables_bounds() -> None:
     ):
         assert (given.connections, given.connections_per_host) == (row.bounds.whole, row.bounds.host)
     assert Limits().topics_per_host == HostLimits().registrations
+    assert 1000 * settings.relay.budget == RELAY_MESSAGE.bounds.host
 
 
 @pytest.fixture
