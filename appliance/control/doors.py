@@ -51,9 +51,7 @@ class Doors:
             ),
         )
         self.turns = Turns(RVMASTER_REQUESTS.bounds, standing, lambda host: policy().alike(host), trail.pause)
-        self.time = ProcessorTime(
-            lambda host: UNKNOWN if standing(host) is Standing.STRANGER else policy().alike(host)
-        )
+        self.time = ProcessorTime(partial(class_of, policy, standing))
         self._own_visitors = Visitors(_own_node, connections=_FOR_ONE, held=_BYTES_FOR_ONE)
         self._own_turns = Turns(_SLOTS_FOR_ONE, _own_node)
         self._trail = trail
@@ -145,7 +143,18 @@ def value_limits(settings: Settings) -> Limits:
     )
 
 
-UNKNOWN = "unknown hosts"  # the class of all of them, for processor time
+_UNKNOWN, _ANYBODY = "unknown hosts", "hosts with a registration, by *"
+
+
+def class_of(policy: Callable[[], Policy], standing: Callable[[Address], Standing], host: Address) -> str:
+    """As whom a host has processor time: as the address or network that the policy names.
+
+    Hosts that only `*` names are as many as somebody has addresses: all are one, and those that have a registration.
+    """
+    if host.is_loopback or policy().names(host):
+        return policy().alike(host)
+    return _ANYBODY if standing(host) is Standing.REGISTERED else _UNKNOWN
+
 
 # The appliance's own nodes and the ROS Master come from one address, and nobody else reaches those listeners.
 _FOR_ONE, _BYTES_FOR_ONE, _SLOTS_FOR_ONE = (

@@ -53,7 +53,7 @@ class HostTable:
         self._tables: dict[int, dict[int, dict[int, Atom]]] = {4: {}, 6: {}}
         self._lengths: dict[int, list[tuple[int, dict[int, Atom]]]] = {4: [], 6: []}
         self.kept: dict[tuple[int, int], frozenset[Atom]] = {}
-        self._named: dict[Address, tuple[Network, str]] = {}
+        self._named: dict[Address, tuple[Network, str, bool]] = {}
 
     def network(self, network: Network) -> Atom:
         """The atom of a network, made when it is new."""
@@ -112,13 +112,19 @@ class HostTable:
         """The same as text: of all addresses that the policy names as one network."""
         return self._named_as(address)[1]
 
-    def _named_as(self, address: Address) -> tuple[Network, str]:
+    def names(self, address: Address) -> bool:
+        """Whether the policy names the address or a network that holds it; `*` names nobody in particular."""
+        return self._named_as(address)[2]
+
+    def _named_as(self, address: Address) -> tuple[Network, str, bool]:
         named = self._named.get(address)
         if named is None:
             if len(self._named) >= _KEPT_HOSTS:
                 self._named.clear()
-            network = self._narrowest(canonical_address(address))
-            named = self._named[address] = network, str(network)
+            plain = canonical_address(address)
+            network, number = self._narrowest(plain), int(plain)
+            held = any(number >> shift in table for shift, table in self._lengths[plain.version])
+            named = self._named[address] = network, str(network), held
         return named
 
     def _narrowest(self, plain: Address) -> Network:

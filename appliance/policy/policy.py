@@ -191,6 +191,10 @@ class Policy:
         """By what a host's part of something shared is counted: as `alike`; all unknown hosts are one, named ""."""
         return self.alike(address) if self.knows(address) else ""
 
+    def names(self, address: Address) -> bool:
+        """Whether a rule names this address or its network, and not only everybody (`*`)."""
+        return self.hosts.names(address)
+
     def has_section(self, category: Category) -> bool:
         """Whether the file has the section that decides this category."""
         return category in self.present

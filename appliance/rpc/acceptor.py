@@ -17,7 +17,7 @@ from appliance.rpc.front import plain_address
 from appliance.rpc.processor_time import ProcessorTime
 
 BACKLOG = 4096
-_AT_ONCE = 128  # connections in one turn of the loop
+_AT_ONCE = 512  # connections in one turn of the loop
 _GONE = frozenset({errno.ECONNABORTED, errno.EINTR, errno.EPROTO})
 _PAUSE_SECONDS = 0.2  # when the process has no descriptor left
 

@@ -10,8 +10,9 @@ import pytest
 from appliance.audit.log import AuditLog
 from appliance.audit_trail import AuditTrail
 from appliance.config import Settings
-from appliance.control.doors import Doors
+from appliance.control.doors import Doors, class_of
 from appliance.policy.compiler import compile_policy
+from appliance.policy.model import address_of
 from appliance.rpc.server import HttpRequest
 from appliance.shares.pool import Standing
 
@@ -45,3 +46,20 @@ async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *,
         sweep.cancel()
         doors.close()
     log.close()
+
+
+def test_hosts_that_only_everybody_names_share_processor_time_as_one() -> None:
+    """Two hundred addresses that a rule for `*` lets in count as one host; an address or network that it names, as one.
+
+    Hosts of `*` that have a registration are one of their own, so that no number of addresses without one delays them.
+    """
+    policy = compile_policy("[Nodes]\ndefault = 10.0.0.1 10.1.0.0/16\n/guest/** = *\n", file="a.ini")
+    registered = address_of("10.9.0.7")
+    standing = {registered: Standing.REGISTERED}
+
+    def kind(text: str) -> str:
+        return class_of(lambda: policy, lambda host: standing.get(host, Standing.NAMED), address_of(text))
+
+    assert len({kind(f"10.9.1.{number}") for number in range(200)}) == 1
+    assert len({kind(text) for text in ("10.0.0.1", "10.1.0.1", "10.9.0.7", "10.9.1.1", "127.0.0.1")}) == 5
+    assert kind("10.1.0.1") == kind("10.1.255.9")

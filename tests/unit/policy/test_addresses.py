@@ -37,3 +37,4 @@ def test_hosts_that_are_named_alike() -> None:
         assert table.alike(address_of("10.1.2.3")) == table.alike(address_of("10.1.9.9")) == "10.1.0.0/16"
         assert table.alike(address_of("10.2.0.1")) != table.alike(address_of("10.2.0.2"))
         assert table.alike(address_of("::ffff:10.1.2.3")) == "10.1.0.0/16"
+        assert (table.names(address_of("10.1.2.3")), table.names(address_of("10.2.0.1"))) == (True, False)
