@@ -139,6 +139,10 @@ class Builder(Transformer_NonRecursive[Token, Any]):
 
     array_parameter_behind = array_parameter
 
+    def array_reference_parameter(self, meta: Meta, kind: Any, name: Any) -> tree.Parameter:
+        vector = tree.TypeName(kind.position, ("std", "vector"), element=kind)
+        return self.reference_parameter(meta, vector, name)
+
     # Events and properties
 
     def event(self, meta: Meta, *children: Any) -> tree.Event:

@@ -32,6 +32,7 @@ parameters: parameter ("," parameter)*
 parameter: type NAME
          | type "&" NAME                          -> reference_parameter
          | type "[" "]" NAME                      -> array_parameter
+         | type "[" "]" "&" NAME                  -> array_reference_parameter
          | type NAME "[" "]"                      -> array_parameter_behind
 
 event: MODIFIER* "event" NAME "(" [parameters] ")" trigger action

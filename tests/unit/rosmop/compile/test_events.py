@@ -514,3 +514,13 @@ def test_a_constant_of_a_message_may_be_named_through_a_variable() -> None:
     assert log_of(text, message("rosgraph_msgs/Log")) == "1"
     assert process(text, message("rosgraph_msgs/Log", level=8)).result == "dropped"
     assert "needs a variable" in refused(text.replace("switch", "d.WARN = 3; switch"))[0].text
+
+
+@pytest.mark.parametrize("kind", ["double[] &p", "std::vector<double>& p", "double p[]"])
+def test_references_to_arrays_are_taken(kind: str) -> None:
+    """As in the specifications of ROSRV: a parameter is a reference into the message, with `&` or without."""
+    text = "s() { void twice(double[] &v) { for (double& one : v) { one *= 2; } }"
+    text += f"event e({kind}) /t sensor_msgs/JointState '{{position:p}}' {{ twice(p); }} }}"
+    outcome = load(text).process("/t", message("sensor_msgs/JointState", position=[1.0, 2.0]), 0)
+    assert not outcome.faults
+    assert list(fields("sensor_msgs/JointState", bytes(outcome.buffer)).position) == [2.0, 4.0]
