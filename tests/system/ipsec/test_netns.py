@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+import sys
 from pathlib import Path
 
 from examples.landshark.lab import Lab
@@ -51,6 +52,24 @@ def test_the_host_forwards_the_tunnel(tmp_path: Path) -> None:
                 assert authority_seen_from(joined).startswith("-----BEGIN CERTIFICATE-----")
             rules = [rule["purpose"] for rule in appliance.status()["firewall"]["forwarding"]]
             assert "UDP 4500 to the appliance, IPv4" in rules
+
+
+PRIVATE_DEVICE = """\
+mount --make-rprivate / && mount -t tmpfs tmpfs /dev/net && mknod -m 600 /dev/net/tun c 10 200 && exec "$@"
+"""
+
+
+def test_a_device_that_only_root_may_open_carries_the_tunnel() -> None:
+    """On a machine without udev `/dev/net/tun` has mode 0600: charon's user is let in, and the tunnel works as well."""
+    need_root()
+    need_strongswan()
+    mine = f"{Path(__file__).resolve()}::{test_the_host_forwards_the_tunnel.__name__}"
+    done = subprocess.run(
+        ["unshare", "--mount", "sh", "-ec", PRIVATE_DEVICE, "sh", sys.executable, "-m", "pytest", "-n0", "-q", mine],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "1 passed" in done.stdout
 
 
 def authority_seen_from(joined: JoinedHost) -> str:
