@@ -49,7 +49,7 @@ class SliceParts:
 
     def __init__(self, slices: Slices) -> None:
         self._slices = slices
-        self._parts: list[dict[Binding, tuple[int, bool, bytes]]] = [{} for _ in range(BUCKETS)]
+        self._parts: list[dict[Binding, tuple[int, bool, msgspec.Raw]]] = [{} for _ in range(BUCKETS)]
         self._number = 0
         self._failed = ""
         slices.keep()
@@ -73,7 +73,7 @@ class SliceParts:
         return [self._encoded(number) for number in range(BUCKETS)]
 
     def _take(
-        self, part: dict[Binding, tuple[int, bool, bytes]], binding: Binding, holder: str | None
+        self, part: dict[Binding, tuple[int, bool, msgspec.Raw]], binding: Binding, holder: str | None
     ) -> None:
         try:
             slice_ = self._slices.state(binding)
@@ -81,7 +81,7 @@ class SliceParts:
             part.pop(binding, None)
             return
         ended = slice_ is None
-        number, was_ended, _ = part.get(binding, (-1, False, b""))
+        number, was_ended, _ = part.get(binding, (-1, False, None))
         if number < 0 or was_ended is not ended:
             number, self._number = self._number, self._number + 1
         domain, key = binding
@@ -89,13 +89,12 @@ class SliceParts:
         if slice_ is not None:
             state = [*map(kept, slice_.runs)], [*slice_.values], slice_.due, slice_.turn
         record = KeptSlice(number, domain, [*key[1:]], holder, ended, *state)
-        part[binding] = number, ended, msgspec.msgpack.encode(record)
+        part[binding] = number, ended, msgspec.Raw(msgspec.msgpack.encode(record))
 
     def _encoded(self, number: int) -> bytes:
         if self._failed:
             return msgspec.msgpack.encode(self._failed)
-        records = [msgspec.Raw(record) for _, _, record in self._parts[number].values()]
-        return msgspec.msgpack.encode(_Written(records))
+        return msgspec.msgpack.encode(_Written([record for _, _, record in self._parts[number].values()]))
 
 
 def restore_slices(
