@@ -198,17 +198,19 @@ class Listener:
         for connection in self.visitors.connections:
             connection.abort()
 
-    def _accepted(self, context: ssl.SSLContext | None, sock: socket.socket, host: Address) -> None:
+    def _accepted(self, context: ssl.SSLContext | None, sock: socket.socket, host: Address) -> bool:
         connection = _Connection(self, sock)
         if self.visitors.enter(connection, peer_key(str(host))):
             sock.close()
-            return
+            return False
+        sock.setblocking(False)
 
         def opened() -> None:
             self._begin(self._open(connection, sock, context))
             self._time.charge(host, _HANDSHAKE_SECONDS)
 
         self._time.run(host, opened)
+        return True
 
     async def _open(
         self, connection: _Connection, sock: socket.socket, context: ssl.SSLContext | None

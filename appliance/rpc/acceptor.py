@@ -8,6 +8,7 @@ no queue that others need.
 import asyncio
 import errno
 import socket
+from collections import Counter
 from collections.abc import Callable
 
 import structlog
@@ -17,7 +18,8 @@ from appliance.rpc.front import plain_address
 from appliance.rpc.processor_time import ProcessorTime
 
 BACKLOG = 4096
-_AT_ONCE = 512  # connections in one turn of the loop
+_CLOSING_SECONDS = 15e-6  # of processor time, to accept and close a connection
+_AT_ONCE = 256  # connections in one turn of the loop
 _GONE = frozenset({errno.ECONNABORTED, errno.EINTR, errno.EPROTO})
 _PAUSE_SECONDS = 0.2  # when the process has no descriptor left
 
@@ -25,10 +27,13 @@ _log = structlog.get_logger()
 
 
 class Acceptor:
-    """Hands each connection, and its host, to `accepted`, which owns the socket then; the time is the host's."""
+    """Hands each connection, and its host, to `accepted`, which owns the socket then; the time is the host's.
+
+    Where `accepted` says that the host has too many (False), more of the same turn are closed without asking.
+    """
 
     def __init__(
-        self, sock: socket.socket, time: ProcessorTime, accepted: Callable[[socket.socket, Address], None]
+        self, sock: socket.socket, time: ProcessorTime, accepted: Callable[[socket.socket, Address], bool]
     ) -> None:
         self._sock = sock
         self._time = time
@@ -47,24 +52,34 @@ class Acceptor:
         self._sock.close()
 
     def _accept(self) -> None:
-        for _ in range(_AT_ONCE):
-            host = None
-            self._time.begin()
-            try:
+        closed: Counter[str] = Counter()
+        try:
+            for _ in range(_AT_ONCE):
                 sock, address = self._sock.accept()
-                sock.setblocking(False)
-                host = plain_address(address[0])
-                self._accepted(sock, host)
-            except BlockingIOError:
-                return
-            except OSError as error:
-                if error.errno in _GONE:
-                    continue
-                _log.error("no connection can be accepted", reason=str(error))
-                self._loop.remove_reader(self._sock)
-                self._pause = self._loop.call_later(
-                    _PAUSE_SECONDS, self._loop.add_reader, self._sock, self._accept
-                )
-                return
-            finally:
-                self._time.end(host)
+                text = address[0]
+                if text in closed:
+                    sock.close()
+                    closed[text] += 1
+                elif not self._hand_over(sock, text):
+                    closed[text] = 0
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            if error.errno not in _GONE:
+                self._wait(error)
+        for text, count in closed.items():
+            self._time.charge(plain_address(text), count * _CLOSING_SECONDS)
+
+    def _hand_over(self, sock: socket.socket, text: str) -> bool:
+        host = plain_address(text)
+        self._time.begin()
+        try:
+            return self._accepted(sock, host)
+        finally:
+            self._time.end(host)
+
+    def _wait(self, error: OSError) -> None:
+        """Accept again in a while."""
+        _log.error("no connection can be accepted", reason=str(error))
+        self._loop.remove_reader(self._sock)
+        self._pause = self._loop.call_later(_PAUSE_SECONDS, self._loop.add_reader, self._sock, self._accept)

@@ -158,12 +158,11 @@ class ProcessorTime:
         self._since = self._clock()
         return True
 
-    def end(self, host: Address | None) -> None:
-        """The piece that began has ended; it was for this host (None: there was nothing to do)."""
+    def end(self, host: Address) -> None:
+        """The piece that began has ended; it was for this host."""
         assert self._since is not None  # noqa: S101  by `begin`
         seconds, self._since = self._clock() - self._since, None
-        if host is not None:
-            self.charge(host, seconds)
+        self.charge(host, seconds)
 
     def turn_of(self, host: Address) -> "asyncio.Future[None]":
         """A future that is done when it is the host's turn; whoever has it calls `taken`, also if it is cancelled."""

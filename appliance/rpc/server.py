@@ -130,16 +130,18 @@ class HttpServer:
         for connection in list(self.connections):
             connection.abort()
 
-    def _accepted(self, sock: socket.socket, host: Address) -> None:
-        """The connection waits until it is its host's turn to be opened; one too many is closed."""
+    def _accepted(self, sock: socket.socket, host: Address) -> bool:
+        """The connection waits until it is its host's turn to be opened; one too many is closed (False)."""
         too_many = self.visitors.arriving.take(host)
         if not too_many:
+            sock.setblocking(False)
             self.time.run(host, partial(self._admit, sock, host))
-            return
+            return True
         sock.close()
         if host not in self._complaining:
             self._complaining.add(host)
             self.time.run(host, partial(self._complain, host, too_many))
+        return False
 
     def _admit(self, sock: socket.socket, host: Address) -> None:
         """A place for the connection, and its transport."""
