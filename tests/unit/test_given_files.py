@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from appliance.cli import main
+from appliance.cli.rest.session import _context
 from appliance.given_files import lines_given, read_given, read_given_text
 
 POLICY = "[Nodes]\ndefault = *\n"
@@ -40,9 +41,7 @@ VERBS = [
     "evidence verify policy.ini --key {}",
     "evidence verify policy.ini --checkpoints {}",
     "restore {} --state new",
-    "policy check policy.ini --api https://127.0.0.1:1 --api-ca {}",
 ]
-OF_NOTHING = {"policy check empty", "policy test empty", "config check empty"}
 
 
 def folder(place: Path) -> None:
@@ -93,6 +92,17 @@ def test_no_file_makes_a_verb_hang_or_crash(
     assert said.out + said.err
     if kind in ("pipe", "device", "loop"):
         assert ended.value.code != 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_certificate_of_another_kind_is_waited_for(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What `--api-ca` names is such a file as well; an empty one is not the system's authorities."""
+    monkeypatch.chdir(tmp_path)
+    KINDS[kind](Path("given"))
+    with pytest.raises(ValueError, match="--api-ca given: "):
+        _context(Path("given"))
 
 
 def test_a_pipe_of_the_shell_is_read(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ import httpx
 
 from appliance.cli.admin_socket import SECONDS, UNKNOWN, NotRunningError
 from appliance.config import is_loopback
+from appliance.given_files import read_given_text
 from appliance.order_proof import HEADER, proof_of, reading_key, statement
 from appliance.store.tokens import parse_token
 
@@ -219,7 +220,11 @@ def _checked_token(token: str | None) -> str:
 
 def _context(authority: Path | None) -> ssl.SSLContext:
     try:
-        return ssl.create_default_context(cafile=authority)
+        if authority is None:
+            return ssl.create_default_context()
+        # Without a text it would be the system's authorities.
+        text = read_given_text(authority, "ascii", "ignore") or "no certificate"
+        return ssl.create_default_context(cadata=text)
     except ssl.SSLError:
         raise ValueError(f"--api-ca {authority}: has no certificate in PEM") from None
     except OSError as error:
