@@ -190,7 +190,7 @@ def in_module(body: str, before: str = FUNCTIONS) -> list[str]:
     assert walker is not None
     taken = walker.take(message("std_msgs/Int32", data=0), 1, walker.prepare(loud=True, told=[True]))
     assert taken is not None
-    assert (taken.events, taken.log) == (("s.e",), ())
+    assert (taken.events, [*taken.log]) == (("s.e",), [])
     return [f"{monitors.value('s', name):.9g}" for name in names]
 
 
