@@ -11,7 +11,7 @@ import msgspec
 
 from appliance.rosmop.compiled import SpecificationCode
 from appliance.rosmop.kept_runs import StateTooLargeError, kept, run_of
-from appliance.rosmop.slices import Binding, Slice, Slices
+from appliance.rosmop.slices import Binding, Slice, Slices, of_nan
 from appliance.rosmop.types.kinds import Type
 
 BUCKETS = 128
@@ -126,7 +126,7 @@ def restore_slices(
         if not 0 <= record.domain < 1 << len(parameters):
             raise ValueError("a slice has a parameter that its specification has not")
         check([kind for place, kind in enumerate(parameters) if record.domain >> place & 1], record.key)
-        key = (True, *record.key)
+        key = of_nan((True, *record.key))
         if record.ended:
             ended.append(((record.domain, key), record.holder))
             continue

@@ -266,7 +266,7 @@ class Slices:
         self.behind = []
         self._now = time_ns
         if self._floating:
-            key = _of_nan(key)
+            key = of_nan(key)
         domain = _domain(event)
         if domain == self._all:
             known = self._known[domain].slices
@@ -502,7 +502,7 @@ class Slices:
         live: Sequence[Slice],
         ended: Sequence[tuple[Binding, Holder]],
     ) -> None:
-        """Go on with the slices that another process had, each in the order in which they began or ended.
+        """Go on with the slices that another process had, in the order in which they began or ended (keys: `of_nan`).
 
         Raises `KeyError` for a binding that there cannot be.
         """
@@ -511,7 +511,6 @@ class Slices:
         self._namespace.update(zip(self._own, values, strict=True))
         self.begin(self._properties, tuple(declared.property.start(0) for declared in self._properties))
         for slice_ in live:
-            slice_.key = _of_nan(slice_.key)
             slice_.kept = True
             self._put(slice_.domain, slice_.key, slice_)
             self._live.take(slice_.holder, (slice_.domain, slice_.key))
@@ -520,8 +519,8 @@ class Slices:
         heapify(self._deadlines)
         self._order = count(max((slice_.turn for slice_ in live), default=-1) + 1)
         for (domain, key), holder in ended:
-            self._put(domain, _of_nan(key), None)
-            self._ended.take(holder, (domain, _of_nan(key)))
+            self._put(domain, key, None)
+            self._ended.take(holder, (domain, key))
 
     # What is known
 
@@ -640,7 +639,7 @@ class Slices:
                 del keys[_key(values, part)]
 
 
-def _of_nan(key: Key) -> Key:
+def of_nan(key: Key) -> Key:
     """The key with the one NaN that is found again."""
     return tuple(_NAN if value != value else value for value in key)  # noqa: PLR0124  NaN
 

@@ -12,7 +12,8 @@ READERS = {
         "hosts/checked_ports.py", "hosts/table.py",
         "recorder/recorder.py", "recorder/ring.py", "relay/looks.py", "relay/monitors/middle.py",
         "relay/recorder_ring.py",
-        "specifications/monitors.py", "supervisor/life.py", "supervisor/rings.py", "supervisor/supervisor.py",
+        "specifications/monitors.py", "supervisor/life.py", "supervisor/monitor_memory.py",
+        "supervisor/rings.py", "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
         "api/access.py", "api/metrics.py", "api/process.py", "cli/selftest/files.py", "cli/token.py",
