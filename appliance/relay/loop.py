@@ -7,7 +7,7 @@ Processor time is a quota. A descriptor is watched for a *payer*: a host, all un
 connections. The relay's own descriptors (control, lifeline) have no payer. A payer with more than `_DIRECT` descriptors
 has an epoll of its own inside the loop's, so however many of them are ready, those of others are found in time. Payers
 are served by deficit round robin in its continuous form: the payer that has used the least processor time goes first,
-for at most `QUANTUM`; credit for idle time is one quantum.
+for at most `QUANTUM`; credit for idle time is one quantum, and a new payer begins behind others.
 
 Invariants:
 - A handler is never called for a descriptor that was unwatched earlier in the same turn, and a descriptor
@@ -85,9 +85,9 @@ class _Payer:
         "watched",
     )
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, spent: int) -> None:
         self.name = name
-        self.spent = 0
+        self.spent = spent
         self.watched = self.direct = 0
         self.crowd: select.epoll | None = None  # of its descriptors beyond `_DIRECT`
         self.crowd_ready = False
@@ -228,7 +228,7 @@ class Loop:
         if payer is None:
             if len(self._payers) >= _PAYERS:
                 self._forget_idle()
-            payer = self._payers[name] = _Payer(name)
+            payer = self._payers[name] = _Payer(name, self._floor + QUANTUM)
         return payer
 
     def _crowd(self, payer: _Payer) -> select.epoll:

@@ -112,6 +112,8 @@ def costs() -> Iterator[Costs]:
 
 def test_a_host_with_little_to_do_waits_for_one_quantum_of_others(costs: Costs) -> None:
     """While two hundred hosts always have costly messages, the robot's message is served after one of them."""
+    costs.ready("robot", QUANTUM // 50, 1)
+    costs.turns_until(lambda: costs.order)
     for number in range(200):
         costs.ready(f"10.9.0.{number}", QUANTUM)
     costs.turns_until(lambda: len(costs.order) > 300)
@@ -121,6 +123,22 @@ def test_a_host_with_little_to_do_waits_for_one_quantum_of_others(costs: Costs) 
         costs.turns_until(lambda: "robot" in costs.order[before:])  # noqa: B023  it is called here
         assert costs.order[before:].index("robot") <= 2
         costs.turns_until(lambda: len(costs.order) >= before + 10)  # noqa: B023  as above
+
+
+def test_many_new_hosts_do_not_come_before_one_that_used_little(costs: Costs) -> None:
+    """Two hundred hosts that come at once, each with a costly message, delay the robot by one of them."""
+    costs.ready("robot", QUANTUM // 50, 1)
+    costs.turns_until(lambda: costs.order)
+    costs.ready("guest", QUANTUM)
+    costs.ready("other", QUANTUM)
+    costs.turns_until(lambda: len(costs.order) > 20)
+    for number in range(200):
+        costs.ready(f"10.9.0.{number}", 10 * QUANTUM, 1)
+    for _ in range(10):
+        before = len(costs.order)
+        costs.ready("robot", QUANTUM // 50, 1)
+        costs.turns_until(lambda: "robot" in costs.order[before:])  # noqa: B023  it is called here
+        assert costs.order[before:].index("robot") <= 2
 
 
 def test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one(costs: Costs) -> None:
