@@ -1,5 +1,6 @@
 """What every part of one relay shares."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.relay.connections.frames import Scratch
@@ -20,3 +21,5 @@ class RelayContext:
     memory: Memory
     scratch: Scratch
     middle: Middle
+    payer: Callable[[str], str]
+    """Who pays for the processor time of a host now."""

@@ -36,7 +36,7 @@ from appliance.relay.context import RelayContext
 from appliance.relay.grants import StatedTable, Statement
 from appliance.relay.limits import Limits
 from appliance.relay.looks import Looks
-from appliance.relay.loop import UNKNOWN, Loop
+from appliance.relay.loop import Loop
 from appliance.relay.monitors.middle import Middle
 from appliance.relay.monitors.own import OwnPublisher
 from appliance.relay.monitors.places import Place
@@ -65,12 +65,15 @@ class Engine:
         )
         self._table = StatedTable()
         self.memory = Memory.of(limits, self._table.standing)
-        self._context = RelayContext(loop, limits, self._reporter, self.memory, Scratch(), self.middle)
+        self._context = RelayContext(
+            loop, limits, self._reporter, self.memory, Scratch(), self.middle, self._table.payer
+        )
         self._anteroom = Anteroom(loop.clock, self._table.standing, self.memory.headers)
         self.ports = Ports(
             loop,
             limits,
             standing=self._table.standing,
+            payer=self._table.payer,
             arrived=self._arrived,
             turned_away=lambda key, host, reason: self._reporter.refused(key, NOTHING, host, "", reason),
             make_room=self._make_place,
@@ -340,7 +343,7 @@ class Engine:
         for member in relayed.members:
             member.cut(reason)
             if self._loop.over():
-                self._loop.later(lambda: self._cut_members(relayed, reason), relayed.host or UNKNOWN)
+                self._loop.later(lambda: self._cut_members(relayed, reason), self._table.payer(relayed.host))
                 return
         row = relayed.traffic()
         if row is not None:
@@ -376,7 +379,7 @@ class Engine:
             sock,
             key,
             host,
-            payer=self.ports.payer(host),
+            payer=self._table.payer(host),
             anteroom=self._anteroom,
             introduced=self._introduced,
             failed=self._visitor_failed,
@@ -535,7 +538,7 @@ class Engine:
             self._anteroom.leave(farewell)
             self.ports.left(visitor.host)
 
-        payer = self.ports.payer(visitor.host)
+        payer = self._table.payer(visitor.host)
         farewell = Farewell(self._loop, sock, reason, self._limits.farewell, ended, payer=payer)
         if farewell.live:
             self.farewells.add(farewell)

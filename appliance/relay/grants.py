@@ -28,6 +28,7 @@ from appliance.channel.messages import (
     ServicePlaced,
     ServiceWithdrawn,
 )
+from appliance.relay.loop import ANYBODY, UNKNOWN
 from appliance.shares.pool import Standing
 
 Statement = NodePlaced | PublicationPlaced | ServicePlaced | GrantInstalled | ClientGranted
@@ -73,6 +74,7 @@ class StatedTable:
         self._facts: dict[_Fact, Message] = {}
         self._by_key: dict[str, dict[_Fact, None]] = {}
         self._hosts: Counter[str] = Counter()
+        self._named: set[str] = set()  # hosts that the policy names, by what was stated last
         self._clients: dict[_Fact, dict[str, None]] = {}  # names, by service and host
         self._restated: set[_Fact] | None = None
         self._epoch = 0
@@ -106,6 +108,7 @@ class StatedTable:
         self._facts[fact] = message
         self._by_key.setdefault(fact[1], {})[fact] = None
         self._hosts[_host(fact, message)] += 1
+        self._name(message)
         if isinstance(message, ClientGranted):
             self._clients.setdefault(fact[:4], {})[message.caller_id] = None
         if self._restated is not None:
@@ -122,6 +125,12 @@ class StatedTable:
     def standing(self, host: str) -> Standing:
         """A host with a node or a grant has a registration; what the policy says of others is not known here."""
         return Standing.REGISTERED if host in self._hosts else Standing.STRANGER
+
+    def payer(self, host: str) -> str:
+        """Return who pays for the processor time of a host: it itself, or all hosts together that no rule names."""
+        if host not in self._hosts:
+            return UNKNOWN
+        return host if host in self._named else ANYBODY
 
     def node(self, key: str) -> NodePlaced | None:
         """The incarnation behind a key."""
@@ -158,6 +167,20 @@ class StatedTable:
         """A name under which this host may call this service; None when it may not."""
         return next(iter(self._clients.get(("client", key, service, host), ())), None)
 
+    def _name(self, message: Statement) -> None:
+        """Note whether the policy names the host of a statement."""
+        if isinstance(message, NodePlaced | ServicePlaced):
+            return
+        if isinstance(message, PublicationPlaced):
+            node = self.node(message.key)
+            host = "" if node is None else node.host
+        else:
+            host = message.host
+        if message.named:
+            self._named.add(host)
+        else:
+            self._named.discard(host)
+
     def _forget(self, fact: _Fact) -> None:
         self._take_out(fact)
         if self._restated is not None:
@@ -174,6 +197,7 @@ class StatedTable:
             self._hosts[host] -= 1
             if not self._hosts[host]:
                 del self._hosts[host]
+                self._named.discard(host)
         if isinstance(message, ClientGranted):
             names = self._clients[fact[:4]]
             del names[fact[4]]

@@ -3,11 +3,12 @@
 Why not asyncio: one frame per read costs a callback, a transport and a future's worth of Python; raw epoll
 with one bound method per descriptor halves the delay a relayed message sees.
 
-Processor time is a quota. A descriptor is watched for a *payer*: a host, all unknown hosts together, or new
-connections. The relay's own descriptors (control, lifeline) have no payer. A payer with more than `_DIRECT` descriptors
-has an epoll of its own inside the loop's, so however many of them are ready, those of others are found in time. Payers
-are served by deficit round robin in its continuous form: the payer that has used the least processor time goes first,
-for at most `QUANTUM`; credit for idle time is one quantum, and a new payer begins behind others.
+Processor time is a quota. A descriptor is watched for a *payer*: a host that the policy names, all other hosts with a
+registration together, all hosts without one, or new connections. The relay's own descriptors (control, lifeline) have
+no payer. A payer with more than `_DIRECT` descriptors has an epoll of its own inside the loop's, so however many of
+them are ready, those of others are found in time. Payers are served by deficit round robin in its continuous form: the
+payer that has used the least processor time goes first, for at most `QUANTUM`; credit for idle time is one quantum, and
+a new payer begins behind others.
 
 Invariants:
 - A handler is never called for a descriptor that was unwatched earlier in the same turn, and a descriptor
@@ -38,6 +39,9 @@ SYSTEM = ""
 
 UNKNOWN = "unknown hosts"
 """The payer for all hosts without a registration."""
+
+ANYBODY = "hosts with a registration, by *"
+"""The payer for all hosts with a registration that no rule names but one for everybody."""
 
 ACCEPTING = "new connections"
 """The payer for listening sockets."""

@@ -180,13 +180,15 @@ RELAY_TURN = Share(
     "microseconds of processor time in one turn of a relay's loop",
     Bounds(1000, 1000, 1000, 0),
     "the host that has used most waits until the others that are ready have been served; a stranger here is a host"
-    " without a grant, and new connections are accepted in a share of their own and charged to their host too; the"
+    " without a grant; hosts with grants that no rule names, or only `*`, count as one; a change of the policy counts"
+    " from the next connection; new connections are accepted in a share of their own and charged to their host too; the"
     " relay's links to control and its supervisor come first",
     "none: nothing is refused",
     (
         "unit/relay/test_loop.py::test_a_host_with_little_to_do_waits_for_one_quantum_of_others",
         "unit/relay/test_loop.py::test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one",
         "unit/relay/test_loop.py::test_all_unknown_hosts_together_are_one_payer",
+        "unit/relay/test_grants.py::test_hosts_that_only_everybody_names_pay_as_one",
     ),
 )
 LIMITED_TOPIC = Share(

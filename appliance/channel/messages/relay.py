@@ -64,7 +64,8 @@ class PublicationPlaced(Message):
     """The incarnation publishes this topic (type as registered, `*` when unknown).
 
     `limit` is for all publications of the topic on this host, `together` for all of the topic: hosts share that one
-    equally, each as `counted_as`. Said again, it changes them.
+    equally, each as `counted_as`. Said again, it changes them. `named`: the policy names the node's host, and not only
+    everybody (`*`).
     """
 
     key: str
@@ -73,6 +74,7 @@ class PublicationPlaced(Message):
     limit: FlowLimit = UNLIMITED
     together: FlowLimit = UNLIMITED
     counted_as: str = ""
+    named: bool = True
 
 
 class PublicationWithdrawn(Message):
@@ -101,7 +103,7 @@ class ServiceWithdrawn(Message):
 class GrantInstalled(Message):
     """This subscriber (host, caller_id) may have this topic of that incarnation, up to a limit.
 
-    Said again, it changes the limit.
+    Said again, it changes the limit. `named`: the policy names the host, and not only everybody (`*`).
     """
 
     key: str
@@ -109,6 +111,7 @@ class GrantInstalled(Message):
     host: str
     caller_id: str
     limit: FlowLimit = UNLIMITED
+    named: bool = True
 
 
 class GrantRevoked(Message):
@@ -121,12 +124,16 @@ class GrantRevoked(Message):
 
 
 class ClientGranted(Message):
-    """This client (host, caller_id) may call this service of that incarnation."""
+    """This client (host, caller_id) may call this service of that incarnation.
+
+    `named`: the policy names the host, and not only everybody (`*`).
+    """
 
     key: str
     service: str
     host: str
     caller_id: str
+    named: bool = True
 
 
 class ClientRevoked(Message):

@@ -216,15 +216,14 @@ class Graph:
         ]
 
     def limits_changed(self, before: Policy, now: Policy) -> Effects:
-        """Another policy is in force: the relays are told of limits that are others now."""
-        if not before.limits_anything and not now.limits_anything:
-            return []
+        """Return what states limits again that differ under another policy, and which hosts the policy names."""
         effects: Effects = []
         for node in self.registry.live():
             for registration in node.registrations.values():
                 parts = ((Part.PUBLISHER, node.host), (Part.TOPIC, None))
                 if registration.kind is Kind.PUBLICATION and (
-                    _differ(before, now, registration.resource, parts)
+                    before.names(node.host) != now.names(node.host)
+                    or _differ(before, now, registration.resource, parts)
                     or (
                         now.limit(Part.TOPIC, registration.resource)
                         and before.counted_as(node.host) != now.counted_as(node.host)
@@ -232,8 +231,10 @@ class Graph:
                 ):
                     effects.append(Place(node, registration.kind, registration.resource, registration.detail))
             for row in self.grants.of(node.key):
-                reader = ((Part.SUBSCRIBER, address_of(row.host)),)
-                if row.kind == TOPIC and _differ(before, now, row.resource, reader):
+                host = address_of(row.host)
+                if before.names(host) != now.names(host) or (
+                    row.kind == TOPIC and _differ(before, now, row.resource, ((Part.SUBSCRIBER, host),))
+                ):
                     effects.append(PlaceGrant(row))
         return effects
 

@@ -23,7 +23,7 @@ from appliance.master.reach.places import Places
 from appliance.master.reach.topic_looks import TopicLooks
 from appliance.master.reach.traffic import Carried
 from appliance.policy.limits import Part, Rate
-from appliance.policy.model import address_of
+from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
 from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError
@@ -215,7 +215,8 @@ class RelayControl:
         if row.kind == TOPIC:
             post.send(_grant(self.policy(), row))
         else:
-            post.send(messages.ClientGranted(row.key, row.resource, row.host, row.caller_id))
+            named = _names(self.policy(), address_of(row.host))
+            post.send(messages.ClientGranted(row.key, row.resource, row.host, row.caller_id, named))
 
     def revoke_grant(self, row: PermissionRow) -> None:
         """A subscriber or client is let in no more; its connection is cut."""
@@ -277,6 +278,7 @@ class RelayControl:
             _flow(policy.limit(Part.PUBLISHER, topic, incarnation.host)),
             _flow(together),
             policy.counted_as(incarnation.host) if together else "",
+            _names(policy, incarnation.host),
         )
 
     # --- what the relays say ---
@@ -348,8 +350,16 @@ class RelayControl:
 
 
 def _grant(policy: Policy, row: PermissionRow) -> messages.GrantInstalled:
-    limit = policy.limit(Part.SUBSCRIBER, row.resource, address_of(row.host))
-    return messages.GrantInstalled(row.key, row.resource, row.host, row.caller_id, _flow(limit))
+    host = address_of(row.host)
+    limit = policy.limit(Part.SUBSCRIBER, row.resource, host)
+    return messages.GrantInstalled(
+        row.key, row.resource, row.host, row.caller_id, _flow(limit), _names(policy, host)
+    )
+
+
+def _names(policy: Policy, host: Address) -> bool:
+    """Whether the policy names a host; it need not name the appliance itself."""
+    return host.is_loopback or policy.names(host)
 
 
 def _flow(rate: Rate) -> messages.FlowLimit:

@@ -114,7 +114,12 @@ class ServiceClient:
             judge=self._judge,
         )
         self._client = Stream(
-            context.loop, sock, self._client_received, self.cut, payer=host, drained=self._advance
+            context.loop,
+            sock,
+            self._client_received,
+            self.cut,
+            payer=context.payer(host),
+            drained=self._advance,
         )
         self._client.read(False)
 
@@ -141,7 +146,9 @@ class ServiceClient:
             return OwnServer(self._own, loop, called=called, received=received, opened=opened)
         sock = begin_connect(service.host, service.port)
         received, broken = self._server_received, self._server_broken
-        return Stream(loop, sock, received, broken, payer=self.host, opened=self._connected)
+        return Stream(
+            loop, sock, received, broken, payer=self._context.payer(self.host), opened=self._connected
+        )
 
     def judge_again(self) -> None:
         """Other specifications are in force: a service that does not fit them is carried no longer."""

@@ -14,7 +14,7 @@ import socket
 from collections.abc import Callable
 
 from appliance.relay.limits import Limits
-from appliance.relay.loop import ACCEPTING, QUANTUM, READ, UNKNOWN, Loop
+from appliance.relay.loop import ACCEPTING, QUANTUM, READ, Loop
 from appliance.shares.pool import Pool, Standing
 from appliance.shares.table import RELAY_CONNECTIONS
 
@@ -25,8 +25,8 @@ _EXHAUSTED = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 class Ports:
     """Accepts peers: `arrived(key, sock, host)`, or `turned_away(key, host, reason)` without room.
 
-    `standing(host)` is what the table knows of a host; `make_room(host)` ends a connection for one of this host and
-    says whether there was one.
+    `standing(host)` is what the table knows of a host, `payer(host)` who pays for it. `make_room(host)` ends a
+    connection for one of this host and says whether there was one.
     """
 
     def __init__(
@@ -35,12 +35,13 @@ class Ports:
         limits: Limits,
         *,
         standing: Callable[[str], Standing],
+        payer: Callable[[str], str],
         arrived: Callable[[str, socket.socket, str], None],
         turned_away: Callable[[str, str, str], None],
         make_room: Callable[[str], bool],
     ) -> None:
         self._loop = loop
-        self._standing = standing
+        self._payer = payer
         self._arrived = arrived
         self._turned_away = turned_away
         self._listening: dict[str, socket.socket] = {}
@@ -70,10 +71,6 @@ class Ports:
         for key in list(self._listening):
             self.close(key)
 
-    def payer(self, host: str) -> str:
-        """Return who pays for a peer from this host."""
-        return host if self._standing(host) is Standing.REGISTERED else UNKNOWN
-
     def left(self, host: str) -> None:
         """A peer that arrived is gone."""
         self.connected.give_back(host)
@@ -94,7 +91,7 @@ class Ports:
                     return
                 continue  # this peer is gone already; the next may be well
             host = address[0].removeprefix("::ffff:")
-            payer = self.payer(host)
+            payer = self._payer(host)
             reason = self._take(host)
             if reason:
                 sock.close()

@@ -28,10 +28,10 @@ def looks_for_names(type_name: str) -> bool:
 class Presences:
     """The presences at one publisher of one topic, at `host:port` while its main connection is open."""
 
-    def __init__(self, context: RelayContext, topic: str, payer: str) -> None:
+    def __init__(self, context: RelayContext, topic: str, host: str) -> None:
         self._context = context
         self._topic = topic
-        self._payer = payer
+        self._host = host
         self._wanted: frozenset[str] = frozenset()
         self._address: tuple[str, int] | None = None
         self._streams: dict[str, Stream] = {}
@@ -69,7 +69,7 @@ class Presences:
                 sock,
                 partial(self._received, name),
                 partial(self._broken, name),
-                payer=self._payer,
+                payer=self._context.payer(self._host),
                 opened=partial(self._connected, name),
             )
 

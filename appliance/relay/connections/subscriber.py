@@ -58,7 +58,7 @@ class Subscriber:
         self._stall = Stall(context.limits.stall_seconds)
         self._number = 0
         self._live = True
-        self._loop.watch(sock.fileno(), READ, self._ready, host)
+        self._loop.watch(sock.fileno(), READ, self._ready, context.payer(host))
 
     def greet(self, header: Mapping[str, str]) -> bool:
         """Answer with the publisher's header, or with an error header where type and md5sum do not fit."""

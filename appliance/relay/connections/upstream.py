@@ -20,7 +20,7 @@ from appliance.relay.connections.presence import Presences, looks_for_names
 from appliance.relay.connections.sockets import Stream, begin_connect
 from appliance.relay.connections.topic import RelayedTopic
 from appliance.relay.context import RelayContext
-from appliance.relay.loop import READ, UNKNOWN, Timer
+from appliance.relay.loop import READ, Timer
 from appliance.ros.errors import LimitExceededError, PeerError
 from appliance.ros.tcpros import HeaderParser, encode_header
 
@@ -40,7 +40,8 @@ class Publisher:
         self._loop = context.loop
         self._clock = context.loop.clock
         self._topic = topic
-        self._payer = topic.host or UNKNOWN
+        self._payer_of = context.payer
+        self._payer = context.payer(topic.host)
         self._reporter = context.reporter
         self._limits = limits = context.limits
         self._weight = Weight(context.memory.frames.of(topic.host))
@@ -71,7 +72,7 @@ class Publisher:
         self._parser = HeaderParser(limits.header_bytes)
         self._address = ("", 0)
         self._header: dict[str, str] = {}
-        self._presences = Presences(context, topic.topic, self._payer)
+        self._presences = Presences(context, topic.topic, topic.host)
         self._objection = objection
         self._objected = ""
 
@@ -107,6 +108,7 @@ class Publisher:
             return
         self._asked = False
         self._address = (host, port)
+        self._payer = self._payer_of(self._topic.host)
         try:
             sock = begin_connect(host, port)
         except (OSError, OverflowError) as error:

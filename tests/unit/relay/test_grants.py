@@ -13,6 +13,7 @@ from appliance.channel.messages import (
     ServiceWithdrawn,
 )
 from appliance.relay.grants import Service, StatedTable
+from appliance.relay.loop import ANYBODY, UNKNOWN
 
 NODE = NodePlaced("k", "/talker", "10.0.0.1")
 TOPIC = PublicationPlaced("k", "/chatter", "std_msgs/String")
@@ -65,6 +66,26 @@ def test_a_node_takes_everything_of_its_incarnation_with_it() -> None:
     assert not table.may_subscribe("k", "/chatter", "10.0.0.2", "/listener")
     assert not table.may_call("k", "/add", "10.0.0.2", "/c")
     assert table.may_subscribe("other", "/chatter", "10.0.0.2", "/listener")
+
+
+def test_hosts_that_only_everybody_names_pay_as_one() -> None:
+    """A host pays for itself while the policy names it; all others with a registration are one, all without one too."""
+    table = stated()
+    for number in range(200):
+        host = f"10.9.0.{number}"
+        table.state(NodePlaced(host, "/guest", host))
+        assert table.payer(host) == ANYBODY
+        table.state(PublicationPlaced(host, "/guest", "*", named=False))
+        table.state(GrantInstalled("k", "/chatter", f"10.9.1.{number}", "/ear", named=False))
+        table.state(ClientGranted("k", "/add", f"10.9.2.{number}", "/c", named=False))
+        assert {table.payer(f"10.9.{kind}.{number}") for kind in range(3)} == {ANYBODY}
+    assert [table.payer(f"10.0.0.{last}") for last in (1, 2, 3)] == ["10.0.0.1", "10.0.0.2", UNKNOWN]
+    table.state(GrantInstalled("k", "/chatter", "10.0.0.2", "/listener", named=False))
+    assert table.payer("10.0.0.2") == ANYBODY
+    table.state(GrantInstalled("k", "/chatter", "10.9.1.1", "/ear", named=True))
+    assert table.payer("10.9.1.1") == "10.9.1.1"
+    table.withdraw(NodeWithdrawn("k"))
+    assert table.payer("10.9.1.1") == UNKNOWN
 
 
 def test_the_latest_place_of_a_service_counts() -> None:

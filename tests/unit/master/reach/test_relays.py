@@ -90,9 +90,9 @@ class Link:
         return told
 
 
-def policy(*limits: str) -> Policy:
-    """A policy with these limits."""
-    return compile_policy("\n".join(["[Limits]", *limits]), file="p.ini")
+def policy(*limits: str, nodes: str = "default = 10.0.0.5") -> Policy:
+    """A policy with these limits, and rules for `nodes`."""
+    return compile_policy("\n".join(["[Limits]", *limits, "[Nodes]", nodes]), file="p.ini")
 
 
 class World:
@@ -232,6 +232,29 @@ async def test_each_relay_is_told_what_it_carries() -> None:
     assert (first.heard(), again.heard()) == ([messages.PublicationWithdrawn("key", "/left")], [])
     relay.withdraw_node(node)
     assert first.heard() == again.heard() == [messages.NodeWithdrawn("key")]
+    world.close()
+
+
+async def test_relays_know_which_hosts_the_policy_names() -> None:
+    """Publications and grants say whether their host is named, and again when another policy differs about it."""
+    world = World()
+    (first, second) = world.links
+    world.grant_topic("/right", HOST, "/ear")
+    world.enactor.carry_out(world.graph.service_granted(world.node, "/serve", HOST, "/client"))
+    for link in world.links:
+        link.heard()
+    before, world.policy = world.policy, policy(nodes="default = *")
+    world.limits_changed(before, world.policy)
+    assert first.heard() == [
+        messages.PublicationPlaced("key", "/left", "std_msgs/String", named=False),
+        messages.ClientGranted("key", "/serve", "10.0.0.5", "/client", named=False),
+    ]
+    assert second.heard() == [
+        messages.PublicationPlaced("key", "/right", "std_msgs/String", named=False),
+        messages.GrantInstalled("key", "/right", "10.0.0.5", "/ear", named=False),
+    ]
+    world.limits_changed(world.policy, policy(nodes="default = *"))
+    assert first.heard() == second.heard() == []
     world.close()
 
 

@@ -47,7 +47,7 @@ def presences(loop: Loop) -> Iterator[Presences]:
     reporter = Reporter(limits)
     memory = Memory.of(limits, lambda _host: Standing.REGISTERED)
     middle = Middle(loop, reporter, budget=1.0, publish=_nothing, changed=_nothing)
-    context = RelayContext(loop, limits, reporter, memory, Scratch(), middle)
+    context = RelayContext(loop, limits, reporter, memory, Scratch(), middle, str)
     presences = Presences(context, TOPIC, "10.0.0.9")
     yield presences
     presences.close()
