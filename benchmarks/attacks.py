@@ -35,9 +35,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from appliance.ros.errors import PeerError
-from appliance.ros.xmlrpc import parse_response
 from examples.landshark.lab import Host, Lab
+from roswire.errors import PeerError
+from roswire.xmlrpc import parse_response
 from tests.support.appliance import Appliance
 
 HERE = Path(__file__).parent

@@ -23,8 +23,8 @@ from collections.abc import Callable
 from rich.console import Console
 from rich.table import Table
 
-from appliance.ros.xmlrpc import Limits, parse_call
 from benchmarks.control_plane import Client, Master, masters, processor_seconds, request
+from roswire.xmlrpc import Limits, parse_call
 
 PARAMETERS, NODES, TOPICS = (
     4000,

@@ -18,8 +18,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet
+from rosmop.run.engine import MonitorSet
+from roswire.standard import standard_definitions
 
 SLICES = 100_000
 TESTS = Path("src/test/scala")

@@ -21,12 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from appliance.learning.learner import Learnt, learn
-from appliance.ros.definitions import Definitions
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet
 from examples.landshark.drive import TYPES, VELOCITY, Part, Simulation
 from examples.landshark.messages import DEFINITIONS, Messages, long_name
+from rosmop.learn.learner import Learnt, learn
+from rosmop.run.engine import MonitorSet
+from roswire.definitions import Definitions
+from roswire.standard import standard_definitions
 
 MESSAGES = Messages()
 KNOWN = standard_definitions().extended(Definitions.from_files(DEFINITIONS))

@@ -18,9 +18,9 @@ from typing import Any
 import reelay
 import rtamt
 
-from appliance.rosmop.logics.catalogue import compile_property
-from appliance.rosmop.logics.interface import CompiledProperty, FiniteProperty, Run
-from appliance.rosmop.positions import Position
+from rosmop.form.positions import Position
+from rosmop.logics.catalogue import compile_property
+from rosmop.logics.interface import CompiledProperty, FiniteProperty, Run
 
 EVENTS = ("a", "b", "c")
 MS = 1_000_000

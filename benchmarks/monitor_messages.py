@@ -14,8 +14,8 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet
+from rosmop.run.engine import MonitorSet
+from roswire.standard import standard_definitions
 
 MESSAGES = 20_000
 ROUNDS = 7

@@ -20,7 +20,6 @@ import subprocess
 import threading
 from pathlib import Path
 
-from appliance.ros.definitions import Definitions
 from benchmarks.relay_throughput import (
     HERE,
     PROGRAM,
@@ -34,6 +33,7 @@ from benchmarks.relay_throughput import (
     cpu_seconds,
     run,
 )
+from roswire.definitions import Definitions
 
 COPYING = PROGRAM.with_name("copying_relay")
 DEFINITION = HERE / "nodes" / "msg" / f"{TYPE}.msg"

@@ -20,10 +20,10 @@ from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
 
-from tests.unit.rosmop.logics import test_ere as ere
-from tests.unit.rosmop.logics import test_ltl as ltl
-from tests.unit.rosmop.logics.driving import ABC, compiled, seeded, told
-from tests.unit.rosmop.logics.temporal import draw
+from rosmop.tests.logics import test_ere as ere
+from rosmop.tests.logics import test_ltl as ltl
+from rosmop.tests.logics.driving import ABC, compiled, seeded, told
+from rosmop.tests.logics.temporal import draw
 
 _PLUGINS = "com/runtimeverification/rvmonitor/logicrepository/plugins"
 _TRACES, _LONGEST = 40, 12

@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet
+from rosmop.run.engine import MonitorSet
+from roswire.standard import standard_definitions
 
 LIVE = 10_000
 MANY = 100_000

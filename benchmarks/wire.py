@@ -10,10 +10,10 @@ import timeit
 import xmlrpc.client
 from collections.abc import Callable
 
-from appliance.ros import names
-from appliance.ros.tcpros import HeaderParser, encode_header
-from appliance.ros.uris import parse_node_uri
-from appliance.ros.xmlrpc import Value, build_call, build_response, parse_call, parse_response
+from roswire import names
+from roswire.tcpros import HeaderParser, encode_header
+from roswire.uris import parse_node_uri
+from roswire.xmlrpc import Value, build_call, build_response, parse_call, parse_response
 
 CALL = ("/talker", "/chatter", "std_msgs/String", "http://10.0.0.1:4567/")
 ANSWER: Value = [1, "Registered [/talker] as publisher of [/chatter]", ["http://10.0.0.1:4567/"]]

@@ -1,6 +1,6 @@
 (* The check of a `ptltl` automaton is sound: what it accepts says, after every trace, whether the formula holds.
 
-   `check` below is `_check_past` of appliance/rosmop/certify/check.py, which follows `Past` of past.py there: a formula is
+   `check` below is `_check_past` of rosmop/certify/check.py, which follows `Past` of past.py there: a formula is
    followed event by event beside the automaton, through all pairs that can be reached. `holds` is the definition of the
    logic; nothing of the check is in it. It is extracted, and compared with the Python (tests/proofs/test_certifier.py). *)
 

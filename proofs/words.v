@@ -1,7 +1,7 @@
 (* The checks of `ere` and `fsm` automata are sound: what they accept gives, after every trace, the verdict of the definition.
 
    `check_words` and `check_machine` are `_check_words` and `_check_machine` (without time limits) of
-   appliance/rosmop/certify/check.py. Both follow what the definition leaves beside the automaton, through all pairs that
+   rosmop/certify/check.py. Both follow what the definition leaves beside the automaton, through all pairs that
    can be reached (`follow`): of an expression its derivatives (`Words` of words.py there), of a machine the states as
    they are written. `lang` is the definition of expressions; nothing of the check is in it. A trace is the list of its
    events, the first one first. Extracted, and compared with the Python (tests/proofs/test_certifier.py). *)

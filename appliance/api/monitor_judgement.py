@@ -14,8 +14,8 @@ from appliance.api.problems import Finding, ProblemError
 from appliance.channel.answers.monitors import Monitors
 
 if TYPE_CHECKING:
-    from appliance.rosmop.engine import MonitorSet
-    from appliance.rosmop.monitor import Monitor
+    from rosmop.run.engine import MonitorSet
+    from rosmop.run.monitor import Monitor
 
 _PLACE = re.compile(r"(?s)(.*?):([0-9]+):([0-9]+): (error|warning): (.*)")
 
@@ -61,9 +61,9 @@ class Compiler:
 
 
 def _compiled(files: dict[str, str], definitions: dict[str, str]) -> MonitorSet:
-    from appliance.ros.definitions import Definitions  # noqa: PLC0415  the compiler: see the head
-    from appliance.ros.standard import standard_definitions  # noqa: PLC0415  the compiler: see the head
-    from appliance.rosmop.engine import MonitorSet  # noqa: PLC0415  the compiler: see the head
+    from rosmop.run.engine import MonitorSet  # noqa: PLC0415  the compiler: see the head
+    from roswire.definitions import Definitions  # noqa: PLC0415  the compiler: see the head
+    from roswire.standard import standard_definitions  # noqa: PLC0415  the compiler: see the head
 
     return MonitorSet.load(files, standard_definitions().extended(Definitions.from_files(definitions)))
 
@@ -85,7 +85,7 @@ def events_of(monitor: Monitor) -> list[EventShown]:
 
 def properties_of(monitor: Monitor) -> list[PropertyShown]:
     """The properties of a monitor."""
-    from appliance.rosmop.logics.picture import dot_of  # noqa: PLC0415  the compiler: see the head
+    from rosmop.logics.picture import dot_of  # noqa: PLC0415  the compiler: see the head
 
     return [
         PropertyShown(
@@ -101,6 +101,6 @@ def properties_of(monitor: Monitor) -> list[PropertyShown]:
 
 def picture_of(monitor: Monitor) -> str | None:
     """The automata of a monitor's properties (SVG); None when none is finite."""
-    from appliance.rosmop.logics.picture import svg_of  # noqa: PLC0415  the compiler: see the head
+    from rosmop.logics.picture import svg_of  # noqa: PLC0415  the compiler: see the head
 
     return svg_of([code.property for code in monitor.code.properties])

@@ -12,7 +12,7 @@ from appliance.channel.answers.graph import Topic, TopicMessage
 from appliance.cli import completion
 from appliance.cli.output import printable, refused, say, say_json, usage_error
 from appliance.cli.target import Appliance, speaks
-from appliance.ros.message_view import CUT
+from roswire.message_view import CUT
 
 _AT_ONCE = 20  # messages of one look
 _Topic = Annotated[str, typer.Argument(metavar="TOPIC", show_default=False, autocompletion=completion.topics)]

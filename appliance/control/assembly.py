@@ -63,7 +63,6 @@ from appliance.master.upkeep.reminders import Reminders
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
 from appliance.recorder.plan import RecordingPlan
-from appliance.ros import log_message
 from appliance.rpc.bulk import LargeWrites, bulk_turns
 from appliance.shares.pool import Pool
 from appliance.shares.table import PARAMETER_BYTES
@@ -71,6 +70,7 @@ from appliance.specifications.allocation import Allocation
 from appliance.specifications.compiler import SpecificationCompiler
 from appliance.specifications.monitors import ALLOCATION, Monitors
 from appliance.store.state import StateStore
+from roswire import log_message
 
 RVMASTER, INNER = "rvmaster", "inner"
 
@@ -399,7 +399,5 @@ def _make_mirror(base: Foundation) -> ParameterMirror:
 
 
 def _header_of_rosout() -> messages.OwnHeaderStated:
-    stated: messages.OwnHeaderStated = rosout.header(
-        late.load("appliance.ros.standard").standard_definitions()
-    )
+    stated: messages.OwnHeaderStated = rosout.header(late.load("roswire.standard").standard_definitions())
     return stated

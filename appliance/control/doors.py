@@ -16,7 +16,6 @@ from appliance.master.calls.call import with_record
 from appliance.master.calls.glimpse import asked_for
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
-from appliance.ros.xmlrpc import Limits, build_fault
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import AtOnce, Handler, HttpServer, Peer, Refusal, not_at_once
@@ -25,6 +24,7 @@ from appliance.rpc.visitors import Visitors
 from appliance.shares.descriptors import connections_within
 from appliance.shares.pool import Bounds, Standing
 from appliance.shares.table import RVMASTER_BYTES, RVMASTER_CONNECTIONS, RVMASTER_REQUESTS
+from roswire.xmlrpc import Limits, build_fault
 
 
 class Doors:

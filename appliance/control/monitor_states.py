@@ -6,9 +6,9 @@ from appliance.channel.answers import monitors as answers
 from appliance.channel.answers.status import MonitorsState
 from appliance.channel.messages import Approach, MarginRow
 from appliance.master.graph.registry import Kind, Registry
-from appliance.rosmop.positions import line_of
 from appliance.specifications.live_topics import Published
 from appliance.specifications.monitors import Monitors
+from rosmop.form.positions import line_of
 
 
 def monitors_of(monitors: Monitors, rv_state: list[object], *, texts: bool) -> answers.Monitors:

@@ -56,7 +56,6 @@ from appliance.hosts.tunnels import Tunnels
 from appliance.master.graph.registry import Life, Registry
 from appliance.master.reach.places import NoPortError
 from appliance.master.upkeep.enactor import restore
-from appliance.ros.uris import node_uri
 from appliance.rpc.server import listen
 from appliance.shares.pool import Standing
 from appliance.shares.table import AUDIT_RESERVE
@@ -65,6 +64,7 @@ from appliance.specifications.compiler import SpecificationCompiler
 from appliance.specifications.files import SpecificationsRefusedError
 from appliance.store.database import StoreError
 from appliance.store.state import StateStore
+from roswire.uris import node_uri
 
 _log = structlog.get_logger()
 _OWN, _ADMIN = "own", "admin"

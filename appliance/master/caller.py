@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 from appliance.audit_trail import Asker
 from appliance.master.graph.registry import Incarnation
-from appliance.ros.uris import NodeUri
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.server import Peer
+from roswire.uris import NodeUri
+from roswire.xmlrpc import Value
 
 Answer = list[Value]
 """What a call returns: `[code, message, value]`; code 1 done, 0 failed or denied, -1 the caller's error."""

@@ -17,11 +17,11 @@ from dataclasses import dataclass, field
 from typing import Protocol, cast
 
 from appliance.policy.model import Address, address_of
-from appliance.ros.errors import ProtocolError
-from appliance.ros.parameter_tree import Tree, parts_of
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import text_weight
 from appliance.shares.pool import Pool
+from roswire.errors import ProtocolError
+from roswire.parameter_tree import Tree, parts_of
+from roswire.xmlrpc import Value
 
 APPLIANCE: Address = address_of("127.0.0.1")
 NAME_WEIGHT = 40

@@ -17,11 +17,11 @@ from appliance.master.parameter_charges import (
     member_weight,
 )
 from appliance.policy.model import Address
-from appliance.ros.errors import ProtocolError
-from appliance.ros.parameter_tree import Tree, parts_of, standing_at
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import text_weight
 from appliance.shares.pool import Pool
+from roswire.errors import ProtocolError
+from roswire.parameter_tree import Tree, parts_of, standing_at
+from roswire.xmlrpc import Value
 
 
 class ParameterMirror:

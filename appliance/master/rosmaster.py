@@ -26,11 +26,11 @@ from typing import Any, TypeVar
 import structlog
 
 from appliance.master.caller import Answer
-from appliance.ros.errors import EncodingError
-from appliance.ros.parameter_tree import Tree
-from appliance.ros.uris import NodeUri
-from appliance.ros.xmlrpc import Limits, Value
 from appliance.rpc.client import BrokenOffError, CallFailedError, RefusedError, XmlRpcClient
+from roswire.errors import EncodingError
+from roswire.parameter_tree import Tree
+from roswire.uris import NodeUri
+from roswire.xmlrpc import Limits, Value
 
 _LARGEST = 64  # parts of one multicall: what one slow part can hold up
 Wanted = tuple[str, tuple[Value, ...]]

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.channel.messages import MonitorEvent, OwnHeaderStated, OwnPublished
-from appliance.ros.definitions import Definitions
-from appliance.ros.log_message import DEBUG, ERROR, FATAL, INFO, TYPE, WARN, log_message
+from roswire.definitions import Definitions
+from roswire.log_message import DEBUG, ERROR, FATAL, INFO, TYPE, WARN, log_message
 
 TOPIC = "/rosout"
 _A_SECOND = 50

@@ -9,8 +9,8 @@ from appliance.policy.keys import is_parameter_key
 from appliance.policy.model import Address, Category
 from appliance.policy.policy import Policy
 from appliance.policy.sections import PARAMETERS
-from appliance.ros.names import is_global_name
 from appliance.wrong_values import meant
+from roswire.names import is_global_name
 
 VERBS = {"use-node" if category is Category.NODE else category.value: category for category in Category}
 

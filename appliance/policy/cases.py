@@ -25,8 +25,8 @@ from appliance.policy.hosts import canonical_address
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, needs_node, rights_of
-from appliance.ros.names import is_global_name
 from appliance.wrong_values import meant, not_yaml
+from roswire.names import is_global_name
 
 MAXIMUM_CHARACTERS = 1024 * 1024
 MAXIMUM_CHECKS = 100_000

@@ -12,8 +12,8 @@ that are equally specific and can match the same name are a tie, which is an err
 
 from dataclasses import dataclass
 
-from appliance.ros.errors import InvalidNameError
-from appliance.ros.names import is_global_name, resolve_parameter
+from roswire.errors import InvalidNameError
+from roswire.names import is_global_name, resolve_parameter
 
 Step = tuple[str, bool]
 """One level of a key: its text, and whether a star follows it."""

@@ -23,7 +23,7 @@ from appliance.policy.hosts import Network, canonical_address
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.rights import rights_of_call
 from appliance.policy.sections import DECIDERS, PARAMETERS
-from appliance.ros.names import is_global_name
+from roswire.names import is_global_name
 
 # What rospy appends (process id and milliseconds) and what roscpp appends (nanoseconds).
 _ANONYMOUS = re.compile(r"_[0-9]+_[0-9]{10,}$|_[0-9]{15,}$")

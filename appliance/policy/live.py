@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Self
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, request_of, rights_to_keep, touch_of
-from appliance.ros.parameter_tree import Tree, holds_others, standing_at
+from roswire.parameter_tree import Tree, holds_others, standing_at
 
 # What each call gives, in the words of a dry run. A node that asks for a topic has subscribed to it.
 _GIVEN = {

@@ -20,7 +20,7 @@ from appliance.policy.limits import NO_LIMIT, LimitRule, LimitTable, Part, Rate
 from appliance.policy.model import Address, Category, Decision, Request, Rule
 from appliance.policy.sections import BY_CATEGORY, PARAMETERS
 from appliance.policy.tree import KeyTree
-from appliance.ros.names import is_global_name
+from roswire.names import is_global_name
 
 DEFAULT_PORTS = range(19001, 26001)
 

@@ -19,8 +19,8 @@ from typing import NamedTuple
 from appliance.policy.model import Address, Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.sections import PARAMETERS
-from appliance.ros.parameter_tree import Tree, holds_others, standing_at
-from appliance.ros.xmlrpc import Value
+from roswire.parameter_tree import Tree, holds_others, standing_at
+from roswire.xmlrpc import Value
 
 _CATEGORIES = {
     "registerPublisher": Category.PUBLISH,

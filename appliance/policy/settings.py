@@ -9,8 +9,8 @@ from appliance.policy.model import TELLS
 from appliance.policy.policy import DEFAULT_PORTS
 from appliance.policy.reader import Entry, SectionText
 from appliance.policy.sections import DECIDERS
-from appliance.ros.names import is_global_name
 from appliance.wrong_values import meant
+from roswire.names import is_global_name
 
 TAKEOVERS = ("same-host", "granted")
 AT_ONCE = "[Options] takeover = granted"

@@ -26,7 +26,7 @@ def known_sums(never: Collection[str]) -> dict[str, str]:
     """The md5sums of the types with known definitions that a glob of `never` fits."""
     if all(glob in _SHIPPED or glob.startswith("/") for glob in never):
         return {name: md5sum for name, md5sum in _SHIPPED.items() if name in never}
-    definitions = late.load("appliance.ros.standard").standard_definitions()
+    definitions = late.load("roswire.standard").standard_definitions()
     known = {name: definitions.md5sum(name) for name in definitions.message_types if fits(never, name)}
     return known | {name: md5sum for name, md5sum in _SHIPPED.items() if fits(never, name)}
 

@@ -27,9 +27,9 @@ from appliance.recorder.never import NAMED
 from appliance.recorder.ring import LEFT_OUT
 from appliance.recorder.ring_reader import MOST_MESSAGES, Found, Place, RingReader
 from appliance.recorder.shelf import ABOUT, BAG, PROGRESS
-from appliance.ros.log_message import ERROR, INFO, TYPE, WARN, log_message
-from appliance.ros.standard import standard_definitions
 from appliance.whole_files import write_whole
+from roswire.log_message import ERROR, INFO, TYPE, WARN, log_message
+from roswire.standard import standard_definitions
 
 RECORDS, LOG = "/rosrv/records", "/rosrv/log"
 MOST_TRIGGERS = 200

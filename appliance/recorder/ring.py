@@ -33,7 +33,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from appliance.ros.tcpros import encode_header
+from roswire.tcpros import encode_header
 
 SMALLEST = 1 << 20
 """No ring is smaller than so many bytes."""

@@ -20,8 +20,8 @@ from appliance.recorder.ring import (
     used_at,
     words_of,
 )
-from appliance.ros.errors import ProtocolError
-from appliance.ros.tcpros import decode_header
+from roswire.errors import ProtocolError
+from roswire.tcpros import decode_header
 
 _LENGTH = struct.Struct("<I")
 _LONGEST_HEADER = 256 << 10

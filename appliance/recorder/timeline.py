@@ -32,7 +32,7 @@ from appliance.recorder.bag import INDEX_ENTRY
 from appliance.recorder.bag_reader import BagReader, Place
 from appliance.recorder.recording import LOG, RECORDS
 from appliance.recorder.triggers import kinds_of
-from appliance.ros.message_view import PublisherReader
+from roswire.message_view import PublisherReader
 
 COLUMNS, MOST_COLUMNS = 200, 1000
 NEIGHBOURS, MOST_NEIGHBOURS = 5, 25

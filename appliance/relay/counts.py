@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from appliance.relay.monitors.places import Place
 
 if TYPE_CHECKING:
-    from appliance.rosmop.walks import Walked, Walker
+    from rosmop.fast.wasm_runner import Walked, Walker
 
 
 class Count(NamedTuple):

@@ -18,7 +18,7 @@ from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.topic import RelayedTopic
 
 if TYPE_CHECKING:
-    from appliance.ros.message_view import PublisherReader
+    from roswire.message_view import PublisherReader
 
 MOST_LOOKS = 8
 MOST_MESSAGES = 20
@@ -73,7 +73,7 @@ class _Reader:
     def __init__(self, topic: RelayedTopic) -> None:
         self._topic = topic
         self._header: Mapping[str, str] | None = None
-        self._view = late.load("appliance.ros.message_view")
+        self._view = late.load("roswire.message_view")
         self._reader: PublisherReader = self._view.PublisherReader({})
 
     def read(self, data: bytes) -> tuple[str, dict[str, Any], str]:

@@ -13,10 +13,10 @@ from typing import cast
 
 import httptools
 
-from appliance.ros.errors import PeerError
-from appliance.ros.uris import NodeUri, node_uri
-from appliance.ros.xmlrpc import FaultReceived, Limits, Value, build_call, parse_response
 from appliance.rpc.bulk import weigh
+from roswire.errors import PeerError
+from roswire.uris import NodeUri, node_uri
+from roswire.xmlrpc import FaultReceived, Limits, Value, build_call, parse_response
 
 
 class CallFailedError(Exception):

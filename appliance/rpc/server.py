@@ -27,12 +27,12 @@ from typing import NamedTuple, cast
 import structlog
 
 from appliance.policy.model import Address
-from appliance.ros.xmlrpc import build_fault
 from appliance.rpc.acceptor import BACKLOG, Acceptor
 from appliance.rpc.front import Front, HttpLimits, plain_address
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Stage, Visitors
+from roswire.xmlrpc import build_fault
 
 _log = structlog.get_logger()
 

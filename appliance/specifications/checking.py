@@ -4,16 +4,16 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 
 from appliance.channel.messages import Contents, PartNames
-from appliance.ros.definitions import Definitions
-from appliance.ros.errors import DefinitionError
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.certify.properties import DEFECT, certificates_of
-from appliance.rosmop.certify.steps import StepDiffersError
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.modules import part_of
-from appliance.rosmop.sent import decoded, encoded, encoded_part
-from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.specifications.files import SpecificationsRefusedError
+from rosmop.certify.properties import DEFECT, certificates_of
+from rosmop.certify.steps import StepDiffersError
+from rosmop.fast.serialization import decoded, encoded, encoded_part
+from rosmop.fast.wasm_build import part_of
+from rosmop.run.engine import MonitorSet
+from rosmop.text.errors import SpecificationError
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
+from roswire.standard import standard_definitions
 
 _LONGEST = 32 << 20  # bytes: half of what a channel takes
 

@@ -13,10 +13,10 @@ import msgspec
 from appliance import late
 from appliance.channel import messages
 from appliance.given_files import read_given_text
-from appliance.ros.definitions import Definitions
-from appliance.ros.errors import DefinitionError
-from appliance.ros.message_view import read_fields
 from appliance.site_keys import UnsignedError, read_signature, signer
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
+from roswire.message_view import read_fields
 
 _MOST_FILES = 1000
 _LONGEST_FILE = 1 << 20

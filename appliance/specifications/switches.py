@@ -8,9 +8,9 @@ ones).
 
 from collections.abc import Mapping
 
-from appliance.rosmop.sharing import sharing
 from appliance.specifications.files import Checked, SpecificationsRefusedError
 from appliance.specifications.rollout import TRIAL, Switch
+from rosmop.form.connected_groups import sharing
 
 
 class Switches:

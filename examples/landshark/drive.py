@@ -16,11 +16,11 @@ from pathlib import Path
 
 from rosbags.rosbag1 import Writer
 
-from appliance.ros.definitions import Definitions
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet
 from examples.landshark.messages import DEFINITIONS, MONITORS, TRIGGER, Messages, long_name
 from examples.landshark.nodes import physics
+from rosmop.run.engine import MonitorSet
+from roswire.definitions import Definitions
+from roswire.standard import standard_definitions
 
 SHIPPED = tuple(sorted(MONITORS.glob("*.rv")))
 START = 1_700_000_000 * 10**9

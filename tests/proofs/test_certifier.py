@@ -8,12 +8,12 @@ from random import Random
 
 import pytest
 
-from appliance.rosmop.certify import text
-from appliance.rosmop.certify.check import Tables, Verdicts, certify
-from appliance.rosmop.certify.machines import Machine
+from rosmop.certify import text
+from rosmop.certify.check import Tables, Verdicts, certify
+from rosmop.certify.machines import Machine
+from rosmop.tests.certify.test_certify import broken, properties, tables_of
 from tests.support.requirements import need_program
 from tests.support.spin import MODEL
-from tests.unit.rosmop.certify.test_certify import broken, properties, tables_of
 
 PROOFS = MODEL.parent
 

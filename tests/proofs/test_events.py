@@ -7,7 +7,7 @@ from collections import Counter
 
 import pytest
 
-from tests.support.module_mutants import FAULTS, FAULTY, faulty
+from rosmop.tests.prove.module_mutants import FAULTS, FAULTY, faulty
 
 
 @pytest.mark.parametrize("text", FAULTY)

@@ -1,8 +1,8 @@
-"""Verdicts of all logics are those of their definitions: a share of what `tests/support/verdicts.py` judges."""
+"""Verdicts of all logics are those of their definitions: a share of what `rosmop/tests/verdicts.py` judges."""
 
 import pytest
 
-from tests.support.verdicts import LOGICS, differing
+from rosmop.tests.verdicts import LOGICS, differing
 
 DEAR = {"parametric": 100, "pattern": 250, "mtl about the future": 500}
 """Fewer of those whose definition takes long."""

@@ -31,12 +31,12 @@ from appliance.master.upkeep.reconcile import Reconciler
 from appliance.metrics import Meter
 from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Address, Decision
-from appliance.ros.uris import node_uri, parse_node_uri
-from appliance.ros.xmlrpc import Limits, Value, build_call, parse_response
 from appliance.rpc.client import CallFailedError, RefusedError
 from appliance.rpc.server import HttpRequest, Peer
 from appliance.shares.pool import Standing
 from appliance.store.state import StateStore
+from roswire.uris import node_uri, parse_node_uri
+from roswire.xmlrpc import Limits, Value, build_call, parse_response
 from tests.support.idle import idle, idle_class
 from tests.support.parameters import mirror
 from tests.support.serving import serving

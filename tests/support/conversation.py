@@ -39,8 +39,8 @@ from appliance.master.graph.registry import Incarnation
 from appliance.master.reach.node_api import NodeApi
 from appliance.master.reach.relays import RelayControl
 from appliance.master.reach.traffic import Carried
-from appliance.ros.xmlrpc import Value
 from appliance.specifications.allocation import Allocation
+from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts
 from tests.support.idle import idle
 

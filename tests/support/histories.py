@@ -48,11 +48,11 @@ from appliance.master.upkeep.enactor import Enactor, restore
 from appliance.master.upkeep.reminders import Reminders
 from appliance.policy.compiler import compile_policy
 from appliance.policy.policy import Policy
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import BrokenOffError, RefusedError, UnansweredError
 from appliance.shares.pool import Standing
 from appliance.specifications.allocation import Allocation
 from appliance.store.state import IncarnationRow, PermissionRow, RegistrationRow, StateStore
+from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, POLICY, ControlParts, HiddenMaster, Inner
 from tests.support.idle import idle, idle_class
 

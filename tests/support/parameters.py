@@ -6,9 +6,9 @@ from typing import Any
 from appliance.master.parameter_charges import ParameterCharges, measure
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.model import Address
-from appliance.ros.parameter_tree import Tree
-from appliance.ros.xmlrpc import Value
 from appliance.shares.pool import Bounds, Pool, Standing
+from roswire.parameter_tree import Tree
+from roswire.xmlrpc import Value
 
 
 class Owners:

@@ -23,8 +23,8 @@ from types import TracebackType
 from typing import Any, Self
 from xmlrpc.server import SimpleXMLRPCServer
 
-from appliance.ros.standard import standard_definitions
-from appliance.ros.tcpros import decode_header, encode_frame, encode_header
+from roswire.standard import standard_definitions
+from roswire.tcpros import decode_header, encode_frame, encode_header
 
 MACHINES = {
     "127.0.0.11": ("arm", "gripper", "safety", "base"),

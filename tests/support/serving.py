@@ -18,11 +18,11 @@ from appliance.master.calls.table import master_table
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.policy import Policy
-from appliance.ros.xmlrpc import Limits
 from appliance.rpc.bulk import LargeWrites, bulk_turns
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest
 from appliance.shares.pool import Standing
+from roswire.xmlrpc import Limits
 
 
 def serving(

@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from appliance.ros.xmlrpc import FaultReceived, parse_response
 from examples.landshark.lab import Host, Lab
+from roswire.xmlrpc import FaultReceived, parse_response
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
 from tests.support.nodes import RosSession

@@ -5,13 +5,13 @@ from functools import cache
 from typing import Any
 
 from appliance.channel.messages import PartNames, SpecificationsStated
-from appliance.ros.definitions import Definitions
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.modules import part_of
-from appliance.rosmop.sent import encoded_part
-from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.specifications.checking import parts
+from rosmop.fast.serialization import encoded_part
+from rosmop.fast.wasm_build import part_of
+from rosmop.run.engine import MonitorSet
+from rosmop.text.errors import SpecificationError
+from roswire.definitions import Definitions
+from roswire.standard import standard_definitions
 
 NOTHING_LIKE_IT = b"\xc1"
 

@@ -4,9 +4,9 @@ import struct
 from collections.abc import Iterator
 from dataclasses import replace
 
-from appliance.rosmop.ir.feed import WrittenModule
-from appliance.rosmop.ir.wasm import signed, unsigned
-from appliance.rosmop.prove import decoding
+from rosmop.fast.batch_codegen import WrittenModule
+from rosmop.fast.wasm import signed, unsigned
+from rosmop.prove import decoding
 
 _OPCODES = {name: code for code, name in (decoding._PLAIN | decoding._MEMORY).items()}
 _PAIRS = (("add", "sub"), ("and", "or"), ("eq", "ne"), ("shl", "shr_u"), ("lt_s", "ge_s"), ("lt_s", "le_s"),

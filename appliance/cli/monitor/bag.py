@@ -17,12 +17,12 @@ from rosbags.rosbag1.writer import WriterError
 
 from appliance.cli.monitor.bounded_bag import BoundedReader
 from appliance.cli.monitor.input import usage_error
-from appliance.ros.definitions import Definitions
-from appliance.ros.errors import DefinitionError
-from appliance.ros.message_text import MessageDefinition
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.happened import Sender
-from appliance.rosmop.outcomes import Outcome, Verdict, bound
+from rosmop.run.causes import Sender
+from rosmop.run.engine import MonitorSet
+from rosmop.run.outcomes import Outcome, Verdict, bound
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
+from roswire.message_text import MessageDefinition
 
 _OWN = "/rosrv"  # the appliance: what monitors publish is not given to monitors
 # What `rosbags` and what unpacks for it raise for a damaged bag, beside an error of their own.

@@ -19,9 +19,9 @@ from appliance.cli.monitor.input import (
 )
 from appliance.cli.output import Json, refused, say, say_json
 from appliance.cli.tables import table_of
-from appliance.learning.coverage import Item, covered
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.syntax.errors import SpecificationError
+from rosmop.learn.coverage import Item, covered
+from rosmop.run.engine import MonitorSet
+from rosmop.text.errors import SpecificationError
 
 _KINDS = ("event", "branch", "function", "handler", "state", "transition")
 

@@ -196,7 +196,7 @@ def load(
     Example: rosrv monitor load safe_zone.rv --shadow
     """
     from appliance.cli.monitor.input import read_to_send  # noqa: PLC0415  it takes a while, and is for this verb only
-    from appliance.rosmop.syntax.errors import SpecificationError  # noqa: PLC0415  as above
+    from rosmop.text.errors import SpecificationError  # noqa: PLC0415  as above
 
     try:
         sent = read_to_send(files, msg or [])

@@ -11,12 +11,12 @@ import typer
 
 from appliance.cli import output
 from appliance.given_files import read_given, read_given_text
-from appliance.ros.definitions import Definitions
-from appliance.ros.errors import DefinitionError
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.positions import Position
-from appliance.rosmop.syntax.errors import SpecificationError
 from appliance.specifications.files import Sources, signatures_of
+from rosmop.form.positions import Position
+from rosmop.text.errors import SpecificationError
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
+from roswire.standard import standard_definitions
 
 usage_error = functools.partial(output.usage_error, verb="rosrv monitor")
 Files = Annotated[

@@ -13,11 +13,11 @@ from appliance.cli.monitor.input import BESIDE, Bags, usage_error
 from appliance.cli.output import Json, counted, say, say_json, write_told
 from appliance.cli.progress import progress
 from appliance.given_files import read_given_text
-from appliance.learning.learner import LearningError, Learnt, learn
-from appliance.ros.definitions import Definitions
-from appliance.ros.errors import DefinitionError
-from appliance.ros.message_text import BUILTINS
-from appliance.ros.standard import standard_definitions
+from rosmop.learn.learner import LearningError, Learnt, learn
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
+from roswire.message_text import BUILTINS
+from roswire.standard import standard_definitions
 
 
 def learn_monitors(

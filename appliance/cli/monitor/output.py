@@ -6,10 +6,10 @@ from typing import Any
 
 from appliance.audit.why import lines_of_why
 from appliance.cli.output import say, say_json
-from appliance.rosmop.explanations import why_of
-from appliance.rosmop.monitor import Monitor
-from appliance.rosmop.outcomes import Fault, Outcome, Verdict, bound
-from appliance.rosmop.positions import Finding
+from rosmop.form.positions import Finding
+from rosmop.run.explanations import why_of
+from rosmop.run.monitor import Monitor
+from rosmop.run.outcomes import Fault, Outcome, Verdict, bound
 
 BILLION = 1_000_000_000
 

@@ -3,8 +3,8 @@
 import time
 
 from appliance.cli.output import say, say_json
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.prove.equality import findings_of
+from rosmop.prove.equality import findings_of
+from rosmop.run.engine import MonitorSet
 
 
 def say_proofs(monitors: MonitorSet, *, as_json: bool) -> int:

@@ -20,15 +20,15 @@ from appliance.cli.output import counted, refused, say, say_json
 from appliance.cli.progress import progress
 from appliance.cli.tables import say_table, table_of
 from appliance.cli.target import Appliance, speaks
-from appliance.ros.definitions import Definitions
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import Margin, MonitorSet
-from appliance.rosmop.outcomes import Outcome, bound
-from appliance.rosmop.positions import Position, line_of
-from appliance.rosmop.sharing import sharing
-from appliance.rosmop.syntax import tree
-from appliance.rosmop.syntax.errors import SpecificationError
-from appliance.rosmop.syntax.parser import parse
+from rosmop.form.connected_groups import sharing
+from rosmop.form.positions import Position, line_of
+from rosmop.run.engine import Margin, MonitorSet
+from rosmop.run.outcomes import Outcome, bound
+from rosmop.text import tree
+from rosmop.text.errors import SpecificationError
+from rosmop.text.parser import parse
+from roswire.definitions import Definitions
+from roswire.standard import standard_definitions
 
 _KINDS = ("drop", "change", "verdict", "warning", "fault")
 _WOULD = {"drop": "would drop it", "change": "would change it"}

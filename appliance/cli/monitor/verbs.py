@@ -16,13 +16,13 @@ from appliance.cli.monitor.input import Files, Folders, read_definitions, read_s
 from appliance.cli.monitor.output import explained, lines, record, say_finding
 from appliance.cli.output import Json, counted, printable, refused, say, say_json
 from appliance.cli.progress import progress
-from appliance.ros.definitions import Definitions
-from appliance.rosmop.certify.properties import certificates_of
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.logics.interface import CompiledProperty
-from appliance.rosmop.logics.picture import dot_of, svg_of
-from appliance.rosmop.positions import Finding
-from appliance.rosmop.syntax.errors import SpecificationError
+from rosmop.certify.properties import certificates_of
+from rosmop.form.positions import Finding
+from rosmop.logics.interface import CompiledProperty
+from rosmop.logics.picture import dot_of, svg_of
+from rosmop.run.engine import MonitorSet
+from rosmop.text.errors import SpecificationError
+from roswire.definitions import Definitions
 
 _TOLD_EVERY = 1000
 

@@ -13,9 +13,9 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import urlsplit
 
-from appliance.ros.errors import PeerError
-from appliance.ros.tcpros import FrameParser, HeaderParser, encode_frame, encode_header
-from appliance.ros.xmlrpc import FaultReceived, build_call, build_response, parse_call, parse_response
+from roswire.errors import PeerError
+from roswire.tcpros import FrameParser, HeaderParser, encode_frame, encode_header
+from roswire.xmlrpc import FaultReceived, build_call, build_response, parse_call, parse_response
 
 TOPIC = "/rosrv_selftest"
 _PUBLISHER, _SUBSCRIBER = "/rosrv_selftest_publisher", "/rosrv_selftest_subscriber"

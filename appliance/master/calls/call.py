@@ -16,11 +16,11 @@ from appliance.master.caller import ApiUri, Caller
 from appliance.master.graph.registry import Kind
 from appliance.policy.model import Category, Decision, Request, told_of
 from appliance.policy.rights import category_of, request_of, touch_of
-from appliance.ros import names
-from appliance.ros.errors import InvalidNameError, PeerError, ProtocolError
-from appliance.ros.names import check_caller_id, check_tool_id
-from appliance.ros.uris import parse_node_uri, parse_service_uri
-from appliance.ros.xmlrpc import Value
+from roswire import names
+from roswire.errors import InvalidNameError, PeerError, ProtocolError
+from roswire.names import check_caller_id, check_tool_id
+from roswire.uris import parse_node_uri, parse_service_uri
+from roswire.xmlrpc import Value
 
 T = TypeVar("T")
 

@@ -34,10 +34,10 @@ from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.liveness import Liveness, Probe
 from appliance.policy.model import Address, Category, Decision
 from appliance.policy.policy import Policy
-from appliance.ros.errors import EncodingError, PeerError, ProtocolError
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import Bulk, LargeWrites, weigh
 from appliance.rpc.client import CallFailedError
+from roswire.errors import EncodingError, PeerError, ProtocolError
+from roswire.xmlrpc import Value
 
 _log = structlog.get_logger()
 _REGISTERS = (Verb.REGISTER, Verb.UNREGISTER)

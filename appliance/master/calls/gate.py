@@ -19,8 +19,8 @@ from appliance.policy.model import Address, Category, Decision
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, rights_of_call
 from appliance.policy.settings import AT_ONCE
-from appliance.ros.parameter_tree import Tree
 from appliance.shares.table import NAMES
+from roswire.parameter_tree import Tree
 
 _TIMES_THE_REST = 3
 

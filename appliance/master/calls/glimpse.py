@@ -14,10 +14,10 @@ from appliance.master.calls.multicall import MULTICALL
 from appliance.master.calls.node_calls import NODE_CALLS
 from appliance.master.calls.table import MASTER_CALLS
 from appliance.policy.model import Category
-from appliance.ros.errors import PeerError
-from appliance.ros.xmlrpc import Limits, Value, parse_call
 from appliance.rpc.method_name import method_named
 from appliance.rpc.server import Peer
+from roswire.errors import PeerError
+from roswire.xmlrpc import Limits, Value, parse_call
 
 _CALLS: Mapping[str, Call[Any]] = {**NODE_CALLS, **MASTER_CALLS}
 _LIMITS = Limits(body=8192, elements=256, depth=16, string=4096, parts=64)

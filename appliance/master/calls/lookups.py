@@ -11,8 +11,8 @@ from appliance.master.graph.registry import Kind, Registry
 from appliance.master.reach.places import Addresses
 from appliance.master.reach.relays import RelayControl
 from appliance.master.upkeep.enactor import Enactor
-from appliance.ros.uris import node_uri, service_uri
-from appliance.ros.xmlrpc import Value
+from roswire.uris import node_uri, service_uri
+from roswire.xmlrpc import Value
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,9 @@ from appliance.channel.admin import MonitorSwitch
 from appliance.master.caller import Answer, Caller
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.reach.relays import RelayControl
-from appliance.ros.xmlrpc import Value
 from appliance.specifications.files import SpecificationsRefusedError
 from appliance.specifications.monitors import Monitors, UnknownMonitorError
+from roswire.xmlrpc import Value
 
 _WORDS = {"enable": True, "disable": False}
 _NOBODY = (0, 0)

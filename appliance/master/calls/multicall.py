@@ -19,8 +19,8 @@ from appliance.master.calls.execution import Execution, Visit
 from appliance.master.calls.parameters import ParameterCalls
 from appliance.master.calls.turns import touch
 from appliance.policy.model import Category
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import weigh
+from roswire.xmlrpc import Value
 
 MULTICALL = "system.multicall"
 PARSE_FAULT, LIMIT_FAULT = -32700, -32600

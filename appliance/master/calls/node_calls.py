@@ -23,11 +23,11 @@ from appliance.master.reach.relays import RelayControl, tcpros_port
 from appliance.master.reach.traffic import Traffic
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.liveness import Liveness
-from appliance.ros.uris import node_uri
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import NoAnswerError
 from appliance.specifications.allocation import TOPIC as TOPIC_CONNECTION
+from roswire.uris import node_uri
+from roswire.xmlrpc import Value
 
 _NOTHING = Traffic()
 

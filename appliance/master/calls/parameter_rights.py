@@ -11,8 +11,8 @@ from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Address, Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide_right, right_to_find, right_to_read
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.server import Peer
+from roswire.xmlrpc import Value
 
 
 @dataclass(frozen=True, slots=True)

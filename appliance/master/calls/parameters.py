@@ -24,12 +24,12 @@ from appliance.master.parameter_mirror import ParameterMirror, Reserved
 from appliance.master.rosmaster import RosMaster, Wanted
 from appliance.master.upkeep.enactor import Enactor
 from appliance.policy.model import Address, Decision
-from appliance.ros.errors import EncodingError, ProtocolError
-from appliance.ros.names import resolve_parameter
-from appliance.ros.parameter_tree import names_in, standing_at
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import weigh
 from appliance.rpc.client import CallFailedError
+from roswire.errors import EncodingError, ProtocolError
+from roswire.names import resolve_parameter
+from roswire.parameter_tree import names_in, standing_at
+from roswire.xmlrpc import Value
 
 _NAMES_AT_ONCE = 500  # some milliseconds
 _TOGETHER_BYTES = 256 << 10  # of values that go to ROSMaster in one request

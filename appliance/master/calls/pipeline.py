@@ -17,13 +17,13 @@ from appliance.master.calls.repetition import Repetitions
 from appliance.master.graph.registry import Incarnation
 from appliance.master.reach.places import Addresses
 from appliance.policy.model import Category
-from appliance.ros.errors import EncodingError, LimitExceededError, PeerError
-from appliance.ros.xmlrpc import Limits, MethodCall, Value, build_fault, build_response, parse_call
 from appliance.rpc.bulk import Bulk, weigh
 from appliance.rpc.method_name import method_named
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest
 from appliance.rpc.turns import Turns
+from roswire.errors import EncodingError, LimitExceededError, PeerError
+from roswire.xmlrpc import Limits, MethodCall, Value, build_fault, build_response, parse_call
 
 _log = structlog.get_logger()
 _INTERNAL_FAULT = -32603

@@ -30,10 +30,10 @@ from appliance.master.reach.places import Addresses
 from appliance.master.rosmaster import RosMaster
 from appliance.policy.model import Decision
 from appliance.policy.policy import Policy
-from appliance.ros.errors import PeerError
-from appliance.ros.parameter_tree import standing_at
-from appliance.ros.xmlrpc import MethodCall, Value
 from appliance.rpc.server import HttpRequest, Peer
+from roswire.errors import PeerError
+from roswire.parameter_tree import standing_at
+from roswire.xmlrpc import MethodCall, Value
 
 _LARGEST_QUESTION, _LARGEST_ANSWER = 8 << 10, 256 << 10  # bytes of each that are remembered
 _MOST_QUESTIONS, _MOST_BYTES = 4096, 16 << 20

@@ -33,10 +33,10 @@ from appliance.master.graph.registry import Incarnation, Kind, Life, Registratio
 from appliance.policy.limits import Part
 from appliance.policy.model import Address, Decision, address_of
 from appliance.policy.policy import Policy
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.bulk import weigh
 from appliance.specifications.allocation import SERVICE, TOPIC
 from appliance.store.state import PermissionRow
+from roswire.xmlrpc import Value
 
 _CARRIED = (Kind.PUBLICATION, Kind.SERVICE)
 

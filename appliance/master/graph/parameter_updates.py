@@ -11,7 +11,7 @@ a key that is not the decided one or below it, whatever the names in a value loo
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-from appliance.ros.xmlrpc import Value
+from roswire.xmlrpc import Value
 
 
 class Update(NamedTuple):

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 
 from appliance.channel import own_node
 from appliance.policy.model import Address
-from appliance.ros.uris import NodeUri, node_uri
+from roswire.uris import NodeUri, node_uri
 
 ANY_TYPE = "*"
 """The type of a topic for who takes any."""

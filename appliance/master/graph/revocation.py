@@ -15,9 +15,9 @@ from appliance.master.graph.registry import Incarnation, Kind, Life, Registratio
 from appliance.policy.live import Live, live_by, may_keep
 from appliance.policy.model import Address, Decision, address_of
 from appliance.policy.policy import Policy
-from appliance.ros.parameter_tree import Tree
 from appliance.specifications.allocation import TOPIC
 from appliance.store.state import PermissionRow
+from roswire.parameter_tree import Tree
 
 CALLS = {
     Kind.PUBLICATION: ("registerPublisher", "unregisterPublisher"),

@@ -17,11 +17,11 @@ from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
 from appliance.master.reach.node_api import NodeApi
 from appliance.policy.model import Address
-from appliance.ros.xmlrpc import FaultReceived
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.turns import Turns
 from appliance.shares.pool import Bounds, Pool, Standing
 from appliance.shares.table import NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS
+from roswire.xmlrpc import FaultReceived
 
 _log = structlog.get_logger()
 MASTER_NAME = "/master"

@@ -15,13 +15,13 @@ from dataclasses import dataclass, field
 from appliance.master.graph.registry import PUBLISHER_PATH, Durable, Incarnation, Registry, SaveNode
 from appliance.master.reach.places import NoPortError, Places
 from appliance.policy.model import Address
-from appliance.ros.uris import node_uri
-from appliance.ros.xmlrpc import build_fault, build_response
 from appliance.rpc.front import HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest, HttpServer, Peer, Refusal
 from appliance.rpc.turns import Turns
 from appliance.rpc.visitors import Visitors
+from roswire.uris import node_uri
+from roswire.xmlrpc import build_fault, build_response
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,9 @@ what a node may ask for: thousands of nodes may answer at once, and each may hav
 """
 
 from appliance.master.graph.registry import Incarnation, Life, Registry
-from appliance.ros.uris import node_uri
-from appliance.ros.xmlrpc import Limits, Value
 from appliance.rpc.client import RefusedError, XmlRpcClient
+from roswire.uris import node_uri
+from roswire.xmlrpc import Limits, Value
 
 ANSWER = Limits(body=16 << 10, elements=256, depth=4, string=16 << 10, parts=0)
 

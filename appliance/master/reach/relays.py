@@ -25,11 +25,11 @@ from appliance.master.reach.traffic import Carried
 from appliance.policy.limits import Part, Rate
 from appliance.policy.model import Address, address_of
 from appliance.policy.policy import Policy
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Resource
 from appliance.specifications.monitors import Monitors
 from appliance.store.state import PermissionRow
+from roswire.xmlrpc import Value
 
 
 class RelayPost(Link):

@@ -49,9 +49,9 @@ from appliance.master.reach.places import Places
 from appliance.master.reach.relays import RelayControl
 from appliance.master.upkeep.entries import Entries
 from appliance.policy.model import address_of
-from appliance.ros.uris import parse_node_uri
 from appliance.rpc.client import CallFailedError
 from appliance.store.state import IncarnationRow, RegistrationRow, StateStore
+from roswire.uris import parse_node_uri
 
 _log = structlog.get_logger()
 

@@ -9,9 +9,9 @@ from appliance.master.caller import Answer
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration
 from appliance.master.graph.revocation import CALLS
 from appliance.master.rosmaster import RosMaster, together
-from appliance.ros.uris import service_uri
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.client import CallFailedError
+from roswire.uris import service_uri
+from roswire.xmlrpc import Value
 
 NAME = "/master"
 NO_SERVICE = "rosrpc://nobody:1"

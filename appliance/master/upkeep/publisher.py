@@ -17,9 +17,9 @@ from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, R
 from appliance.master.reach.places import NoPortError
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import Entries
-from appliance.ros.uris import node_uri, parse_node_uri, parse_service_uri, service_uri
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import Peer
+from roswire.uris import node_uri, parse_node_uri, parse_service_uri, service_uri
 
 _log = structlog.get_logger()
 _LOOPBACK = "127.0.0.1"

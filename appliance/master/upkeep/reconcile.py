@@ -28,8 +28,8 @@ from appliance.master.reach.faces import Faces
 from appliance.master.rosmaster import RosMaster, together
 from appliance.master.upkeep.enactor import Enactor
 from appliance.master.upkeep.entries import NAME, NO_SERVICE, Entries, stand_in
-from appliance.ros.parameter_tree import Tree, standing_at
 from appliance.rpc.client import CallFailedError
+from roswire.parameter_tree import Tree, standing_at
 
 _log = structlog.get_logger()
 _RETRY_SECONDS = 0.1

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from appliance.channel.messages.relay import NO_GRANT
 from appliance.relay.connections.headers import switched_on, too_long
 from appliance.relay.grants import StatedTable
-from appliance.ros.errors import InvalidNameError
-from appliance.ros.names import check_tool_id
+from roswire.errors import InvalidNameError
+from roswire.names import check_tool_id
 
 _REQUIRED = {"topic": ("md5sum", "callerid"), "service": ("md5sum", "callerid")}
 

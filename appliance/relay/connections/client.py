@@ -25,8 +25,8 @@ from appliance.relay.grants import Service
 from appliance.relay.loop import Timer
 from appliance.relay.monitors.middle import Judged
 from appliance.relay.monitors.places import Place
-from appliance.ros.errors import PeerError
-from appliance.ros.tcpros import HeaderParser, encode_header
+from roswire.errors import PeerError
+from roswire.tcpros import HeaderParser, encode_header
 
 _PATIENT = 1 << 20  # so much may wait for ever, as long as its host has memory
 

@@ -15,8 +15,8 @@ from collections import deque
 from collections.abc import Callable
 
 from appliance.relay.monitors.middle import Judged
-from appliance.ros.errors import ProtocolError
-from appliance.ros.tcpros import (
+from roswire.errors import ProtocolError
+from roswire.tcpros import (
     FrameParser,
     ServiceReply,
     ServiceReplyParser,

@@ -22,7 +22,7 @@ from math import ceil, gcd
 from typing import Literal
 
 from appliance.relay.connections.memory import HostShare
-from appliance.ros.errors import LimitExceededError
+from roswire.errors import LimitExceededError
 
 SMALL = 4 << 10
 """Bytes of what is unfinished on a connection that are never refused."""

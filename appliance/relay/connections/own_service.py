@@ -15,7 +15,7 @@ from typing import Final
 
 from appliance.channel.messages import Message, OwnServiceAnswered, OwnServiceCalled
 from appliance.relay.loop import Loop
-from appliance.ros.tcpros import HeaderParser, encode_header, encode_service_reply
+from roswire.tcpros import HeaderParser, encode_header, encode_service_reply
 
 HEADER: Final = {
     "type": "std_srvs/Trigger",

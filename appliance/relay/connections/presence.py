@@ -13,7 +13,7 @@ from functools import partial
 from appliance.relay.connections.sockets import Stream, begin_connect
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import Timer
-from appliance.ros.tcpros import encode_header
+from roswire.tcpros import encode_header
 
 _GOAL = "ActionGoal"
 _CANCEL = "actionlib_msgs/GoalID"

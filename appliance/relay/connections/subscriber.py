@@ -16,7 +16,7 @@ from appliance.relay.connections.outbox import Outbox
 from appliance.relay.connections.topic import RelayedTopic
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import READ, WRITE
-from appliance.ros.tcpros import encode_header
+from roswire.tcpros import encode_header
 
 _ANY = "*"
 

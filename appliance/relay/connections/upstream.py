@@ -21,8 +21,8 @@ from appliance.relay.connections.sockets import Stream, begin_connect
 from appliance.relay.connections.topic import RelayedTopic
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import READ, Timer
-from appliance.ros.errors import LimitExceededError, PeerError
-from appliance.ros.tcpros import HeaderParser, encode_header
+from roswire.errors import LimitExceededError, PeerError
+from roswire.tcpros import HeaderParser, encode_header
 
 _CALLER_ID = "/rosrv"
 _REASON = 1000  # characters that are reported; an error in a header is as long as the publisher likes

@@ -15,8 +15,8 @@ from appliance.relay.connections.anteroom import Anteroom
 from appliance.relay.connections.sockets import Stream
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import Loop
-from appliance.ros.errors import PeerError
-from appliance.ros.tcpros import HeaderParser, encode_header
+from roswire.errors import PeerError
+from roswire.tcpros import HeaderParser, encode_header
 
 
 class Visitor:

@@ -19,10 +19,10 @@ from appliance.channel.messages import StateGiven
 from appliance.relay.monitors.state_memory import Memory, StateMemory, read
 
 if TYPE_CHECKING:
-    from appliance.rosmop.engine import MonitorSet
-    from appliance.rosmop.kept_slices import SliceParts
-    from appliance.rosmop.monitor import Group
-    from appliance.rosmop.remembered import KeptGroup
+    from rosmop.run.engine import MonitorSet
+    from rosmop.run.monitor import Group
+    from rosmop.run.state import KeptGroup
+    from rosmop.run.state_of_slices import SliceParts
 
 _UNREADABLE = "the memory of its state cannot be read"
 _NO_ROOM = "the states of all monitors together are more than is kept"

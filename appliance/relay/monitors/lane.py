@@ -24,12 +24,12 @@ from appliance.relay.monitors.pace import Pace
 from appliance.relay.monitors.passage import Passage
 from appliance.relay.monitors.places import HEAD, Place, Senders, Sighting
 from appliance.relay.monitors.trials import Trials
-from appliance.rosmop.outcomes import Outcome
-from appliance.rosmop.runtime.context import Published
+from rosmop.run.outcomes import Outcome
+from rosmop.runtime.context import Published
 
 if TYPE_CHECKING:
-    from appliance.rosmop.engine import MonitorSet
-    from appliance.rosmop.walks import Prepared, Walked, Walker
+    from rosmop.fast.wasm_runner import Prepared, Walked, Walker
+    from rosmop.run.engine import MonitorSet
 
 _unpack_length = struct.Struct("<I").unpack_from
 _NEVER = 1 << 63

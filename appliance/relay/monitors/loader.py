@@ -15,7 +15,7 @@ from appliance.channel.messages import SpecificationsStated
 from appliance.relay.loop import READ, Loop
 
 if TYPE_CHECKING:
-    from appliance.rosmop.engine import MonitorSet
+    from rosmop.run.engine import MonitorSet
 
 _SWITCH_SECONDS = 0.0005  # the loop waits so long at most for the thread that loads
 

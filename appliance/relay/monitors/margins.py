@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from appliance.channel.messages import Approach, MarginRow
 
 if TYPE_CHECKING:
-    from appliance.rosmop.engine import Margin, MonitorSet
+    from rosmop.run.engine import Margin, MonitorSet
 
 _DAY = 86_400 * 1_000_000_000
 

@@ -38,15 +38,15 @@ from appliance.relay.monitors.pace import Pace
 from appliance.relay.monitors.places import NOWHERE, Place, Senders
 from appliance.relay.monitors.trials import Trials
 from appliance.relay.report import Reporter
-from appliance.rosmop.happened import Sender
-from appliance.rosmop.runtime.context import Published
-from appliance.rosmop.sharing import way_of
+from rosmop.form.connected_groups import way_of
+from rosmop.run.causes import Sender
+from rosmop.runtime.context import Published
 
 if TYPE_CHECKING:
-    from appliance.rosmop.engine import MonitorSet
-    from appliance.rosmop.monitor import Monitor
-    from appliance.rosmop.outcomes import Outcome
-    from appliance.rosmop.walks import Prepared, Walker
+    from rosmop.fast.wasm_runner import Prepared, Walker
+    from rosmop.run.engine import MonitorSet
+    from rosmop.run.monitor import Monitor
+    from rosmop.run.outcomes import Outcome
 
 _AFTER_DEFECT = 1.0
 _UNHURRIED = Pace()

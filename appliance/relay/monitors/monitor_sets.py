@@ -7,13 +7,13 @@ import msgspec
 
 from appliance.channel.messages import SpecificationsStated
 from appliance.relay.monitors.loader import Result
-from appliance.ros.definitions import Definitions
-from appliance.rosmop.compiled import Compiled, Part
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.ir.abi import FeedModule
-from appliance.rosmop.machine import load
-from appliance.rosmop.sent import decoded_part
-from appliance.rosmop.types.messages import Messages
+from rosmop.fast.abi import FeedModule
+from rosmop.fast.serialization import decoded_part
+from rosmop.fast.wasm_instance import load
+from rosmop.form.compiled import Compiled, Part
+from rosmop.run.engine import MonitorSet
+from rosmop.types.messages import Messages
+from roswire.definitions import Definitions
 
 _TICKS_SECONDS = 0.2  # of processor time that ticks and deadlines may take in one go
 _TRIAL_TICKS_SECONDS = 0.02

@@ -16,12 +16,12 @@ from appliance.relay.counts import Counts
 from appliance.relay.monitors.margins import Margins
 from appliance.relay.monitors.observations import SHOWN, Observations
 from appliance.relay.monitors.places import NOWHERE, Place, Senders, Sighting
-from appliance.rosmop.explanations import of_change, of_drop, of_fault, of_published, of_verdict
-from appliance.rosmop.outcomes import Outcome, Verdict, named
-from appliance.rosmop.runtime.context import LogLine, Published
+from rosmop.run.explanations import of_change, of_drop, of_fault, of_published, of_verdict
+from rosmop.run.outcomes import Outcome, Verdict, named
+from rosmop.runtime.context import LogLine, Published
 
 if TYPE_CHECKING:
-    from appliance.rosmop.monitor import Monitor
+    from rosmop.run.monitor import Monitor
 
 _EXPLAINED = 10
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.topic import RelayedTopic
-from appliance.ros.tcpros import encode_frame
+from roswire.tcpros import encode_frame
 
 
 class OwnPublisher:

@@ -4,7 +4,7 @@ A message that takes all of the budget is cut off, and whoever sends one may sen
 next ones have a tenth. Messages that are cut off within that second do not prolong it.
 """
 
-from appliance.rosmop.runtime.context import FUEL_PER_SECOND
+from rosmop.runtime.context import FUEL_PER_SECOND
 
 _SECOND = 1_000_000_000
 _AGAIN = 0.1

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from appliance.relay.monitors.passage import Passage
-from appliance.rosmop.happened import SEQ, Sender
+from rosmop.run.causes import SEQ, Sender
 
 HEAD = 12
 """Bytes of `std_msgs/Header` that are told: seq and stamp."""

@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, NamedTuple
 from appliance.relay.loop import Loop, Timer
 from appliance.relay.monitors.observer import Observer
 from appliance.relay.monitors.places import NOWHERE, Place, Sighting
-from appliance.rosmop.happened import Sender
-from appliance.rosmop.outcomes import Outcome
-from appliance.rosmop.runtime.context import TRIAL_BUDGET
+from rosmop.run.causes import Sender
+from rosmop.run.outcomes import Outcome
+from rosmop.runtime.context import TRIAL_BUDGET
 
 if TYPE_CHECKING:
-    from appliance.rosmop.engine import MonitorSet, Tapped
+    from rosmop.run.engine import MonitorSet, Tapped
 
 SHARE = 0.2
 """Seconds of processor time in a second."""

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from appliance.network.scan import scan
-from appliance.ros.tcpros import HeaderParser
+from roswire.tcpros import HeaderParser
 from tests.support.field import Field, Impostor, answering, response
 from tests.support.processes import LIMIT
 

@@ -13,9 +13,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.ros.tcpros import encode_header
-from appliance.ros.xmlrpc import FaultReceived
 from examples.landshark.lab import Host, Lab
+from roswire.tcpros import encode_header
+from roswire.xmlrpc import FaultReceived
 from tests.support.field import Impostor, answering
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs

@@ -6,7 +6,7 @@ from functools import partial
 import pytest
 
 from appliance.channel.messages import ClientRevoked, ConnectionClosed, ConnectionOpened, ConnectionRefused
-from appliance.ros.tcpros import HeaderParser, encode_header
+from roswire.tcpros import HeaderParser, encode_header
 from tests.support.nodes import Client, RosSession
 from tests.support.relay_driver import LOOPBACK, Face, RelayDriver
 from tests.support.waiting import eventually

@@ -19,7 +19,7 @@ from appliance.channel.messages import (
     TrafficReported,
     UpstreamLost,
 )
-from appliance.ros.tcpros import HeaderParser, encode_header
+from roswire.tcpros import HeaderParser, encode_header
 from tests.support.nodes import Client, RosSession
 from tests.support.relay_driver import LOOPBACK, Face, RelayDriver
 from tests.support.waiting import eventually

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from appliance.ros.definitions import Definitions
-from appliance.ros.layout import StringPart
-from appliance.ros.standard import standard_definitions
-from appliance.ros.tcpros import FrameParser, HeaderParser, ServiceReplyParser, encode_frame, encode_header
-from appliance.ros.uris import parse_node_uri, parse_service_uri
-from appliance.ros.xmlrpc import MethodCall, build_call, build_response, parse_call, parse_response
+from roswire.definitions import Definitions
+from roswire.layout import StringPart
+from roswire.standard import standard_definitions
+from roswire.tcpros import FrameParser, HeaderParser, ServiceReplyParser, encode_frame, encode_header
+from roswire.uris import parse_node_uri, parse_service_uri
+from roswire.xmlrpc import MethodCall, build_call, build_response, parse_call, parse_response
 from tests.support.nodes import Client, RosSession, has_ros
 from tests.support.processes import LIMIT
 from tests.support.requirements import needs

@@ -36,7 +36,7 @@ def main(*_given: Any) -> None:
 
 def run_modules(*_given: Any) -> None:
     """The entry of a relay's stand-in: run modules, the second when the first has long been at work, and tell of it."""
-    from appliance.rosmop.machine import Machine, MachineTrap, translated  # noqa: PLC0415  within the walls, as a relay loads it
+    from rosmop.fast.wasm_instance import Machine, MachineTrap, translated  # noqa: PLC0415  within the walls, as a relay loads it
 
     told: dict[str, Any] = {"before": len(_executable()), "results": [], "traps": []}
     machines = []

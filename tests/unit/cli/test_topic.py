@@ -4,8 +4,8 @@ import pytest
 import typer
 
 from appliance.cli.topic import part_of
-from appliance.ros.definitions import Definitions
-from appliance.ros.message_view import CUT, read_fields
+from roswire.definitions import Definitions
+from roswire.message_view import CUT, read_fields
 
 DEFINITIONS = Definitions.from_files(
     {"a/Scan.msg": "float32[] ranges\nuint8[] data\nPose pose\nuint8 last\n", "a/Pose.msg": "float32 x\n"}

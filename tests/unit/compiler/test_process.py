@@ -16,8 +16,8 @@ import pytest
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.compiler import process
-from appliance.rosmop.sent import decoded_part
 from appliance.specifications.files import Sources, SpecificationsRefusedError, check, checked
+from rosmop.fast.serialization import decoded_part
 from tests.support.waiting import eventually
 
 GOOD = """a() {

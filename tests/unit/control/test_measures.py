@@ -10,7 +10,7 @@ from appliance.control.measures import by_resource, carried_of, from_zero
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.reach import traffic
 from appliance.master.reach.traffic import MOST_RESOURCES, OTHERS, Carried
-from appliance.ros.uris import parse_node_uri
+from roswire.uris import parse_node_uri
 
 
 def test_sums_by_name() -> None:

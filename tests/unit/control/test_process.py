@@ -14,8 +14,8 @@ from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
 from appliance.master.reach.faces import Faces
 from appliance.master.reach.places import Places
 from appliance.master.upkeep.enactor import Enactor, write
-from appliance.ros.uris import parse_node_uri
 from appliance.store.state import StateStore
+from roswire.uris import parse_node_uri
 from tests.support.idle import idle, idle_class
 
 pytestmark = pytest.mark.anyio

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from appliance.master.rosmaster import BatchingClient
-from appliance.ros.errors import EncodingError
 from appliance.rpc.client import BrokenOffError, CallFailedError
+from roswire.errors import EncodingError
 
 
 class Server:

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from appliance.master.graph.registry import Incarnation, Kind, new_key
 from appliance.policy.compiler import compile_policy
 from appliance.policy.live import Live, endings
-from appliance.ros.uris import parse_node_uri
 from appliance.store.state import PermissionRow
+from roswire.uris import parse_node_uri
 from tests.support.control_parts import ControlParts
 from tests.support.examples import examples
 from tests.support.parameters import mirror

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from appliance.master.parameter_charges import APPLIANCE, LimitReachedError, measure, member_weight
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.model import Address
-from appliance.ros.parameter_tree import parts_of
-from appliance.ros.xmlrpc import Value
 from appliance.shares.pool import Bounds, Standing
+from roswire.parameter_tree import parts_of
+from roswire.xmlrpc import Value
 from tests.support.examples import examples
 from tests.support.parameters import Owners, mirror, put
 

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from appliance.master.graph.registry import Kind
-from appliance.ros.xmlrpc import Value
+from roswire.xmlrpc import Value
 from tests.support.control_parts import HOST, OPEN, ControlParts
 from tests.support.parameters import put
 

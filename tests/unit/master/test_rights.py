@@ -43,10 +43,10 @@ from appliance.policy.live import Live, may_keep
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import needs_node, rights_of
-from appliance.ros.parameter_tree import Tree
-from appliance.ros.uris import parse_node_uri
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.server import Peer
+from roswire.parameter_tree import Tree
+from roswire.uris import parse_node_uri
+from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts
 from tests.support.examples import examples
 

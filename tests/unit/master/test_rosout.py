@@ -5,8 +5,8 @@ import pytest
 
 from appliance.channel.messages import MonitorEvent, OwnPublished
 from appliance.master.rosout import Rosout, header
-from appliance.ros.message_view import read_fields
-from appliance.ros.standard import standard_definitions
+from roswire.message_view import read_fields
+from roswire.standard import standard_definitions
 
 DEFINITIONS = standard_definitions()
 LINE = MonitorEvent("log", "gate", "key", "/chatter", 1_700_000_000_250_000_000, "ünsafe", {"level": "WARN"})

@@ -12,8 +12,8 @@ from appliance.policy.judgement import Known
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, rights_of, rights_of_call
-from appliance.ros.parameter_tree import Tree
-from appliance.ros.xmlrpc import Value
+from roswire.parameter_tree import Tree
+from roswire.xmlrpc import Value
 
 POLICIES = sorted((Path(__file__).parents[3] / "policies").glob("*.ini"))
 ROBOT = ipaddress.ip_network("10.84.0.2/32")

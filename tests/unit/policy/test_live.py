@@ -6,7 +6,7 @@ import pytest
 
 from appliance.policy.compiler import compile_policy
 from appliance.policy.live import Live, endings, live_by, may_keep
-from appliance.ros.parameter_tree import Tree
+from roswire.parameter_tree import Tree
 
 HOST = ipaddress.ip_address("10.0.0.5")
 POLICY = compile_policy(

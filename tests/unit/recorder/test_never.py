@@ -4,8 +4,8 @@ import pytest
 
 from appliance.config import RecorderRules
 from appliance.recorder.never import NAMED, known_sums, left_out_because
-from appliance.ros.definitions import Definitions
-from appliance.ros.standard import standard_definitions
+from roswire.definitions import Definitions
+from roswire.standard import standard_definitions
 
 IMAGE = "sensor_msgs/Image"
 STRING_SUM = standard_definitions().md5sum("std_msgs/String")

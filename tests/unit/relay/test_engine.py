@@ -43,7 +43,7 @@ from appliance.channel.messages import (
 from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.upstream import Publisher
 from appliance.relay.limits import MIB
-from appliance.ros.tcpros import (
+from roswire.tcpros import (
     encode_frame,
     encode_header,
     encode_service_reply,

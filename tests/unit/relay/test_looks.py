@@ -7,7 +7,7 @@ import pytest
 
 from appliance.channel.messages import LookEnded, LookWanted, MessageSeen
 from appliance.relay.looks import MOST_LOOKS, MOST_MESSAGES
-from appliance.ros.tcpros import encode_frame, encode_header
+from roswire.tcpros import encode_frame, encode_header
 from tests.unit.relay.world import ASK, HEADER, Peer, World
 
 TOLD = HEADER | {"message_definition": "string data\n"}

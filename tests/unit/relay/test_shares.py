@@ -18,7 +18,7 @@ from appliance.channel.messages import (
     UpstreamWanted,
 )
 from appliance.relay.limits import MIB
-from appliance.ros.tcpros import encode_frame, encode_header
+from roswire.tcpros import encode_frame, encode_header
 from tests.unit.relay.world import ASK, CALL, HEADER, LIMITS, LOOPBACK, Peer, World
 
 SMALL_RELAY = replace(

@@ -26,7 +26,7 @@ from appliance.relay.connections.links import Link
 from appliance.relay.engine import Engine
 from appliance.relay.limits import MIB, Limits
 from appliance.relay.loop import Loop
-from appliance.ros.tcpros import HeaderParser, encode_header
+from roswire.tcpros import HeaderParser, encode_header
 
 LOOPBACK = "127.0.0.1"
 LIMITS = replace(

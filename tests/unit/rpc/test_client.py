@@ -9,9 +9,9 @@ from typing import Any, cast
 import pytest
 
 from appliance.master.reach.node_api import ANSWER, NodeApi
-from appliance.ros.uris import NodeUri
-from appliance.ros.xmlrpc import build_response
 from appliance.rpc.client import CallFailedError, UnansweredError, XmlRpcClient
+from roswire.uris import NodeUri
+from roswire.xmlrpc import build_response
 
 
 def test_a_kept_connection_that_does_not_answer_is_given_up_in_time() -> None:

@@ -13,7 +13,6 @@ import pytest
 import uvloop
 
 from appliance.policy.model import Address
-from appliance.ros.xmlrpc import FaultReceived, parse_response
 from appliance.rpc.front import HttpLimits, plain_address
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import (
@@ -36,6 +35,7 @@ from appliance.shares.table import (
     RVMASTER_FAREWELLS,
     RVMASTER_REQUESTS,
 )
+from roswire.xmlrpc import FaultReceived, parse_response
 
 LIMITS = HttpLimits()
 WAIT = 20.0

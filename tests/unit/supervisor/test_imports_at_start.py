@@ -8,7 +8,7 @@ import pytest
 
 from appliance.supervisor.roles import ROLES
 
-NEVER: Final = {"rich", "pygments", "typer", "lark", "numpy", "pyroute2", "z3", "appliance.rosmop.engine"}
+NEVER: Final = {"rich", "pygments", "typer", "lark", "numpy", "pyroute2", "z3", "rosmop.run.engine"}
 """What is not needed until somebody asks for help, loads specifications or builds a namespace."""
 
 ENTRIES: Final = {role.name: role.entry.partition(":")[0] for role in ROLES if role.entry is not None}
@@ -17,8 +17,8 @@ _LINKED = _BARE | {"appliance.channel.admin"}
 ALSO: Final = {
     "signer": _LINKED | {"appliance.config"}, "control": _BARE,
     "relay": _LINKED | {
-        "cryptography", "appliance.config", "appliance.ros.definitions", "appliance.rosmop.logics.formula",
-        "appliance.rosmop.why",
+        "cryptography", "appliance.config", "roswire.definitions", "rosmop.logics.formula",
+        "rosmop.run.explain",
     },
     "charon": _LINKED, "compiler": _LINKED, "syslog": _LINKED, "recorder": {"pydantic", "appliance.channel.admin"},
     "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette", "yaml", "appliance.policy.policy"},

@@ -9,8 +9,8 @@ from rosbags.rosbag1 import Reader, Writer
 from typer.testing import CliRunner, Result
 
 from appliance.cli.main import app
-from appliance.ros.standard import standard_definitions
-from tests.unit.rosmop.acting import message
+from rosmop.tests.acting import message
+from roswire.standard import standard_definitions
 
 GOOD = """counter() {
     int n;

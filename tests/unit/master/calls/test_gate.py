@@ -14,9 +14,9 @@ from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, R
 from appliance.master.upkeep.liveness import Presence, Probe
 from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Decision
-from appliance.ros.parameter_tree import Tree
-from appliance.ros.uris import parse_node_uri, parse_service_uri
 from appliance.rpc.server import Peer
+from roswire.parameter_tree import Tree
+from roswire.uris import parse_node_uri, parse_service_uri
 
 ADMIN, OPERATOR = "10.0.0.9", "10.0.0.5"
 BASE = """

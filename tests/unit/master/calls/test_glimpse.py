@@ -6,8 +6,8 @@ import pytest
 
 from appliance.master.calls.glimpse import asked_for
 from appliance.policy.model import Category
-from appliance.ros.xmlrpc import Value, build_call
 from appliance.rpc.server import Peer
+from roswire.xmlrpc import Value, build_call
 
 PEER = Peer(ipaddress.ip_address("10.0.0.9"), "10.0.0.9", "10.0.0.1")
 

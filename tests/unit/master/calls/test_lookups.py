@@ -10,7 +10,7 @@ from appliance.master.caller import Caller
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.graph import registry
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.ros.uris import parse_node_uri
+from roswire.uris import parse_node_uri
 
 HOST = ipaddress.ip_address("10.0.0.5")
 CALLER = cast(Caller, SimpleNamespace(caller_id="/client", peer=SimpleNamespace(host=HOST)))

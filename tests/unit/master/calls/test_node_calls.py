@@ -13,7 +13,7 @@ from appliance.master.caller import Caller
 from appliance.master.calls.node_calls import NodeCalls
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.traffic import Carried
-from appliance.ros.uris import parse_node_uri
+from roswire.uris import parse_node_uri
 from tests.support.idle import idle
 
 pytestmark = pytest.mark.anyio

@@ -11,8 +11,8 @@ from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.calls.parameters import ParameterSearch
 from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Decision
-from appliance.ros.parameter_tree import standing_at
 from appliance.rpc.server import Peer
+from roswire.parameter_tree import standing_at
 from tests.support.parameters import mirror
 
 HOST = "10.0.0.5"

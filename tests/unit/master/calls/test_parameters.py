@@ -16,9 +16,9 @@ from appliance.master.caller import Caller
 from appliance.master.calls.parameters import ParameterCalls, Write
 from appliance.master.parameter_charges import LimitReachedError, measure
 from appliance.master.parameter_mirror import ParameterMirror
-from appliance.ros.errors import EncodingError, ProtocolError
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import Peer
+from roswire.errors import EncodingError, ProtocolError
 from tests.support.examples import examples
 from tests.support.nodes import PYTHON
 from tests.support.parameters import mirror, put

@@ -19,10 +19,10 @@ from appliance.master.upkeep.enactor import Enactor
 from appliance.metrics import Meter
 from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Decision
-from appliance.ros.uris import parse_node_uri
-from appliance.ros.xmlrpc import Value, build_call, parse_response
 from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import HttpRequest, Peer
+from roswire.uris import parse_node_uri
+from roswire.xmlrpc import Value, build_call, parse_response
 from tests.support.examples import examples
 from tests.support.idle import idle
 from tests.support.parameters import mirror, put

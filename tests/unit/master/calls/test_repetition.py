@@ -9,8 +9,8 @@ import pytest
 from appliance.master.calls.repetition import Repetitions
 from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registry import Kind
-from appliance.ros.xmlrpc import Value
 from appliance.rpc.server import HttpRequest
+from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, POLICY, ControlParts
 
 pytestmark = pytest.mark.anyio

@@ -5,8 +5,8 @@ from typing import Any, cast
 import pytest
 
 from appliance.master.graph.registry import Kind, Life
-from appliance.ros.xmlrpc import Value
 from appliance.store.state import PermissionRow
+from roswire.xmlrpc import Value
 from tests.support.control_parts import HOST, POLICY, ControlParts
 
 pytestmark = pytest.mark.anyio

@@ -12,8 +12,8 @@ from appliance.master.graph.own_node import ROSOUT
 from appliance.master.graph.registry import Kind, Registry
 from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Decision
-from appliance.ros.uris import parse_node_uri
 from appliance.rpc.server import Peer
+from roswire.uris import parse_node_uri
 
 URI = "http://127.0.0.1:4000/"
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Kind
-from appliance.ros.names import is_relative_member
-from appliance.ros.xmlrpc import Value
+from roswire.names import is_relative_member
+from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts
 from tests.support.examples import examples
 from tests.support.nodes import PYTHON

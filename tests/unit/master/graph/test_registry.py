@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
-from appliance.ros.uris import parse_node_uri
+from roswire.uris import parse_node_uri
 from tests.support.examples import examples
 
 HOSTS = [ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")]

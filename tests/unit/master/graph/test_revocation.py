@@ -5,8 +5,8 @@ import pytest
 from appliance.master.graph.registry import Kind, Life
 from appliance.master.graph.revocation import revoked
 from appliance.policy.compiler import compile_policy
-from appliance.ros.xmlrpc import Value
 from appliance.store.state import PermissionRow
+from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, POLICY, ControlParts
 
 pytestmark = pytest.mark.anyio

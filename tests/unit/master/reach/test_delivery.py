@@ -9,10 +9,10 @@ import pytest
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
 from appliance.master.reach.delivery import Delivery
-from appliance.ros.xmlrpc import FaultReceived, Value
 from appliance.rpc.client import CallFailedError
 from appliance.shares.pool import Bounds, Standing
 from appliance.shares.table import NODE_CALLS_UNDER_WAY
+from roswire.xmlrpc import FaultReceived, Value
 from tests.support.control_parts import ControlParts
 
 pytestmark = pytest.mark.anyio

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 from appliance.master.graph.registry import Incarnation
 from appliance.master.reach.faces import Faces
-from appliance.ros.uris import parse_node_uri
+from roswire.uris import parse_node_uri
 
 
 class Told:

@@ -7,8 +7,8 @@ import pytest
 
 from appliance.master.graph.registry import PUBLISHER_PATH, Kind
 from appliance.master.reach.faces import InnerFace
-from appliance.ros.xmlrpc import FaultReceived, Value, build_call, parse_response
 from appliance.rpc.server import HttpRequest, Peer
+from roswire.xmlrpc import FaultReceived, Value, build_call, parse_response
 from tests.support.control_parts import ControlParts
 
 MASTER = ipaddress.ip_address("127.0.0.1")

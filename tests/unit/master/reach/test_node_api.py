@@ -7,8 +7,8 @@ import pytest
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation, Kind, Life
 from appliance.master.reach.delivery import Delivery
-from appliance.ros.xmlrpc import Value
 from appliance.shares.pool import Standing
+from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts
 
 pytestmark = pytest.mark.anyio

@@ -13,8 +13,8 @@ from appliance.master.reach.places import NoPortError, Places
 from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Address
 from appliance.policy.policy import DEFAULT_PORTS
-from appliance.ros.uris import parse_node_uri
 from appliance.shares.table import NODE_PORTS
+from roswire.uris import parse_node_uri
 
 
 @pytest.fixture

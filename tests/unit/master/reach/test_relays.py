@@ -23,11 +23,11 @@ from appliance.master.upkeep.enactor import Enactor
 from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
-from appliance.ros.uris import parse_node_uri
 from appliance.shares.pool import Bounds
 from appliance.shares.table import GRANTS
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Plan
 from appliance.store.state import PermissionRow, StateStore
+from roswire.uris import parse_node_uri
 from tests.support.stated import stated
 
 pytestmark = pytest.mark.anyio

@@ -9,7 +9,7 @@ from appliance.audit.record import Severity
 from appliance.channel.messages import ConnectionRefused
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.reach.traffic import Carried
-from appliance.ros.uris import parse_node_uri
+from roswire.uris import parse_node_uri
 
 
 class Kept:

@@ -9,7 +9,7 @@ import pytest
 from appliance.master.graph.registry import Incarnation, Kind, Registry
 from appliance.master.upkeep import reminders
 from appliance.master.upkeep.reminders import Reminders
-from appliance.ros.uris import parse_node_uri
+from roswire.uris import parse_node_uri
 
 HOST = ipaddress.ip_address("10.0.0.5")
 

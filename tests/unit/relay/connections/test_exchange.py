@@ -5,8 +5,8 @@ import struct
 import pytest
 
 from appliance.relay.connections.exchange import ServiceExchange
-from appliance.ros.errors import LimitExceededError, ProtocolError
-from appliance.ros.tcpros import encode_frame, encode_service_error, encode_service_reply
+from roswire.errors import LimitExceededError, ProtocolError
+from roswire.tcpros import encode_frame, encode_service_error, encode_service_reply
 
 
 class Conversation:

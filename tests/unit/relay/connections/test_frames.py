@@ -17,7 +17,7 @@ from appliance.relay.connections.frames import (
     last_frame,
 )
 from appliance.relay.connections.memory import HostShare
-from appliance.ros.errors import LimitExceededError, PeerError
+from roswire.errors import LimitExceededError, PeerError
 from tests.support.examples import examples
 from tests.support.relay_memory import share
 

@@ -14,8 +14,8 @@ from appliance.channel.messages import (
     ServicePlaced,
 )
 from appliance.relay.connections.own_service import HEADER
-from appliance.ros.standard import standard_definitions
-from appliance.ros.tcpros import encode_frame, encode_header, encode_service_reply
+from roswire.standard import standard_definitions
+from roswire.tcpros import encode_frame, encode_header, encode_service_reply
 from tests.unit.relay.world import LOOPBACK, Peer, World
 
 OTHER = "127.0.0.9"

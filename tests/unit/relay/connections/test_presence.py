@@ -14,8 +14,8 @@ from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
 from appliance.relay.monitors.middle import Middle
 from appliance.relay.report import Reporter
-from appliance.ros.tcpros import HeaderParser
 from appliance.shares.pool import Standing
+from roswire.tcpros import HeaderParser
 
 TOPIC = "/fibonacci/goal"
 

@@ -19,12 +19,12 @@ from appliance.audit.why import lines_of
 from appliance.audit_trail import AuditTrail
 from appliance.channel.messages import MonitorEvent
 from appliance.relay.monitors.places import Place
-from appliance.rosmop.explanations import moment
 from appliance.specifications.records import MonitorRecords
+from rosmop.run.explanations import moment
+from rosmop.tests.acting import message
+from rosmop.tests.random_specifications import Traffic, definitions
 from tests.support.idle import idle_class
 from tests.unit.relay.monitors.test_passage import Monitored
-from tests.unit.rosmop.acting import message
-from tests.unit.rosmop.random_specifications import Traffic, definitions
 
 MS = 1_000_000
 START = time.time_ns() + 3_600_000 * MS

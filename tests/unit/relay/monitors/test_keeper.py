@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from appliance.channel.messages import StateGiven
 from appliance.relay.monitors.keeper import Keeper
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.outcomes import Outcome
-from appliance.rosmop.syntax.errors import SpecificationError
+from rosmop.run.engine import MonitorSet
+from rosmop.run.outcomes import Outcome
+from rosmop.tests.interpreted import check_same
+from rosmop.tests.random_specifications import Messages, Specifications, definitions
+from rosmop.text.errors import SpecificationError
+from roswire.standard import standard_definitions
 from tests.support.examples import examples
-from tests.unit.rosmop.interpreted import check_same
-from tests.unit.rosmop.random_specifications import Messages, Specifications, definitions
 
 FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck), deadline=None)
 SIZE = 1 << 20

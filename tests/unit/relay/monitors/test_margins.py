@@ -6,8 +6,8 @@ import pytest
 
 from appliance.channel.messages import Approach, MarginRow
 from appliance.relay.monitors.margins import Margins
-from appliance.ros.standard import standard_definitions
-from appliance.rosmop.engine import MonitorSet
+from rosmop.run.engine import MonitorSet
+from roswire.standard import standard_definitions
 from tests.unit.relay.monitors.test_middle import string
 from tests.unit.relay.monitors.test_trials import Trying
 

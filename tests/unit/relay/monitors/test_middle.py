@@ -27,7 +27,7 @@ from appliance.channel.messages import (
 from appliance.relay.connections.frames import Batch
 from appliance.relay.monitors.loader import Loader
 from appliance.relay.monitors.places import Place
-from appliance.ros.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
+from roswire.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
 from tests.support.stated import stated
 from tests.unit.relay.world import ASK, HEADER, LOOPBACK, Peer, World
 

@@ -9,9 +9,9 @@ import pytest
 from appliance.channel.messages import MonitorEvent, MonitorsCounted, MonitorsReported
 from appliance.relay.monitors import observations
 from appliance.relay.monitors.places import Place
+from rosmop.tests.acting import message
+from rosmop.tests.random_specifications import Traffic, definitions
 from tests.unit.relay.monitors.test_passage import Monitored
-from tests.unit.rosmop.acting import message
-from tests.unit.rosmop.random_specifications import Traffic, definitions
 
 COMMAND = "geometry_msgs/Twist"
 STOP = """stop() { std_msgs::String s; event drive(double v) /cmd geometry_msgs/Twist '{linear:{x:v}}' {

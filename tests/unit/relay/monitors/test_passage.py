@@ -18,22 +18,22 @@ from appliance.relay.monitors.lane import Lane
 from appliance.relay.monitors.middle import Middle
 from appliance.relay.monitors.places import Place
 from appliance.relay.report import Reporter
-from appliance.ros.definitions import Definitions
-from appliance.rosmop.engine import MonitorSet
-from appliance.rosmop.logics.interface import ClockedRun, FiniteRun
-from appliance.rosmop.runtime.context import Published
-from appliance.rosmop.syntax.errors import SpecificationError
-from appliance.rosmop.walks import Walked
-from tests.support.examples import examples
-from tests.support.relay_memory import share
-from tests.support.stated import stated
-from tests.unit.rosmop.acting import message
-from tests.unit.rosmop.random_specifications import (
+from rosmop.fast.wasm_runner import Walked
+from rosmop.logics.interface import ClockedRun, FiniteRun
+from rosmop.run.engine import MonitorSet
+from rosmop.runtime.context import Published
+from rosmop.tests.acting import message
+from rosmop.tests.random_specifications import (
     Messages,
     Specifications,
     Traffic,
     definitions,
 )
+from rosmop.text.errors import SpecificationError
+from roswire.definitions import Definitions
+from tests.support.examples import examples
+from tests.support.relay_memory import share
+from tests.support.stated import stated
 
 MONITORS = Path(__file__).parents[4] / "monitors"
 

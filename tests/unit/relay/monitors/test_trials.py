@@ -13,7 +13,7 @@ from appliance.channel.messages import (
     SpecificationsTaken,
 )
 from appliance.relay.monitors import trials
-from appliance.ros.tcpros import encode_frame, encode_header, encode_service_reply
+from roswire.tcpros import encode_frame, encode_header, encode_service_reply
 from tests.support.stated import stated
 from tests.unit.relay.monitors.test_middle import (
     GUARD,

@@ -1,0 +1,284 @@
+"""Whether an automaton gives, after every trace, the verdict that its formula's definition gives.
+
+The formula is followed event by event beside the automaton, from the start on: a pair is what the definition has left
+and the state that the automaton is in. There are finitely many pairs, and each is looked at, with every event: so what
+holds for all pairs holds after every trace. The automaton's own words for its states play no part, nor does how it was
+made or made smaller.
+
+What is not certified is said with the reason: bounds of time and grammars (their monitors are no automata), and what
+would take too long.
+"""
+
+import itertools
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+
+from rosmop.certify import patterns, text
+from rosmop.certify.future import Future, State, positive
+from rosmop.certify.guesses import Guesses
+from rosmop.certify.machines import Machine
+from rosmop.certify.past import Past
+from rosmop.certify.text import TooMuchError, UnreadError
+from rosmop.certify.words import Words
+
+MOST_STEPS = 200_000
+"""Events after pairs that may be looked at for one property."""
+MOST_WORK = 400_000
+"""Clauses, or parts of expressions, that may be made for one formula. Each of the two is some tenths of a second."""
+
+S = TypeVar("S", bound=Hashable)
+Verdicts = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What is certified: the automaton of a property, by event name; `verdicts` are told after a step into a state."""
+
+    initial: int
+    table: Sequence[Sequence[int]]
+    verdicts: Sequence[Verdicts]
+    timeouts: Sequence[tuple[int, int] | None] = ()
+    """For each state of a `tfsm`: after how many nanoseconds it is left, and for which state."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """`proved`: after every trace the verdict is that of the definition; `text` says what was looked at.
+
+    `wrong`: it is not, and `text` has a trace. Neither: it was not certified, and `text` says why.
+    """
+
+    proved: bool
+    wrong: bool
+    text: str
+
+
+class _WrongError(Exception):
+    """The automaton says something else than the definition."""
+
+
+def certify(logic: str, formula: str, events: Sequence[str], tables: Tables | None) -> Certificate:
+    """Hold the automaton of a property (None: it has none) against its formula."""
+    check = _CHECKS.get(logic)
+    if check is None or tables is None:
+        return Certificate(
+            False, False, f"{_NO_AUTOMATON.get(logic, 'it has no automaton')}: tested, not proved"
+        )
+    try:
+        _look_at_form(logic, events, tables)
+        pairs = check(formula, events, tables)
+    except _WrongError as error:
+        return Certificate(False, True, str(error))
+    except UnreadError as error:
+        return Certificate(False, False, f"the certifier does not read it ({error}): tested, not proved")
+    except TooMuchError:
+        return Certificate(False, False, "there is too much to look at: tested, not proved")
+    return Certificate(True, False, f"proved: its automaton is what is written ({pairs} cases followed)")
+
+
+def _look_at_form(logic: str, events: Sequence[str], tables: Tables) -> None:
+    """What is no state is one to Python where it is negative, and another to the module; time is for `tfsm` alone."""
+    limits = [limit for limit in tables.timeouts if limit is not None]
+    if len(tables.verdicts) != len(tables.table) or (
+        tables.timeouts and len(tables.timeouts) != len(tables.table)
+    ):
+        raise _WrongError("it has not as many verdicts, or limits of time, as states")
+    if limits and logic != "tfsm":
+        raise _WrongError("it has limits of time, and its logic has none")
+    for state, row in enumerate(tables.table):
+        if len(row) != len(events):
+            raise _WrongError(f"state {state} has {len(row)} ways on, and there are {len(events)} events")
+    reached = itertools.chain((tables.initial,), *tables.table, (target for _, target in limits))
+    if not all(map(range(len(tables.table)).__contains__, reached)):
+        raise _WrongError("it leads to a state that it has not")
+
+
+_NO_AUTOMATON = {
+    "cfg": "grammars are not followed",
+    "ptcaret": "it has a stack",
+    "srs": "it has no automaton",
+    "mtl": "it has bounds of time",
+    "pattern": "it has a bound of time",
+}
+
+
+def _follow(
+    start: S,
+    step: Callable[[S, str], S],
+    told: Callable[[S, S, str], Verdicts],
+    events: Sequence[str],
+    tables: Tables,
+    *,
+    silently: Callable[[S, int], S | None] = lambda _before, _state: None,
+) -> int:
+    """Look at all pairs; `told(before, after, event)` are the verdicts that the definition has for a step.
+
+    `silently(before, state)` is what the passing of time leaves, where it does anything.
+    """
+    first = start, tables.initial
+    came: dict[tuple[S, int], tuple[tuple[S, int], str] | None] = {first: None}
+    waiting = [first]
+
+    def reach(following: tuple[S, int], pair: tuple[S, int], event: str) -> None:
+        if following not in came:
+            came[following] = pair, event
+            waiting.append(following)
+            if len(waiting) * len(events) > MOST_STEPS:
+                raise TooMuchError
+
+    for pair in waiting:
+        before, state = pair
+        for event, target in zip(events, tables.table[state], strict=True):
+            after = step(before, event)
+            wanted = told(before, after, event)
+            if tables.verdicts[target] != wanted:
+                trace = [*_trace(came, pair), event]
+                raise _WrongError(
+                    f"after {' '.join(trace)} the automaton says {_said(tables.verdicts[target])},"
+                    f" the definition {_said(wanted)}"
+                )
+            reach((after, target), pair, event)
+        left = silently(before, state)
+        if left is not None:
+            reach((left, tables.timeouts[state][1]), pair, "(a time limit)")  # type: ignore[index]  # it was looked at
+    return len(waiting)
+
+
+def _trace(came: dict[tuple[S, int], tuple[tuple[S, int], str] | None], pair: tuple[S, int]) -> Iterable[str]:
+    events: list[str] = []
+    while (before := came[pair]) is not None:
+        pair, event = before
+        events.append(event)
+    return reversed(events)
+
+
+def _said(verdicts: Verdicts) -> str:
+    return " and ".join(verdicts) or "nothing"
+
+
+def _check_past(grammar: text.Grammar, formula: str, events: Sequence[str], tables: Tables) -> int:
+    past = Past(text.formula(formula, events, grammar))
+    steps: dict[tuple[object, str], tuple[tuple[bool, ...], bool]] = {}
+
+    def step(state: tuple[tuple[bool, ...], bool], event: str) -> tuple[tuple[bool, ...], bool]:
+        key = state[0], event
+        if key not in steps:
+            steps[key] = past.step(state[0], event)
+        return steps[key]
+
+    return _follow(
+        (past.initial, False),
+        step,
+        lambda _before, after, _event: ("validation",) if after[1] else ("violation",),
+        events,
+        tables,
+    )
+
+
+def _check_words(formula: str, events: Sequence[str], tables: Tables) -> int:
+    """`fail` once no continuation matches: nothing that a derivative leads to has the empty word."""
+    words = Words(text.expression(formula, events), MOST_WORK)
+    dead: dict[int, bool] = {}
+
+    def is_dead(state: int) -> bool:
+        if state not in dead:
+            dead.update(_dead(words, state, events))
+        return dead[state]
+
+    def told(_before: int, after: int, _event: str) -> Verdicts:
+        return ("match",) if words.matches(after) else ("fail",) if is_dead(after) else ()
+
+    return _follow(words.initial, words.step, told, events, tables)
+
+
+def _dead(words: Words, start: int, events: Sequence[str]) -> dict[int, bool]:
+    """For all that this leads to: whether nothing matches any more."""
+    leading: dict[int, set[int]] = {start: set()}
+    waiting = [start]
+    for state in waiting:
+        for event in events:
+            after = words.step(state, event)
+            if after not in leading:
+                leading[after] = set()
+                waiting.append(after)
+                if len(waiting) * len(events) > MOST_STEPS:
+                    raise TooMuchError
+            leading[after].add(state)
+    alive = {state for state in waiting if words.matches(state)}
+    reached = list(alive)
+    while reached:
+        for before in leading[reached.pop()]:
+            if before not in alive:
+                alive.add(before)
+                reached.append(before)
+    return {state: state not in alive for state in waiting}
+
+
+def _check_future(formula: str, events: Sequence[str], tables: Tables) -> int:
+    return _check_endless(text.formula(formula, events, text.LTL), events, events, tables)
+
+
+def _check_pattern(formula: str, events: Sequence[str], tables: Tables) -> int:
+    """There may be silence for ever, which is an event that the pattern does not name."""
+    return _check_endless(patterns.meaning(formula, events), events, [*events, _SILENCE], tables)
+
+
+_SILENCE = "(silence)"
+
+
+def _check_endless(formula: text.Node, events: Sequence[str], letters: Sequence[str], tables: Tables) -> int:
+    """`violation` once no endless continuation makes it true, `validation` once all do. Follows it and its opposite."""
+    guesses = Guesses(formula, letters)
+    future = Future(guesses.count, MOST_WORK)
+    sides = (guesses.formula, ("not", guesses.formula))
+    start = tuple(future.start(positive(guesses.kept(side), guesses.count)) for side in sides)
+
+    def step(state: tuple[State, ...], event: str) -> tuple[State, ...]:
+        return tuple(future.steps(side, guesses.letters[event]) for side in state)
+
+    def told(_before: object, after: tuple[State, ...], _event: str) -> Verdicts:
+        if not future.possible(after[0]):
+            return ("violation",)
+        return () if future.possible(after[1]) else ("validation",)
+
+    return _follow(start, step, told, events, tables)
+
+
+def _check_machine(formula: str, events: Sequence[str], tables: Tables) -> int:
+    """With time limits: that they are as written, and lead where they should."""
+    machine = Machine(formula, events)
+
+    def silently(before: str, state: int) -> str | None:
+        written = machine.timeout(before)
+        made = tables.timeouts[state] if tables.timeouts else None
+        if (written and written[0]) != (made and made[0]):
+            raise _WrongError(f"the time limit of the state {before} is {made and made[0]} ns")
+        if written is None or made is None:
+            return None
+        if tables.verdicts[made[1]] != machine.told(written[1]):
+            raise _WrongError(
+                f"the time limit of the state {before} leads to {_said(tables.verdicts[made[1]])}"
+            )
+        return written[1]
+
+    return _follow(
+        machine.initial,
+        machine.step,
+        lambda _before, after, _event: machine.told(after),
+        events,
+        tables,
+        silently=silently,
+    )
+
+
+_CHECKS: dict[str, Callable[[str, Sequence[str], Tables], int]] = {
+    "ere": _check_words,
+    "fsm": _check_machine,
+    "ltl": _check_future,
+    "mtl": partial(_check_past, text.MTL),
+    "pattern": _check_pattern,
+    "ptltl": partial(_check_past, text.PTLTL),
+    "tfsm": _check_machine,
+}

@@ -1,0 +1,73 @@
+"""State machines, by what is written.
+
+`state [ event -> state, default state, timeout 2s -> state ]`, and `alias name = states`.
+"""
+
+from collections.abc import Sequence
+
+from rosmop.certify.text import UnreadError, Words
+
+FAIL = "fail"
+
+
+class Machine:
+    """Follows a machine; a state is its name."""
+
+    def __init__(self, formula: str, events: Sequence[str]) -> None:
+        self._moves: dict[str, dict[str, str]] = {}
+        self._default: dict[str, str] = {}
+        self._aliases: dict[str, list[str]] = {}
+        self._timeouts: dict[str, tuple[int, str]] = {}
+        self._events = events
+        words = Words(formula, ("->", "[", "]", "=", ","))
+        while words.word:
+            name = words.take()
+            if words.accept("["):
+                self._read_state(words, name)
+            elif name == "alias":
+                name = words.take()
+                words.expect("=")
+                self._aliases[name] = self._read_members(words)
+            else:
+                raise UnreadError(f"{name!r} begins no state")
+        self.initial = next(iter(self._moves), FAIL)
+
+    def _read_state(self, words: Words, state: str) -> None:
+        if state in self._moves:
+            raise UnreadError(f"the state {state!r} stands twice")
+        moves = self._moves.setdefault(state, {})
+        while not words.accept("]"):
+            event = words.take()
+            if event == "timeout" and words.word[:1].isdecimal() | (words.word[:1] == "."):
+                after = words.duration()
+                words.expect("->")
+                self._timeouts[state] = after, words.take()
+                words.accept(",")
+                continue
+            arrow = words.accept("->")
+            target = words.take()
+            if event == "default":
+                self._default[state] = target
+            elif arrow and event in self._events:
+                moves[event] = target
+            else:
+                raise UnreadError(f"{event!r} is no event")
+            words.accept(",")
+
+    def _read_members(self, words: Words) -> list[str]:
+        members = [words.take()]
+        while words.accept(",") or (words.word and words.word != "alias"):
+            members.append(words.take())
+        return members
+
+    def step(self, state: str, event: str) -> str:
+        """Where an event leads: to `fail` where nothing is written."""
+        return self._moves.get(state, {}).get(event, self._default.get(state, FAIL))
+
+    def timeout(self, state: str) -> tuple[int, str] | None:
+        """After how many nanoseconds without an event the machine leaves a state, and for which one."""
+        return self._timeouts.get(state)
+
+    def told(self, state: str) -> tuple[str, ...]:
+        """The state, and its aliases as they are written."""
+        return (state, *(alias for alias, members in self._aliases.items() if state in members))

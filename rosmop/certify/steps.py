@@ -1,0 +1,301 @@
+"""Runs the steps of a finished module in every state, and compares them with the automata that were certified.
+
+The walk of a topic (`ir/feed.py`) calls the functions of events, looks up states in tables, runs handlers, and notes
+what came of it. Here the same bytes run, tables included, but the functions of events and handlers are replaced
+(`scripted_module.py`): each returns what the check has put down for it (happened, dropped, begin again), and notes that
+it was called. So every event can be made to happen in every state of every property. What the module then does is
+compared with the automaton, which the certificate is about, and with the order and effects of `execution.py`.
+
+What is run, for each topic:
+
+- each event alone, in every state of every property; with a clock before, at and after its bound;
+- where a handler runs, it returns nothing, a drop, `__RESET;`, both, and that the message is to be left;
+- each event that may drop does so; two events on one message, in every state, the second one dropping if it may, as
+  long as that takes fewer than `MOST` steps for the whole set; and several messages in one read, all with the same
+  results of functions;
+- a monitor that is switched off, a drop and a verdict that are to be left to the engine.
+
+Not run: the functions themselves (`prove` compares those of events with their form), what a changed message leaves in
+the list of effects, the explanations that are kept, and the translation of the module to machine code.
+"""
+
+import struct
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+from typing import Any
+
+from rosmop.certify.expected_steps import (
+    BEGAN,
+    CHANGED,
+    DROPPED,
+    ELSEWHERE,
+    HAPPENED,
+    RESET,
+    Case,
+    Result,
+    States,
+    Stepped,
+    Topic,
+    begun_in,
+)
+from rosmop.certify.scripted_module import NOTE, RECORD, SCRIPT, TELL, scripted
+from rosmop.fast.abi import AREA, Cells
+from rosmop.fast.batch_codegen import WrittenModule
+from rosmop.fast.wasm_instance import Machine, MachineTrap, translated
+from rosmop.form.compiled import Compiled
+from rosmop.form.components import groups
+from rosmop.logics.interface import ClockedProperty, ClockedRun, FiniteProperty
+
+MOST = 100_000
+"""Steps of pairs of events that are run for one set."""
+
+_FEW = 16  # states, where the state plays no part
+_FUEL = 100_000  # for each message
+_FRAME = bytes(range(7, 23))
+
+
+class StepDiffersError(Exception):
+    """The module does something else than the automaton; the text says where."""
+
+
+def check_steps(compiled: Compiled, module: WrittenModule) -> int:
+    """Run the steps of a module; how many it were. Raises `StepDiffersError` for the first that is wrong."""
+    if not module.feeds:
+        return 0
+    pairs = MOST
+    machine = Machine(translated(scripted(module), module.memory), module.memory)
+    benches = []
+    for group, cells in zip(groups(compiled.specifications), module.cells, strict=True):
+        for (name, _), numbers in zip(group.component.topics, group.events, strict=True):
+            if name in module.feeds:
+                topic = Topic(compiled, group, module, name, numbers)
+                benches.append((topic, _Bench(machine, module, cells, topic, name)))
+    steps = sum(
+        bench.run(case, number, everywhere=everywhere)
+        for topic, bench in benches
+        for case, number, everywhere in _cases(topic)
+    )
+    for topic, bench in benches:
+        for case, number, everywhere in _pairs(topic):
+            if pairs <= 0:
+                return steps
+            done = bench.run(case, number, everywhere=everywhere)
+            pairs, steps = pairs - done, steps + done
+    return steps
+
+
+def _cases(topic: Topic) -> Iterator[tuple[Case, int | None, bool]]:
+    """What is run: a case, the property whose states are tried (None: none), and whether in all of its states."""
+    for event, function in enumerate(topic.functions):
+        happens = {function: HAPPENED}
+        rows = [one for one in topic.steps[event] if one.number is not None]
+        yield Case({}), None, False
+        yield Case({function: ELSEWHERE}), None, False
+        for one in rows:
+            for now in _times(one):
+                yield Case(happens, now), one.number, True
+            for other in rows:
+                beside = _handling(other) if other is not one else None
+                if beside is not None:
+                    dropping = happens | _answers(other, DROPPED)
+                    yield Case(dropping, beside=beside), one.number, True
+                    yield Case(happens | _answers(one, DROPPED), beside=beside), one.number, True
+            yield Case(happens, until=BEGAN), one.number, True
+            yield Case(happens, frames=3), one.number, True
+            yield Case(happens, counted=0), one.number, True
+            for bits in (DROPPED, RESET, DROPPED | RESET, ELSEWHERE) if one.handlers else ():
+                script = happens | _answers(one, bits)
+                yield Case(script), one.number, True
+                if bits == DROPPED:
+                    yield Case(script, frames=3), one.number, True
+                    yield Case(script, told=1 << event), one.number, True
+        yield Case(happens), None, False
+        if topic.drops[event]:
+            for number in (None, *topic.properties):
+                yield Case({function: HAPPENED | DROPPED}), number, False
+            yield Case({function: HAPPENED | DROPPED}, frames=3), None, False
+            yield Case({function: HAPPENED | DROPPED}, told=1 << event), None, False
+    for place in dict.fromkeys(topic.specifications):
+        yield Case(dict.fromkeys(topic.functions, HAPPENED), enabled=~(1 << place)), None, False
+
+
+def _pairs(topic: Topic) -> Iterator[tuple[Case, int | None, bool]]:
+    """The same of two events on one message: both happen, and what comes second drops it, if it may."""
+    for first, second in combinations(range(len(topic.functions)), 2):
+        one, other = topic.functions[first], topic.functions[second]
+        numbers = dict.fromkeys(each.number for event in (first, second) for each in topic.steps[event])
+        happen = {one: HAPPENED, other: HAPPENED}
+        for number in numbers or (None,):
+            yield Case(happen), number, True
+            if topic.drops[second]:
+                yield Case(happen | {other: HAPPENED | DROPPED}), number, True
+            if topic.drops[first]:
+                yield Case(happen | {one: HAPPENED | DROPPED}), number, True
+            answers: dict[int, int] = {}
+            for each in topic.steps[second]:
+                answers |= _answers(each, DROPPED)
+            if any(answers.values()):
+                yield Case(happen | answers), number, True
+
+
+def _handling(one: Stepped) -> tuple[int, int] | None:
+    """The property, and a state from which its event leads to a handler; None if there is none."""
+    if one.number is None or not isinstance(one.compiled, FiniteProperty):
+        return None
+    handled, automaton = {each.category for each in one.handlers}, one.compiled.automaton
+    for state, targets in enumerate(automaton.table):
+        if not handled.isdisjoint(automaton.verdicts[targets[one.event]]):
+            return one.number, state
+    return None
+
+
+def _answers(one: Stepped, bits: int) -> dict[int, int]:
+    """What the handlers of a property return: they drop only if they may, and other bits mean nothing."""
+    bits |= HAPPENED | CHANGED
+    return {
+        each.function: bits if each.drops else bits & ~DROPPED
+        for each in one.handlers
+        if each.verdict is not None
+    }
+
+
+def _times(one: Stepped) -> Sequence[int]:
+    if isinstance(one.compiled, FiniteProperty):
+        return (BEGAN,)
+    within = one.compiled.within  # type: ignore[attr-defined]  # it has a clock
+    return BEGAN - 5, BEGAN, BEGAN + within, BEGAN + within + 1
+
+
+class _Bench:
+    """A topic's walk in the module with replaced functions."""
+
+    def __init__(
+        self, machine: Machine, module: WrittenModule, cells: Cells, topic: Topic, name: str
+    ) -> None:
+        feed = module.feeds[name]
+        self._memory, self._cells, self._feed, self._topic = machine.memory, cells, feed, topic
+        self._machine, self._name = machine, name
+        self._try = machine.function(f"try {feed.name}")
+        self._frames, self._effects = module.frames, module.effects
+        self._functions, self._nothing = module.functions, bytes(4 * module.functions)
+        template = self._frames + SCRIPT + 4 * self._functions
+        self._template = template + -template % 8
+        self._out = self._template + 8 * (cells.properties + 1)
+        self._scratch = self._out - 8
+        room = module.frames + AREA - self._out
+        size = RECORD.size + 3 * NOTE.size * (len(topic.functions) + sum(map(len, topic.steps)) * 9)
+        self._most = 1 if topic.clocked else max(1, room // size)
+        for frame in range(3):
+            at = self._frames + 20 * frame
+            self._memory[at : at + 20] = struct.pack("<I", len(_FRAME)) + _FRAME
+
+    def run(self, case: Case, number: int | None, *, everywhere: bool) -> int:
+        """Run a case and compare; how many states were tried. Raises `StepDiffersError`."""
+        one = None if number is None else self._topic.properties[number]
+        states = 1 if one is None else one.states if everywhere else min(one.states, _FEW)
+        for first in range(0, states, self._most):
+            self._sweep(case, one, first, min(first + self._most, states))
+        return states
+
+    def _sweep(self, case: Case, one: Stepped | None, first: int, behind: int) -> None:
+        begun = self._topic.begun()
+        if case.beside is not None:
+            begun[case.beside[0]] = case.beside[1]
+        if one is not None and self._topic.clocked:
+            begun[one.number or 0] = begun_in(one, first)
+        if any(self._waits_no_more(number, state, case) for number, state in begun.items()):
+            return
+        notes = self._out + RECORD.size * (behind - first)
+        self._put_down(case, begun, notes)
+        cell = self._scratch if one is None else self._cells.base + 8 * (one.number or 0)
+        self._machine.refuel(_FUEL * (behind - first) * case.frames)
+        end = self._frames + 20 * case.frames
+        try:
+            self._try(first, behind, cell, self._out, end, case.now)
+        except MachineTrap as trap:
+            self._differs(case, one, first, f"it is stopped: {trap}")
+        expected = []
+        at = notes
+        for place, state in enumerate(range(first, behind)):
+            if one is not None and not self._topic.clocked:
+                begun[one.number or 0] = state
+            expected.append(self._topic.walk(dict(begun), case))
+            answer = *RECORD.unpack_from(self._memory, self._out + RECORD.size * place), at
+            at = self._compare(case, one, state, answer, expected[-1])
+        self._count(case, one, expected)
+
+    def _waits_no_more(self, number: int, state: Any, case: Case) -> bool:
+        """Whether the deadline of a property would have passed before the message."""
+        tables = self._topic.properties[number].compiled
+        if not isinstance(tables, ClockedProperty) or tables.waits[state[0]] is None:
+            return False
+        run = ClockedRun(tables, 0)
+        run.state, run.since, run.now = state
+        return case.now > (run.deadline or 0)
+
+    def _put_down(self, case: Case, states: States, notes: int) -> None:
+        memory, cells, feed = self._memory, self._cells, self._feed
+        for number in range(cells.properties):
+            state = states.get(number, 0)
+            shown = state if isinstance(state, int) else state[0]
+            struct.pack_into("<q", memory, self._template + 8 * number, shown)
+            if number in cells.clocks and not isinstance(state, int):
+                struct.pack_into("<2q", memory, cells.clocks[number], *state[1:])
+        script = self._frames + SCRIPT
+        memory[script : script + 4 * self._functions] = self._nothing
+        for function, bits in case.script.items():
+            struct.pack_into("<i", memory, script + 4 * function, bits)
+        told = self._frames + TELL
+        struct.pack_into("<I", memory, told, notes)
+        struct.pack_into("<3I", memory, told + 16, cells.base, self._template, 8 * cells.properties)
+        struct.pack_into("<4q", memory, cells.source, 5 << 32, case.told, case.enabled, case.counted)
+        struct.pack_into("<q", memory, cells.until, case.until)
+        counters = 2 * len(feed.functions) + len(feed.verdicts)
+        memory[feed.counters : feed.counters + 8 * counters] = bytes(8 * counters)
+
+    def _compare(
+        self, case: Case, one: Stepped | None, state: int, given: tuple[int, ...], expected: Result
+    ) -> int:
+        """Compare what came of one try; where the notes of the next begin."""
+        answer, who, what, cell, end, at = given
+        notes = list(NOTE.iter_unpack(self._memory[at:end]))
+        begins = [self._frames + 20 * frame for frame in range(4)]
+        wanted = [(function, begins[frame] + 4, len(_FRAME)) for function, frame in expected.calls]
+        effect = [(-1, begins[begin] | begins[behind] << 32) for begin, behind in expected.effects[:1]]
+        after: Any = None if one is None else expected.states[one.number or 0]
+        number = after if after is None or isinstance(after, int) else after[0]
+        clock = self._clock(one) if one is not None and self._topic.clocked else ()
+        for found, right, what_of in (
+            (answer, expected.answer | begins[expected.position], "what it answers"),
+            (notes, wanted, "which functions it calls, in which order"),
+            ([(who, what)] if effect else [], effect, "what it drops"),
+            (None if one is None else cell, number, "the next state"),
+            (clock, after[1:] if clock else (), "the clock"),
+        ):
+            if found != right:
+                self._differs(case, one, state, f"{what_of}: {found}, not {right}")
+        return int(end)
+
+    def _clock(self, one: Stepped) -> tuple[int, ...]:
+        address = self._cells.clocks.get(one.number or 0)
+        return () if address is None else struct.unpack_from("<2q", self._memory, address)
+
+    def _count(self, case: Case, one: Stepped | None, expected: Sequence[Result]) -> None:
+        """Compare how often events have happened, dropped, and come to verdicts."""
+        rows = [
+            [0] * len(self._feed.functions),
+            [0] * len(self._feed.functions),
+            [0] * len(self._feed.verdicts),
+        ]
+        for each in expected:
+            for row_of, places in zip(rows, (each.happened, each.dropped, each.verdicts), strict=True):
+                for place in places:
+                    row_of[place] += 1
+        wanted = tuple(count for row_of in rows for count in row_of)
+        found = struct.unpack_from(f"<{len(wanted)}q", self._memory, self._feed.counters)
+        if found != wanted:
+            self._differs(case, one, 0, f"what it counts: {found}, not {wanted}")
+
+    def _differs(self, case: Case, one: Stepped | None, state: int, text: str) -> None:
+        formula = "" if one is None else f", `{one.compiled.logic}: {one.compiled.formula}` in state {state}"
+        raise StepDiffersError(f"{self._name}{formula}: {text} ({case})")

@@ -1,0 +1,105 @@
+"""`v.begin()`, `v.end()` and what takes them: `erase`, `insert`, `std::sort`, `std::reverse`, `std::accumulate`.
+
+A cursor is an index into a vector that is known when the code is compiled; it is no value that a variable holds.
+"""
+
+from collections.abc import Sequence
+
+from rosmop.check.assignments import mark, marked, require_place
+from rosmop.check.conversion import convert, number
+from rosmop.check.places import Value
+from rosmop.check.scope import Scope
+from rosmop.form import nodes
+from rosmop.form.positions import Position
+from rosmop.text.errors import SpecificationError
+from rosmop.types import kinds
+
+ALGORITHMS = frozenset({"sort", "reverse", "accumulate"})
+"""Functions of `<algorithm>` and `<numeric>` that take a vector from `begin` to `end`."""
+
+
+def moved(operator: str, left: Value, right: Value, position: Position) -> Value | None:
+    """`begin + n`, `end - n`, `end - begin`; None if this is none of them."""
+    if left.vector is None or operator not in ("+", "-"):
+        return None
+    if kinds.is_number(right.type):
+        function, distance = "k_after" if operator == "+" else "k_before", number(right.form, kinds.LONG)
+        return Value(nodes.Call(kinds.INDEX, function, (left.form, distance)), position, vector=left.vector)
+    if right.vector is not None and operator == "-":
+        return Value(nodes.Call(kinds.LONG, "k_before", (left.form, right.form)), position)
+    return None
+
+
+def begin_or_end(base: Value, name: str, position: Position) -> Value:
+    """`v.begin()` or `v.end()`."""
+    begin = nodes.Literal(kinds.INDEX, 0)
+    place = begin if name == "begin" else nodes.Call(kinds.INDEX, "l_len", (base.form,))
+    return Value(place, position, vector=base)
+
+
+def erase(scope: Scope, base: Value, cursors: Sequence[Value], at: tuple[Position, int]) -> Value:
+    """`v.erase(place)`, `v.erase(first, last)`."""
+    first, last = _index(base, cursors[0]), nodes.Literal(kinds.VOID, None)
+    arguments = (base.form, first, _index(base, cursors[1]) if len(cursors) > 1 else last)
+    return _changed(scope, base, nodes.Call(kinds.VOID, "k_erase", arguments, at[1]), at[0])
+
+
+def insert(scope: Scope, base: Value, arguments: Sequence[Value], at: tuple[Position, int]) -> Value:
+    """`v.insert(place, value)`."""
+    kind = _vector(base, at[0])
+    value = convert(scope, arguments[1], kind.element, at[1])
+    width = nodes.Literal(kinds.ULONG, scope.values.width(kind.element))
+    handed = (base.form, _index(base, arguments[0]), value, width)
+    return _changed(scope, base, nodes.Call(kinds.VOID, "k_insert", handed, at[1]), at[0])
+
+
+def algorithm(scope: Scope, name: str, values: Sequence[Value], at: tuple[Position, int]) -> Value:
+    """`std::sort(first, last)` and its like."""
+    position, site = at
+    if len(values) < 2 or values[0].vector is None:
+        raise SpecificationError.at(position, f"`{name}` goes from `v.begin()` to `v.end()`")
+    base = values[0].vector
+    kind = _vector(base, position)
+    span = (base.form, values[0].form, _index(base, values[1]))
+    if name == "accumulate":
+        return _sum(values, span, at)
+    if len(values) != 2:
+        raise SpecificationError.at(values[2].position, f"`{name}` with a function of one's own is not known")
+    if name == "sort" and not kinds.is_scalar(kind.element):
+        raise SpecificationError.at(position, f"a {kind} has no order to sort by")
+    return _changed(scope, base, nodes.Call(kinds.VOID, f"k_{name}", span, site), position)
+
+
+def _sum(
+    values: Sequence[Value],
+    span: tuple[nodes.Expression, nodes.Expression, nodes.Expression],
+    at: tuple[Position, int],
+) -> Value:
+    if len(values) != 3 or not kinds.is_number(values[2].type):
+        raise SpecificationError.at(
+            at[0], "`accumulate` goes from `v.begin()` to `v.end()`, with a number to start from"
+        )
+    kind = values[2].type
+    assert values[0].vector is not None  # the caller has looked
+    element = _vector(values[0].vector, at[0]).element
+    if not kinds.is_number(element):
+        raise SpecificationError.at(at[0], f"{element} has no sum")
+    wide = kinds.common(kind, element)
+    return Value(nodes.Accumulate(kind, *span, values[2].form, wide, at[1]), at[0])
+
+
+def _vector(base: Value, position: Position) -> kinds.Vector:
+    if not isinstance(base.type, kinds.Vector):
+        raise SpecificationError.at(position, f"{base.type} has no elements")
+    return base.type
+
+
+def _index(base: Value, cursor: Value) -> nodes.Expression:
+    if cursor.vector is None or cursor.vector.form != base.form:
+        raise SpecificationError.at(cursor.position, "write `v.begin() + n` of the same vector")
+    return cursor.form
+
+
+def _changed(scope: Scope, base: Value, change: nodes.Expression, position: Position) -> Value:
+    require_place(base, "this")
+    return Value(marked(mark(scope, base), change), position)

@@ -1,0 +1,124 @@
+"""Whether a property can be enforced: what handlers may drop, and what is published when it is due (`enforced by`)."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+
+from rosmop.check.functions import topics_of
+from rosmop.check.scope import SpecificationNames
+from rosmop.logics.interface import CompiledProperty
+from rosmop.logics.lint import TIME, Graph, graph_of, shortest_trace_to
+from rosmop.logics.pattern import ENFORCED, TimedPattern
+from rosmop.text import tree
+from rosmop.text.errors import SpecificationError
+from rosmop.types.messages import nearest, shown
+
+_TAKES = {
+    "pattern": "it takes `enforced by f` behind `within`, with a function f that publishes what is due",
+    "mtl": "it takes a `pattern: … causes … within … enforced by f`, with a function f that publishes what is due",
+}
+
+
+def blocking_refused(
+    compiled: CompiledProperty, specification: tree.Specification, category: str
+) -> str | None:
+    """Why a handler cannot drop the message that brought it about."""
+    refused = compiled.blocking_refused(category)
+    if refused is not None:
+        return refused
+    for index, event in enumerate(specification.events):
+        if isinstance(event.trigger, tree.TimerTrigger) and category in compiled.categories_after(index):
+            return f"the timer {shown(event.name)} can bring @{category} about, and it has no message to drop"
+    return None
+
+
+def enforcement(
+    compiled: CompiledProperty,
+    specification: tree.Specification,
+    published: Sequence[str],
+    dropping: Collection[str],
+) -> str:
+    """Whether the property can be kept from being violated, by what, or what it would take.
+
+    `published` are the topics of its remedy, `dropping` the categories whose handlers may drop the message.
+    """
+    if compiled.remedy is not None:
+        topics = ", ".join(published)
+        return f"enforced: at the deadline {compiled.remedy} publishes what was due ({topics})"
+    category = "violation" if "violation" in compiled.categories else "fail"
+    graph = graph_of(compiled)
+    if graph is not None and shortest_trace_to(compiled, category) is None:
+        return f"nothing to enforce: no trace leads to @{category}"
+    refused = blocking_refused(compiled, specification, category)
+    if refused is None:
+        brings = _bringing(compiled, graph, category) if graph is not None else compiled.events
+        named = ", ".join(event for event in compiled.events if event in brings)
+        said = f"can be enforced: @{category} may drop the message that brings it about ({named})"
+        if category not in dropping:
+            said += f"; to enforce it write `@{category} {{ DROP; }}`"
+        return f"{said}; {_COUNTS[compiled.suppresses]}"
+    takes = "it takes an event on a topic for the timer"
+    if compiled.blocking_refused(category) is not None:
+        takes = _TAKES[compiled.logic]
+        if isinstance(compiled, TimedPattern):
+            refused += f", and no drop makes `{compiled.events[compiled.pattern.second]}` come"
+    return f"cannot be enforced by dropping: {refused}; {takes}"
+
+
+_COUNTS = {
+    True: "a dropped message has not happened for it",
+    False: "a dropped message counts for it, as if it had been passed on",
+}
+
+
+def _bringing(compiled: CompiledProperty, graph: Graph, category: str) -> set[str]:
+    """The events that lead to the category from where it is not yet.
+
+    Where a dropped message has not happened, only from where the messages lead that were not dropped.
+    """
+    reached, brings = {graph.initial}, set[str]()
+    waiting = [graph.initial]
+    while waiting:
+        state = waiting.pop()
+        for trace, target in graph.edges[state]:
+            leads = category in graph.verdicts[target]
+            if leads and (state == graph.initial or category not in graph.verdicts[state]):
+                brings.add(trace[-1])
+            if target not in reached and not (leads and compiled.suppresses and trace[-1] != TIME):
+                reached.add(target)
+                waiting.append(target)
+    return brings
+
+
+def topics_of_remedy(names: SpecificationNames, compiled: CompiledProperty) -> list[str]:
+    """What the remedy of a property publishes; raises `SpecificationError` if it is none."""
+    name = compiled.remedy
+    if name is None:
+        return []
+    place = compiled.source.finding(compiled.formula.rindex(name), "").position
+    function = names.functions.get(name)
+    if function is None:
+        if name in names.misdeclared:
+            raise SpecificationError(())
+        raise SpecificationError.at(
+            place, f"there is no function {shown(name)}{nearest(name, names.functions)}"
+        )
+    if function.parameters:
+        raise SpecificationError.at(place, f"{shown(name)} takes parameters; nobody gives them at a deadline")
+    topics = topics_of(names, name)
+    if not topics:
+        raise SpecificationError.at(place, f"{shown(name)} publishes nothing; write `PUBLISH(…)` in it")
+    return topics
+
+
+def with_remedy(compiled: CompiledProperty, node: tree.Property) -> list[tree.Handler]:
+    """The handlers of a property; that of `enforced` calls the remedy first."""
+    handlers = list(node.handlers)
+    if compiled.remedy is None:
+        return handlers
+    at = node.position
+    call = tree.Evaluate(at, tree.Call(at, tree.Name(at, (compiled.remedy,)), ()))
+    mine = [place for place, handler in enumerate(handlers) if (handler.category,) == ENFORCED]
+    for place in mine:
+        body = handlers[place].body
+        handlers[place] = replace(handlers[place], body=replace(body, statements=(call, *body.statements)))
+    return handlers if mine else [*handlers, tree.Handler(at, ENFORCED[0], tree.Block(at, (call,)))]

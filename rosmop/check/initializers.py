@@ -1,0 +1,34 @@
+"""What a variable is initialised or assigned with: an expression that converts, or `{a, b, c}` for a vector."""
+
+from rosmop.check.conversion import convert
+from rosmop.check.scope import Scope
+from rosmop.form import nodes
+from rosmop.text import tree
+from rosmop.text.errors import SpecificationError
+from rosmop.types import kinds
+from rosmop.types.kinds import Type
+
+
+def converted(scope: Scope, node: tree.Expression, target: Type) -> nodes.Expression:
+    """An expression as a value of the target type; `{…}` makes a vector."""
+    if isinstance(node, tree.Elements):
+        return elements(scope, node, target)
+    return convert(scope, scope.value_of(node), target, scope.site(node))
+
+
+def elements(scope: Scope, node: tree.Elements, target: Type) -> nodes.Expression:
+    """`{a, b, c}` as a vector."""
+    if not isinstance(target, kinds.Vector):
+        if len(node.items) == 1:
+            return converted(scope, node.items[0], target)
+        if not node.items:
+            return nodes.Zero(target)
+        raise SpecificationError.at(
+            node.position, f"`{{…}}` makes a vector, not a {target}; set its parts one by one"
+        )
+    if target.length is not None and len(node.items) > target.length:
+        raise SpecificationError.at(
+            node.items[target.length].position, f"more than the {target.length} elements of the array"
+        )
+    items = tuple(converted(scope, item, target.element) for item in node.items)
+    return nodes.Vector(target, items, 0 if target.length is None else target.length - len(items))

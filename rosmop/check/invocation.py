@@ -1,0 +1,91 @@
+"""A call of a member function while it is compiled: its base, its arguments, and the results it can have."""
+
+from collections.abc import Callable, Sequence
+
+from rosmop.check.assignments import mark, marked, require_place, store
+from rosmop.check.conversion import convert, number
+from rosmop.check.places import Value
+from rosmop.check.scope import Scope
+from rosmop.form import nodes
+from rosmop.form.positions import Position
+from rosmop.text.errors import SpecificationError
+from rosmop.types import kinds
+
+
+class Invocation:
+    """A call of a member function."""
+
+    def __init__(
+        self, scope: Scope, base: Value, name: str, arguments: Sequence[Value], at: tuple[Position, int]
+    ) -> None:
+        self.scope = scope
+        self.base = base
+        self.name = name
+        self.arguments = arguments
+        self.position, self.site = at
+
+    def count(self, least: int, most: int | None = None) -> int:
+        """How many arguments there are; refuses another number."""
+        number_of = len(self.arguments)
+        if not least <= number_of <= (least if most is None else most):
+            wanted = str(least) if most in (None, least) else f"{least} to {most}"
+            raise SpecificationError.at(
+                self.position, f"`{self.name}` takes {wanted} argument(s), not {number_of}"
+            )
+        return number_of
+
+    def index(self, position: int, default: int | None = None) -> nodes.Expression:
+        """An argument as an index."""
+        if default is not None and position >= len(self.arguments):
+            return nodes.Literal(kinds.ULONG, default)
+        value = self.arguments[position]
+        if not kinds.is_number(value.type):
+            raise SpecificationError.at(value.position, f"`{self.name}` needs a number; this is {value.type}")
+        return number(value.form, kinds.ULONG)
+
+    def text(self, position: int) -> nodes.Expression:
+        """An argument as a string; a character is one of length 1."""
+        value = self.arguments[position]
+        if value.type == kinds.CHAR:
+            return nodes.Call(kinds.STRING, "t_byte", (value.form,))
+        return convert(self.scope, value, kinds.STRING)
+
+    def called(self, kind: kinds.Type, function: str, *arguments: nodes.Expression) -> nodes.Call:
+        """A function of the form, of the base and these arguments."""
+        return nodes.Call(kind, function, (self.base.form, *arguments), self.site)
+
+    def value(self, kind: kinds.Type, function: str, *arguments: nodes.Expression) -> Value:
+        """The result, by a function of the form."""
+        return Value(self.called(kind, function, *arguments), self.position)
+
+    def changes(self, value: nodes.Expression) -> Value:
+        """The result of a function that gives the base a new value."""
+        require_place(self.base, f"`{self.name}`")
+        stored = store(self.scope, self.base, value)
+        return Value(nodes.Discard(stored), self.position)
+
+    def changes_in_place(self, function: str, *arguments: nodes.Expression) -> Value:
+        """The result of a function of the form that changes the vector itself."""
+        require_place(self.base, f"`{self.name}`")
+        if isinstance(self.base.type, kinds.Vector) and self.base.type.length is not None:
+            raise SpecificationError.at(
+                self.position, f"`{self.name}`: an array of fixed length stays so long"
+            )
+        change = marked(mark(self.scope, self.base), self.called(kinds.VOID, function, *arguments))
+        return Value(change, self.position)
+
+
+Method = Callable[[Invocation], Value]
+"""A member function: from a call to its value."""
+
+
+def length(call: Invocation) -> Value:
+    """`size()`, `length()`."""
+    call.count(0)
+    return call.value(kinds.ULONG, "l_len")
+
+
+def empty(call: Invocation) -> Value:
+    """`empty()`."""
+    call.count(0)
+    return call.value(kinds.BOOL, "l_empty")

@@ -1,0 +1,245 @@
+"""Loops and `switch`. Every iteration is charged, so that no loop outlives its budget."""
+
+from collections.abc import Callable, Sequence
+
+from rosmop.check.conversion import condition, convert, number
+from rosmop.check.order import settled
+from rosmop.check.places import Value, Variable
+from rosmop.check.scope import Loop, Scope
+from rosmop.check.vector_members import element_value
+from rosmop.form import nodes
+from rosmop.form.positions import Position
+from rosmop.runtime.numbers import wrap
+from rosmop.text import tree
+from rosmop.text.errors import SpecificationError
+from rosmop.types import kinds
+from rosmop.types.kinds import Type
+from rosmop.types.resolve import resolve
+
+Write = Callable[[Scope, tree.Statement], None]
+"""Writes a statement; handed in, because statements contain loops and loops contain statements."""
+
+MAX_NESTED = 15
+"""Loops inside each other; Python takes no more than 20."""
+
+
+def charge(scope: Scope, node: tree.Node) -> None:
+    """Charge for one iteration (or one call)."""
+    scope.add(nodes.Charge(scope.lines.site, weight(node)))
+
+
+def weight(node: tree.Node) -> int:
+    """How many instructions an iteration (or a call) is charged: one, and one for each statement in the body."""
+    total = 1
+    waiting: list[object] = [getattr(node, name) for name in node.__dataclass_fields__]
+    while waiting:
+        current = waiting.pop()
+        if isinstance(current, tuple):
+            waiting += current
+        elif isinstance(current, tree.Statement | tree.Case):
+            total += not isinstance(current, tree.Block)
+            waiting += [getattr(current, name) for name in current.__dataclass_fields__]
+    return total
+
+
+def write_while(scope: Scope, node: tree.While, write: Write) -> None:
+    """`while` and `do … while`."""
+    _enter(scope, node, Loop((lambda: _leave_unless(scope, node.condition)) if node.at_end else None))
+    with scope.nested() as statements:
+        charge(scope, node)
+        if not node.at_end:
+            _leave_unless(scope, node.condition)
+        _block(scope, [node.body], write)
+        if node.at_end:
+            _leave_unless(scope, node.condition)
+    scope.add(nodes.Loop(scope.lines.site, tuple(statements)))
+    scope.loops.pop()
+
+
+def write_for(scope: Scope, node: tree.For, write: Write) -> None:
+    """`for (start; condition; step)`."""
+    with scope.block():
+        if node.start is not None:
+            write(scope, node.start)
+        step = tree.Evaluate(node.step.position, node.step) if node.step is not None else None
+        _enter(scope, node, Loop((lambda: write(scope, step)) if step is not None else None))
+        with scope.nested() as statements:
+            charge(scope, node)
+            if node.condition is not None:
+                _leave_unless(scope, node.condition)
+            _block(scope, [node.body], write)
+            if step is not None:
+                write(scope, step)
+        scope.add(nodes.Loop(scope.lines.site, tuple(statements)))
+        scope.loops.pop()
+
+
+def write_range_for(scope: Scope, node: tree.RangeFor, write: Write) -> None:
+    """`for (type name : values)`."""
+    values = scope.value_of(node.values)
+    by_value = not node.type.reference or node.type.constant
+    if not by_value:
+        first, values = settled(scope, values)
+        for each in first:
+            scope.evaluate(each)
+    if not isinstance(values.type, kinds.Vector | kinds.String):
+        raise SpecificationError.at(values.position, f"{values.type} has no elements to go through")
+    element = values.type.element if isinstance(values.type, kinds.Vector) else kinds.CHAR
+    kind = element if node.type.name == ("auto",) else resolve(node.type, scope.messages)
+    _enter(scope, node, Loop(None))
+    item = scope.temporary() if by_value else None
+    index = "" if item is not None else _first_index(scope, node, values, kind)
+    with scope.block(), scope.nested() as statements:
+        if item is None:
+            _by_reference(scope, node, values, kind, index)
+        else:
+            _by_value(scope, node, element, kind, item)
+        _block(scope, [node.body], write)
+    site = scope.lines.site
+    scope.add(
+        nodes.Loop(site, tuple(statements))
+        if item is None
+        else nodes.ForEach(site, item, values.form, tuple(statements))
+    )
+    scope.loops.pop()
+
+
+def _by_value(scope: Scope, node: tree.RangeFor, element: Type, kind: Type, item: str) -> None:
+    charge(scope, node)
+    read: nodes.Expression = nodes.Read(element, item)
+    if element == kinds.CHAR:  # of a string; those of a vector are in their range
+        read = nodes.Convert(kinds.CHAR, nodes.Read(kinds.UINT8, item))
+    value = Value(read, node.position, owned=node.type.reference)
+    variable = scope.local(node.name, kind, node.position, constant=node.type.constant)
+    scope.evaluate(nodes.Assign(kind, variable.code, convert(scope, value, kind)))
+
+
+def _first_index(scope: Scope, node: tree.RangeFor, values: Value, kind: Type) -> str:
+    """The name of an index that stands before the first element."""
+    if not isinstance(values.type, kinds.Vector) or values.place is None:
+        raise SpecificationError.at(
+            node.values.position, "a reference goes through a vector variable; leave out the `&`"
+        )
+    if values.type.element != kind:
+        raise SpecificationError.at(node.type.position, f"the elements are {values.type.element}, not {kind}")
+    index = scope.temporary("i")
+    scope.evaluate(nodes.Assign(kinds.LONG, index, nodes.Literal(kinds.LONG, -1)))
+    return index
+
+
+def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type, index: str) -> None:
+    charge(scope, node)
+    site, at = scope.lines.site, nodes.Read(kinds.LONG, index)
+    one = nodes.Literal(kinds.LONG, 1)
+    scope.evaluate(nodes.Assign(kinds.LONG, index, nodes.Arithmetic(kinds.LONG, "+", at, one, site)))
+    length = nodes.Call(kinds.LONG, "l_len", (values.form,))
+    scope.add(nodes.If(site, nodes.Compare(">=", at, length, site), (nodes.Break(site),), ()))
+    alias = element_value(values, Value(at, node.position), node.position, site)
+    scope.declare(Variable(node.name, kind, index, node.position, alias=alias))
+
+
+def write_switch(scope: Scope, node: tree.Switch, write: Write) -> None:
+    """`switch`: the index of the first case, then every block from there on until a `break`."""
+    value = scope.value_of(node.value)
+    kind = kinds.promoted(value.type)
+    if not isinstance(kind, kinds.Integer):
+        raise SpecificationError.at(value.position, f"`switch` needs an integer; this is {value.type}")
+    start, flag = scope.temporary(), scope.temporary("k")
+    table, default = _cases(scope, node, kind)
+    site = scope.lines.site
+    nothing = nodes.Literal(kinds.BOOL, False)
+    scope.evaluate(nodes.Assign(kinds.BOOL, flag, nothing))
+    scope.add(nodes.Select(site, start, number(value.form, kind), table, default))
+    _enter(scope, node, Loop(None, flag=flag))
+    with scope.block() as names, scope.nested() as statements:
+        for index, case in enumerate(node.cases):
+            if case.statements:
+                with scope.nested() as inner:
+                    _statements(scope, case.statements, write)
+                reached = nodes.Compare(
+                    "<=", nodes.Read(kinds.INT, start), nodes.Literal(kinds.INT, index), site
+                )
+                scope.add(nodes.If(site, reached, tuple(inner), ()))
+        scope.add(nodes.Break(site))
+    for variable in names.values():  # a case may jump over the declaration
+        scope.evaluate(nodes.Assign(variable.type, variable.code, nodes.Zero(variable.type)))
+    scope.add(nodes.Loop(site, tuple(statements)))
+    loop = scope.loops.pop()
+    if loop.continued:
+        with scope.nested() as going_on:
+            write_continue(scope, node.position)
+        scope.add(nodes.If(site, nodes.Read(kinds.BOOL, flag), tuple(going_on), ()))
+
+
+def _cases(scope: Scope, node: tree.Switch, kind: kinds.Integer) -> tuple[tuple[tuple[int, int], ...], int]:
+    table: dict[int, int] = {}
+    default = len(node.cases)
+    for index, case in enumerate(node.cases):
+        if case.value is None:
+            default = index
+            continue
+        value = scope.value_of(case.value)
+        constant = value.constant
+        if not isinstance(constant, int):
+            raise SpecificationError.at(
+                case.value.position, "a case needs a constant: a number or a character"
+            )
+        if not -(1 << kind.bits - 1) <= constant < 1 << kind.bits:
+            raise SpecificationError.at(
+                case.value.position,
+                f"case {int(constant)} can never be: {kind} holds {kind.least} to {kind.most}",
+            )
+        wanted = wrap(int(constant), kind.bits, kind.signed)
+        if wanted in table:
+            raise SpecificationError.at(case.value.position, f"case {wanted} occurs twice")
+        table[wanted] = index
+    return tuple(table.items()), default
+
+
+def write_continue(scope: Scope, position: Position) -> None:
+    """`continue`: the step of the innermost loop, then its next iteration."""
+    if all(loop.flag is not None for loop in scope.loops):
+        raise SpecificationError.at(position, "`continue` stands in a loop")
+    loop = scope.loops[-1]
+    if loop.flag is not None:
+        loop.continued = True
+        scope.evaluate(nodes.Assign(kinds.BOOL, loop.flag, nodes.Literal(kinds.BOOL, True)))
+        scope.add(nodes.Break(scope.lines.site))
+        return
+    if loop.step is not None:
+        with scope.around(loop):
+            loop.step()
+    scope.add(nodes.Continue(scope.lines.site))
+
+
+def _enter(scope: Scope, node: tree.Node, loop: Loop) -> None:
+    if len(scope.loops) >= MAX_NESTED:
+        raise SpecificationError.at(
+            node.position, f"more than {MAX_NESTED} loops inside each other; use helper functions"
+        )
+    scope.enter(loop)
+
+
+def _leave_unless(scope: Scope, node: tree.Expression) -> None:
+    with scope.at(node):
+        site = scope.lines.site
+        with scope.looking():
+            left = nodes.Not(condition(scope.value_of(node)))
+        scope.add(nodes.If(site, left, (nodes.Break(site),), ()))
+
+
+def body(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> tuple[nodes.Statement, ...]:
+    """Statements in a block of names of their own."""
+    with scope.nested() as found:
+        _block(scope, statements, write)
+    return tuple(found)
+
+
+def _block(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> None:
+    with scope.block():
+        _statements(scope, statements, write)
+
+
+def _statements(scope: Scope, statements: Sequence[tree.Statement], write: Write) -> None:
+    for statement in statements:
+        write(scope, statement)

@@ -1,0 +1,71 @@
+"""How close comparisons of numbers came: of each the sides when they were nearest, while it was true and while not.
+
+In the place of a comparison stands an expression that notes its sides and has the same value: they are compared as the
+type that C++ compares them as, and nothing is charged. Left alone are conditions of loops (how close a counter came to
+its end says nothing), what `when` looks at, first values and `init`.
+"""
+
+from dataclasses import replace
+
+import msgspec
+
+from rosmop.check.conversion import number
+from rosmop.check.places import Value
+from rosmop.check.scope import Scope
+from rosmop.form import nodes
+from rosmop.form.compiled import Comparison
+from rosmop.text import tree
+from rosmop.types import kinds
+
+MOST_NOTED = 32
+"""Comparisons of a specification; those that are compiled after them are not noted."""
+
+_COMPARED = frozenset({"<", "<=", ">", ">="})
+_TRUE, _FALSE = (nodes.Literal(kinds.BOOL, truth) for truth in (True, False))
+
+
+def noted(scope: Scope, node: tree.Binary, left: Value, right: Value, value: Value) -> Value:
+    """The value of `left operator right`, noted if that is a comparison of numbers which are not both known."""
+    compare = value.form
+    if (
+        not scope.notes
+        or node.operator not in _COMPARED
+        or not isinstance(compare, nodes.Compare)
+        or not kinds.is_number(compare.left.type)
+    ):
+        return value
+    known = scope.names.comparisons
+    if node not in known:
+        if len(known) >= MOST_NOTED:
+            return value
+        variables = [(scope.symbols.fresh("g"), scope.symbols.fresh("g")) for _truth in range(2)]
+        constant = (side for side, operand in enumerate((left, right)) if operand.constant is not None)
+        known[node] = Comparison(node.position, next(constant, None), *variables)
+    comparison = known[node]
+    scope.written.update(comparison.variables)
+    kind = compare.left.type
+    sides = [nodes.Read(kind, scope.temporary()) for _side in range(2)]
+    kept = (
+        nodes.Assign(kind, side.name, operand)
+        for side, operand in zip(sides, (compare.left, compare.right), strict=True)
+    )
+    now = [number(side, kinds.DOUBLE) for side in sides]
+    answer = nodes.Conditional(
+        kinds.BOOL,
+        msgspec.structs.replace(compare, left=sides[0], right=sides[1]),
+        nodes.Sequence(kinds.BOOL, (_note(now, comparison.when_true), _TRUE), -1),
+        nodes.Sequence(kinds.BOOL, (_note(now, comparison.when_false), _FALSE), -1),
+    )
+    return replace(value, form=nodes.Sequence(kinds.BOOL, (*kept, answer), -1))
+
+
+def _note(now: list[nodes.Expression], variables: tuple[str, str]) -> nodes.Expression:
+    """Keep the sides if they are nearer to each other than those that are kept."""
+    before = [nodes.Read(kinds.DOUBLE, name) for name in variables]
+    nearer = nodes.Compare("<", _distance(*now), _distance(*before), -1)
+    kept = (nodes.Assign(kinds.DOUBLE, name, side) for name, side in zip(variables, now, strict=True))
+    return nodes.Logical("and", nearer, nodes.Sequence(kinds.BOOL, (*kept, _TRUE), -1))
+
+
+def _distance(left: nodes.Expression, right: nodes.Expression) -> nodes.Expression:
+    return nodes.Unary(kinds.DOUBLE, "abs", nodes.Arithmetic(kinds.DOUBLE, "-", left, right, -1))

@@ -1,0 +1,181 @@
+"""Operators, with the types C++ gives their results."""
+
+from rosmop.check import cursors, order
+from rosmop.check.conversion import (
+    condition,
+    convert,
+    number,
+)
+from rosmop.check.places import Value
+from rosmop.check.scope import Scope
+from rosmop.form import nodes
+from rosmop.form.positions import Position
+from rosmop.text.errors import SpecificationError
+from rosmop.types import kinds
+from rosmop.types.kinds import Type
+
+COMPARISONS = frozenset({"==", "!=", "<", ">", "<=", ">="})
+_BITS = frozenset({"&", "|", "^"})
+_TEXTS = (kinds.String, kinds.Characters)
+_MOMENTS = (kinds.Time, kinds.Duration)
+
+
+class Operands:
+    """Two operands, where the operation stands, and the site of its faults."""
+
+    def __init__(self, scope: Scope, position: Position, left: Value, right: Value, site: int) -> None:
+        self.scope = scope
+        self.position = position
+        self.left = left
+        self.right = right
+        self.site = site
+
+    def value(self, result: nodes.Expression) -> Value:
+        """The result."""
+        return Value(result, self.position)
+
+    def refused(self, operator: str, hint: str = "") -> SpecificationError:
+        """The refusal of this operation."""
+        left, right = self.left.type, self.right.type
+        return SpecificationError.at(
+            self.position, f"`{operator}` has no meaning for {left} and {right}{hint}"
+        )
+
+
+def binary(operator: str, operands: Operands) -> Value:
+    """`left operator right`."""
+    left, right = operands.left.type, operands.right.type
+    if operator in ("&&", "||"):
+        word = "and" if operator == "&&" else "or"
+        return operands.value(nodes.Logical(word, condition(operands.left), condition(operands.right)))
+    if kinds.is_number(left) and kinds.is_number(right):
+        return _comparison(operator, operands) if operator in COMPARISONS else _arithmetic(operator, operands)
+    if isinstance(left, _TEXTS) or isinstance(right, _TEXTS):
+        return _texts(operator, operands)
+    if isinstance(left, _MOMENTS) or isinstance(right, _MOMENTS):
+        return _moments(operator, operands)
+    cursor = cursors.moved(operator, operands.left, operands.right, operands.position)
+    if cursor is not None:
+        return cursor
+    if operator in ("==", "!=") and left == right and not isinstance(left, kinds.Void | kinds.Index):
+        first, (one, other) = order.arguments(operands.scope, (operands.left, operands.right))
+        return order.after(
+            first, operands.value(nodes.Compare(operator, one.form, other.form, operands.site))
+        )
+    raise operands.refused(operator, _hint(left, right))
+
+
+def _hint(left: Type, right: Type) -> str:
+    if isinstance(left, kinds.Vector) != isinstance(right, kinds.Vector):
+        return "; write an index, `[0]`"
+    if isinstance(left, kinds.Record) or isinstance(right, kinds.Record):
+        return "; write a field, `.data`"
+    return ""
+
+
+def _comparison(operator: str, operands: Operands) -> Value:
+    kind = kinds.common(operands.left.type, operands.right.type)
+    left, right = (number(value.form, kind) for value in (operands.left, operands.right))
+    return operands.value(nodes.Compare(operator, left, right, operands.site))
+
+
+def _arithmetic(operator: str, operands: Operands) -> Value:
+    if operator in ("<<", ">>"):
+        return _shift(operator, operands)
+    kind = kinds.common(operands.left.type, operands.right.type)
+    if isinstance(kind, kinds.Floating) and (operator == "%" or operator in _BITS):
+        raise operands.refused(operator, "; write `fmod(…)`" if operator == "%" else "")
+    left, right = (number(value.form, kind) for value in (operands.left, operands.right))
+    return operands.value(nodes.Arithmetic(kind, operator, left, right, operands.site))
+
+
+def _shift(operator: str, operands: Operands) -> Value:
+    kind, amount = kinds.promoted(operands.left.type), kinds.promoted(operands.right.type)
+    if not isinstance(kind, kinds.Integer) or not isinstance(amount, kinds.Integer):
+        raise operands.refused(operator)
+    left = number(operands.left.form, kind)
+    return operands.value(nodes.Arithmetic(kind, operator, left, operands.right.form, operands.site))
+
+
+def _texts(operator: str, operands: Operands) -> Value:
+    left, right = operands.left, operands.right
+    if operator == "+":
+        return _put_together("o_join", operands)
+    if operator == "<<":
+        raise operands.refused(operator, "; write `std::cout << …` or ROS_INFO_STREAM(…)")
+    if operator not in COMPARISONS:
+        raise operands.refused(operator)
+    if not (isinstance(left.type, _TEXTS) and isinstance(right.type, _TEXTS)):
+        raise operands.refused(operator, _text_hint(left, right))
+    one, other = (convert(operands.scope, value, kinds.STRING) for value in (left, right))
+    short = any(
+        isinstance(value.constant, bytes) and len(value.constant) <= nodes.SHORT for value in (left, right)
+    )
+    return operands.value(nodes.CompareTexts(operator, one, other, short, operands.site))
+
+
+def extended(operands: Operands) -> Value:
+    """`left += right`, where `left` is a string: what it holds goes with it."""
+    return _put_together("o_extend", operands)
+
+
+def _put_together(function: str, operands: Operands) -> Value:
+    for value, other in ((operands.left, operands.right), (operands.right, operands.left)):
+        if isinstance(value.type, kinds.Characters) and isinstance(
+            other.type, kinds.Integer | kinds.Floating
+        ):
+            hint = "; there is no arithmetic of pointers: write `std::string(…).substr(1)`"
+            raise operands.refused("+", hint)
+    texts = (_joined(operands, operands.left), _joined(operands, operands.right))
+    return operands.value(nodes.Call(kinds.STRING, function, texts, operands.site))
+
+
+def _text_hint(left: Value, right: Value) -> str:
+    other = left if isinstance(right.type, _TEXTS) else right
+    if other.type == kinds.CHAR:
+        return "; a character is written 'a', a string \"a\""
+    return "; write an index, `[0]`" if isinstance(other.type, kinds.Vector) else ""
+
+
+def _joined(operands: Operands, value: Value) -> nodes.Expression:
+    if isinstance(value.type, kinds.Integer) and value.type == kinds.CHAR:
+        return nodes.Call(kinds.STRING, "t_byte", (value.form,))
+    if kinds.is_number(value.type):
+        raise SpecificationError.at(value.position, f"{value.type} is no string; write `std::to_string(…)`")
+    return convert(operands.scope, value, kinds.STRING)
+
+
+def _moments(operator: str, operands: Operands) -> Value:
+    left, right, site = operands.left, operands.right, operands.site
+    if operator in COMPARISONS and left.type == right.type:
+        return operands.value(nodes.Compare(operator, left.form, right.form, site))
+    if operator in ("+", "-"):
+        kind = _sum(operator, left.type, right.type)
+        if kind is not None:
+            return operands.value(nodes.Moment(kind, operator, left.form, right.form, site))
+    if operator == "*" and left.type == kinds.DURATION and kinds.is_number(right.type):
+        return operands.value(nodes.Call(kinds.DURATION, "o_scaled", (left.form, right.form), site))
+    raise operands.refused(operator, "; write `.toSec()` to calculate in seconds")
+
+
+def _sum(operator: str, left: Type, right: Type) -> Type | None:
+    if left == kinds.TIME and right == kinds.TIME and operator == "-":
+        return kinds.DURATION
+    if left == kinds.TIME and right == kinds.DURATION:
+        return kinds.TIME
+    return kinds.DURATION if left == right == kinds.DURATION else None
+
+
+def unary(operator: str, operand: Value, position: Position, site: int) -> Value:
+    """`!x`, `-x`, `+x`, `~x`."""
+    if operator == "!":
+        return Value(nodes.Not(condition(operand)), position)
+    if operator == "-" and operand.type == kinds.DURATION:
+        nothing = nodes.Literal(kinds.DURATION, 0)
+        return Value(nodes.Moment(kinds.DURATION, "-", nothing, operand.form, site), position)
+    kind = kinds.promoted(operand.type)
+    if not kinds.is_number(kind) or (operator == "~" and not isinstance(kind, kinds.Integer)):
+        raise SpecificationError.at(position, f"`{operator}` has no meaning for {operand.type}")
+    value = number(operand.form, kind)
+    changed = value if operator == "+" else nodes.Unary(kind, operator, value)
+    return Value(changed, position)

@@ -1,0 +1,60 @@
+"""Which message types a specification uses, however deep: whether its state outlives a change of definitions.
+
+What is found may be more than what is used (a string that is the name of a type), never less.
+"""
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from hashlib import sha256
+from typing import Any
+
+from rosmop.text import tree
+from roswire.definitions import Definitions
+
+
+def reached(node: tree.Specification, definitions: Definitions) -> frozenset[str]:
+    """The message types that a specification names, and those they are made of."""
+    messages, services = set(definitions.message_types), set(definitions.service_types)
+    waiting: list[str] = []
+    for name in set(_names(node)):
+        if name in messages:
+            waiting.append(name)
+        if name in services:
+            service = definitions.service(name)
+            waiting += [service.request.name, service.response.name]
+    found: set[str] = set()
+    while waiting:
+        name = waiting.pop()
+        if name in messages and name not in found:
+            found.add(name)
+            waiting += [field.type for field in definitions.message(name).fields]
+    return frozenset(found)
+
+
+def identity(node: tree.Specification) -> bytes:
+    """The same for specifications that are the same but for where they stand."""
+    return sha256(repr(_plain(node)).encode()).digest()
+
+
+def _plain(node: Any) -> object:
+    if isinstance(node, tuple):
+        return tuple(map(_plain, node))
+    if is_dataclass(node):
+        parts = (_plain(getattr(node, field.name)) for field in fields(node) if field.compare)
+        return (type(node).__name__, *parts)
+    return node
+
+
+def _names(root: object) -> Iterator[str]:
+    """Every string of a tree that may name a type: `pkg/T`, `pkg::T`, or the two parts apart."""
+    waiting = [root]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, str):
+            yield node.replace("::", "/")
+        elif isinstance(node, tuple | list):
+            if len(node) == 2 and all(isinstance(part, str) for part in node):
+                yield "/".join(node)
+            waiting += node
+        elif is_dataclass(node):
+            waiting += [getattr(node, field.name) for field in fields(node)]

@@ -1,0 +1,347 @@
+"""What a function under compilation knows: variables by name, the statements written so far, where it stands."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Literal
+
+from rosmop.check.places import Value, Variable
+from rosmop.form import nodes
+from rosmop.form.compiled import Comparison, Publication
+from rosmop.form.positions import Finding, Position
+from rosmop.form.sites import Site, SiteVariable, Symbols
+from rosmop.runtime.values import Values
+from rosmop.text import tree
+from rosmop.text.errors import SpecificationError
+from rosmop.text.foreign import instead
+from rosmop.types import kinds
+from rosmop.types.kinds import Type
+from rosmop.types.messages import Messages, nearest, shown
+
+Role = Literal["action", "timer", "handler", "init", "function"]
+ValueOf = Callable[["Scope", tree.Expression], Value]
+
+
+@dataclass(eq=False)
+class HelperFunction:
+    """A helper function; `references` are the parameters that are handed back.
+
+    `names` are the names of other variables that it, or what it calls, looks at or assigns.
+    """
+
+    name: str
+    code: str
+    result: Type
+    parameters: tuple[Variable, ...]
+    references: tuple[Variable, ...]
+    node: tree.Function
+    recursive: bool = False
+    names: frozenset[str] = frozenset()
+    changes: frozenset[str] = frozenset()
+    """The shared variables that it assigns, as the code names them."""
+    calls: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Loan:
+    """A shared variable, or a part of one, that is handed to a function as a constant reference."""
+
+    position: Position
+    function: str
+    parameter: Variable
+    variable: Variable
+
+
+@dataclass(eq=False)
+class SpecificationNames:
+    """What one specification declares, and the code's name for its context."""
+
+    name: str
+    context: str
+    variables: dict[str, Variable] = field(default_factory=dict)
+    functions: dict[str, HelperFunction] = field(default_factory=dict)
+    parameters: dict[str, Variable] = field(default_factory=dict)
+    """The parameters of the specification, in order; they are variables, too."""
+    misdeclared: set[str] = field(default_factory=set)
+    """Names of variables and functions whose declarations are refused: to use them is no further mistake."""
+    uses: set[str] = field(default_factory=set)
+    """The other specifications whose variables are used."""
+    comparisons: dict[tree.Binary, Comparison] = field(default_factory=dict)
+    """The comparisons that are noted."""
+    lent: list[Loan] = field(default_factory=list)
+
+    def changed_by(self, name: str) -> frozenset[str]:
+        """The shared variables that a function, or one that it calls, assigns, as the code names them."""
+        waiting, seen, found = [name], {name}, frozenset[str]()
+        while waiting:
+            function = self.functions[waiting.pop()]
+            found |= function.changes
+            waiting += function.calls - seen
+            seen |= function.calls
+        return found
+
+
+@dataclass(eq=False)
+class Loop:
+    """A loop or switch around the current statement, and what a `continue` needs before it.
+
+    `blocks` are the names that the step sees: those around the loop, not those around the `continue`.
+    """
+
+    step: Callable[[], None] | None
+    blocks: list[dict[str, Variable]] = field(default_factory=list)
+    flag: str | None = None  # of a switch: tells the loop around it to continue
+    continued: bool = False  # of a switch: whether a `continue` in it sets the flag
+
+
+@dataclass
+class Statements:
+    """Statements while they are written, and the site of the next."""
+
+    found: list[nodes.Statement] = field(default_factory=list)
+    site: int = -1
+
+
+class Shared:
+    """What all functions of all specifications share while they are compiled."""
+
+    def __init__(self, messages: Messages, value_of: ValueOf, *, margins: bool = False) -> None:
+        self.symbols = Symbols()
+        self.margins = margins
+        self.messages = messages
+        self.value_of = value_of
+        self.values = Values(messages)
+        self.functions: dict[str, nodes.Function] = {}
+        self.specifications: list[SpecificationNames] = []
+        self.types: dict[str, Type] = {}
+        """Those of variables, by their names in the form."""
+        self.owners: dict[str, list[SpecificationNames]] = {}
+        """The specifications that have a variable of a name."""
+        self.unsliced: set[str] = set()
+        """The variables of which slices have none of their own, by their names in the form."""
+        self.findings: list[Finding] = []
+        self.publications: list[Publication] = []
+        self.partial = False
+        """Files of the set could not be read: a name that is not known here may be declared there."""
+
+    def define(self, function: nodes.Function) -> None:
+        """Add a function."""
+        self.functions[function.name] = function
+
+    def declare(self, names: SpecificationNames, variable: Variable) -> None:
+        """Add a variable of a specification."""
+        names.variables[variable.name] = variable
+        self.types[variable.code] = variable.type
+        self.owners.setdefault(variable.name, []).append(names)
+        if not variable.sliced:
+            self.unsliced.add(variable.code)
+
+    def foreign(
+        self, own: SpecificationNames, name: str, position: Position
+    ) -> tuple[Variable | None, str | None]:
+        """A variable of another specification, and which that is."""
+        owners = [other for other in self.owners.get(name, ()) if other is not own]
+        if len(owners) > 1:
+            both = " and ".join(other.name for other in owners[:2])
+            raise SpecificationError.at(
+                position, f"{shown(name)} is a variable of {both}; give one of them another name"
+            )
+        if not owners:
+            return None, None
+        variable = owners[0].variables[name]
+        if variable.sliced:
+            raise SpecificationError.at(
+                position, f"each slice of {owners[0].name} has its own {shown(name)}: others cannot see it"
+            )
+        return variable, owners[0].name
+
+
+class Scope:
+    """A function under compilation."""
+
+    def __init__(self, shared: Shared, names: SpecificationNames, role: Role) -> None:
+        self.shared = shared
+        self.names = names
+        self.role: Role = role
+        self.symbols = shared.symbols
+        self.values = shared.values
+        self.messages = shared.messages
+        self.value_of = partial(shared.value_of, self)
+        """Computes an expression."""
+        self.context = names.context
+        self.lines = Statements()
+        self.result: Type = kinds.VOID
+        self.references: tuple[Variable, ...] = ()
+        self.message_type: str | None = None  # of the message that `MESSAGE` is
+        self.pending: str | None = None  # `MESSAGE` was read: the code's name for what this action assigns
+        self.drop_refused: str | None = None  # why `DROP;` may not stand here
+        self.below: set[str] = set()  # shared variables whose declarations are still to come
+        self.loops: list[Loop] = []
+        self.written: set[str] = set()
+        self.changes = False  # something was assigned
+        self.changes_shared: set[str] = set()  # the shared variables that were, as the code names them
+        self.calls: set[str] = set()  # the helper functions that are called
+        self.recursive = False
+        self.notes = shared.margins and role != "init"  # comparisons are noted
+        self.misdeclared: set[str] = set()  # local names whose declarations are refused
+        self._blocks: list[dict[str, Variable]] = [{}]
+
+    # Names
+
+    @contextmanager
+    def block(self) -> Iterator[dict[str, Variable]]:
+        """A block with names of its own."""
+        names: dict[str, Variable] = {}
+        self._blocks.append(names)
+        try:
+            yield names
+        finally:
+            self._blocks.pop()
+
+    def enter(self, loop: Loop) -> None:
+        """A loop or switch begins here."""
+        loop.blocks = self._blocks.copy()
+        self.loops.append(loop)
+
+    @contextmanager
+    def around(self, loop: Loop) -> Iterator[None]:
+        """Names are those that the loop sees."""
+        inner, self._blocks = self._blocks, loop.blocks
+        try:
+            yield
+        finally:
+            self._blocks = inner
+
+    def declare(self, variable: Variable) -> None:
+        """A name of the innermost block."""
+        block = self._blocks[-1]
+        if variable.name in block:
+            raise SpecificationError.at(
+                variable.position, f"{shown(variable.name)} is declared twice in this block"
+            )
+        block[variable.name] = variable
+        if variable.alias is None:
+            self.shared.types[variable.code] = variable.type
+
+    def local(self, name: str, kind: Type, position: Position, *, constant: bool = False) -> Variable:
+        """A new local variable."""
+        variable = Variable(name, kind, self.symbols.fresh("v"), position, constant=constant)
+        self.declare(variable)
+        return variable
+
+    def find(self, name: str, position: Position) -> Variable | None:
+        """The variable of this name, which the code uses: local, of this specification, of another one."""
+        variable, owner = self._known(name, position)
+        if owner is not None:
+            self.names.uses.add(owner)
+        return variable
+
+    def _known(self, name: str, position: Position) -> tuple[Variable | None, str | None]:
+        for block in reversed(self._blocks):
+            if name in block:
+                return block[name], None
+        if name in self.below:
+            raise SpecificationError.at(position, f"{shown(name)} is declared below; move its declaration up")
+        own = self.names.variables.get(name)
+        return (own, None) if own is not None else self.shared.foreign(self.names, name, position)
+
+    def changes_anything(self) -> bool:
+        """Whether what was written so far assigns something, itself or in a function that it calls."""
+        return self.changes or any(self.names.changed_by(called) for called in self.calls)
+
+    def unknown(self, name: str, position: Position, what: str = "variable") -> SpecificationError:
+        """The refusal of a name that nothing has."""
+        wrong = (self.misdeclared, *(other.misdeclared for other in self.shared.specifications))
+        if self.shared.partial or any(name in names for names in wrong):
+            return SpecificationError(())
+        known = [local for block in self._blocks for local in block]
+        known += [*self.names.variables, *self.names.functions]
+        told = instead(name.split("::"))
+        hint = f"; {told}" if told else nearest(name, known)
+        return SpecificationError.at(position, f"there is no {what} {shown(name)}{hint}")
+
+    def published(self, topic: str, kind: str, position: Position) -> None:
+        """Note that the topic is published."""
+        self.shared.publications.append(Publication(self.names.name, topic, kind, position))
+
+    # Statements
+
+    def temporary(self, prefix: str = "t") -> str:
+        """A name for an intermediate value."""
+        return self.symbols.fresh(prefix)
+
+    def site(self, node: tree.Node) -> int:
+        """The site of a node: where it stands, and the variables in it."""
+        return self.symbols.site(Site(node.position, tuple(self._variables(node))))
+
+    @contextmanager
+    def at(self, node: tree.Node) -> Iterator[None]:
+        """Statements written inside belong to this node."""
+        before = self.lines.site
+        self.lines.site = self.site(node)
+        try:
+            yield
+        finally:
+            self.lines.site = before
+
+    @contextmanager
+    def looking(self) -> Iterator[None]:
+        """Comparisons inside are not noted."""
+        before, self.notes = self.notes, False
+        try:
+            yield
+        finally:
+            self.notes = before
+
+    def add(self, statement: nodes.Statement) -> None:
+        """Append a statement."""
+        self.lines.found.append(statement)
+
+    def evaluate(self, value: nodes.Expression) -> None:
+        """Append an expression for its effect."""
+        self.add(nodes.Evaluate(self.lines.site, value))
+
+    @contextmanager
+    def nested(self) -> Iterator[list[nodes.Statement]]:
+        """Statements written inside are these, and not of the function itself."""
+        outer, self.lines.found = self.lines.found, []
+        try:
+            yield self.lines.found
+        finally:
+            self.lines.found = outer
+
+    def function(
+        self, name: str, parameters: tuple[str, ...], *, happens: int | None = None
+    ) -> nodes.Function:
+        """What was written, as a function."""
+        shared = tuple(sorted(self.written))
+        return nodes.Function(name, self.context, parameters, tuple(self.lines.found), shared, happens)
+
+    def _variables(self, node: tree.Node) -> Iterator[SiteVariable]:
+        seen: set[str] = set()
+        for name in names_in(node):
+            if name in seen or len(seen) >= 16:
+                continue
+            seen.add(name)
+            try:
+                variable, _ = self._known(name, node.position)
+            except SpecificationError:
+                continue
+            if variable is not None and variable.alias is None:
+                steady = kinds.is_scalar(variable.type) or isinstance(variable.type, kinds.String)
+                yield SiteVariable(name, variable.code, variable.type, steady)
+
+
+def names_in(node: object) -> Iterator[str]:
+    """The simple names in an expression, or in the expressions of a statement that holds no other statement."""
+    waiting = [node]
+    while waiting:
+        current = waiting.pop()
+        if isinstance(current, tree.Name):
+            if len(current.parts) == 1:
+                yield current.parts[0]
+        elif isinstance(current, tuple):
+            waiting += current
+        elif isinstance(current, tree.Node) and (current is node or not isinstance(current, tree.Statement)):
+            waiting += [getattr(current, name) for name in reversed(current.__dataclass_fields__)]

@@ -1,0 +1,151 @@
+"""Parametric specifications: their parameters as variables, and what each event binds of them.
+
+An event binds a parameter of the specification by one of its own with that name and type. Beside its function it has
+one that gives the values that it binds, for which nothing else of the message is read.
+"""
+
+from collections.abc import Iterable, Sequence
+
+from rosmop.check.places import Variable
+from rosmop.check.scope import Shared, SpecificationNames
+from rosmop.form import nodes
+from rosmop.form.compiled import EventCode, PropertyCode, Slicing
+from rosmop.form.positions import Finding
+from rosmop.logics.bounded import BoundedProperty
+from rosmop.logics.interface import CompiledProperty
+from rosmop.logics.past import PastProperty
+from rosmop.text import tree
+from rosmop.text.errors import SpecificationError
+from rosmop.types import kinds
+from rosmop.types.messages import shown
+from rosmop.types.resolve import resolve
+
+MOST_PARAMETERS = 6
+
+_ACTS = (nodes.Log, nodes.Throttle, nodes.Drop, nodes.Publish, nodes.Invoke)
+
+
+def declare_parameters(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
+    """Make the parameters variables that each slice has a value of, and that nothing assigns."""
+    for parameter in specification.parameters:
+        try:
+            kind = resolve(parameter.type, shared.messages)
+            if not (kinds.is_number(kind) or isinstance(kind, kinds.String | kinds.Time | kinds.Duration)):
+                text = f"a parameter of a specification is a string, a number or a time, and {kind} is none"
+                raise SpecificationError.at(parameter.position, text)
+            if parameter.name in names.variables:
+                raise SpecificationError.at(
+                    parameter.position, f"the parameter {shown(parameter.name)} occurs twice"
+                )
+        except SpecificationError as error:
+            shared.findings += error.findings
+            names.misdeclared.add(parameter.name)
+            continue
+        code = shared.symbols.fresh("g")
+        variable = Variable(
+            parameter.name, kind, code, parameter.position, shared=True, constant=True, sliced=True
+        )
+        names.parameters[parameter.name] = variable
+        shared.declare(names, variable)
+    if len(specification.parameters) > MOST_PARAMETERS:
+        text = f"a specification has at most {MOST_PARAMETERS} parameters"
+        shared.findings.append(Finding(specification.parameters[-1].position, "error", text))
+
+
+def check_own(names: SpecificationNames, variable: Variable) -> None:
+    """Refuse a variable of which not each slice can have its own: what slices hold is bounded by their number."""
+    if variable.sliced and not (
+        kinds.is_number(variable.type) or isinstance(variable.type, kinds.Time | kinds.Duration)
+    ):
+        text = (
+            f"each slice of {names.name} has its own {shown(variable.name)}, so it is a number or a time; "
+            "write `static` for one that all slices share"
+        )
+        raise SpecificationError.at(variable.position, text)
+
+
+def slicing_of(
+    shared: Shared, names: SpecificationNames, events: Iterable[EventCode], properties: Iterable[PropertyCode]
+) -> Slicing | None:
+    """What the slices of a specification differ in; None without parameters."""
+    if not names.parameters:
+        return None
+    own = (
+        variable
+        for variable in names.variables.values()
+        if variable.sliced and variable.name not in names.parameters
+    )
+    functions = [event.function for event in events]
+    functions += (name for code in properties for name in code.handlers.values())
+    return Slicing(
+        tuple((parameter.name, parameter.code, parameter.type) for parameter in names.parameters.values()),
+        tuple(variable.code for variable in own),
+        _enforces(shared, functions),
+    )
+
+
+def _enforces(shared: Shared, functions: Sequence[str]) -> bool:
+    """Whether these functions, or those that they call, drop, change or publish a message."""
+    waiting, seen = [*functions], {*functions}
+    while waiting:
+        function = shared.functions.get(waiting.pop())
+        for node in () if function is None else nodes.walk(function.body):
+            if isinstance(node, nodes.Drop | nodes.Publish) or (
+                isinstance(node, nodes.WriteBack) and node.writes
+            ):
+                return True
+            if isinstance(node, nodes.Invoke) and node.function not in seen:
+                seen.add(node.function)
+                waiting.append(node.function)
+    return False
+
+
+def binds(names: SpecificationNames, event: tree.Event) -> tuple[int, ...]:
+    """Which parameters of the specification an event binds, by their numbers."""
+    own = {parameter.name for parameter in event.parameters}
+    return tuple(number for number, name in enumerate(names.parameters) if name in own)
+
+
+def creates(specification: tree.Specification, event: tree.Event) -> bool:
+    """Whether a slice may begin with an event: with all where none is a `creation event`."""
+
+    def marked(event: tree.Event) -> bool:
+        return any(modifier.parts == ("creation",) for modifier in event.modifiers)
+
+    return marked(event) or not any(map(marked, specification.events))
+
+
+def acts(function: nodes.Function, shared: Shared) -> bool:
+    """Whether the action of an event does more than to change the slice's own variables."""
+    if not shared.unsliced.isdisjoint(function.shared):
+        return True
+    return any(
+        isinstance(node, _ACTS) or (isinstance(node, nodes.WriteBack) and bool(node.writes))
+        for node in nodes.walk(function.body)
+    )
+
+
+def unsliceable(compiled: CompiledProperty) -> str | None:
+    """Why slices cannot have a run each of a property."""
+    if isinstance(compiled, PastProperty) and compiled.timed:
+        return (
+            "a formula with several bounds of time, or with one that neither begins at 0 nor ends at `inf`, cannot be "
+            "sliced: what a slice keeps of it has no bound; write a property for each bound"
+        )
+    if isinstance(compiled, PastProperty):
+        return "the formula has too many states to be sliced; split it into several properties"
+    if isinstance(compiled, BoundedProperty) and any(compiled.folded.bounds):
+        return (
+            "a formula that looks back and forward within bounds of time cannot be sliced: what a slice keeps of it "
+            "has no bound; write a property for each"
+        )
+    return None
+
+
+def check_parameters(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
+    """Every parameter is bound by an event."""
+    bound = {number for event in specification.events for number in binds(names, event)}
+    for number, (name, variable) in enumerate(names.parameters.items()):
+        if number not in bound:
+            text = f"no event binds the parameter {shown(name)}: give an event a parameter of that name"
+            shared.findings.append(Finding(variable.position, "error", text))

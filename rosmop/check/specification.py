@@ -1,0 +1,305 @@
+"""Specifications as code: a set of files becomes one module, and a description of what is in it.
+
+Specifications of one set see each other's variables. Everything wrong with any of them is found in one pass.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import TypeVar
+
+from rosmop.check.enforcement import (
+    blocking_refused,
+    enforcement,
+    topics_of_remedy,
+    with_remedy,
+)
+from rosmop.check.events import compile_event
+from rosmop.check.expressions import value_of
+from rosmop.check.functions import (
+    compile_function,
+    compile_handler,
+    compile_start,
+    declare_functions,
+    declare_variables,
+)
+from rosmop.check.lint import kept_slices, lint_property, unused_events
+from rosmop.check.reach import identity, reached
+from rosmop.check.scope import Shared, SpecificationNames
+from rosmop.check.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
+from rosmop.check.slips import slips
+from rosmop.form import nodes
+from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
+from rosmop.form.positions import Finding
+from rosmop.logics.catalogue import compile_property
+from rosmop.logics.interface import CompiledProperty, FormulaError
+from rosmop.runtime.context import MAX_BYTES
+from rosmop.text import tree
+from rosmop.text.errors import SpecificationError
+from rosmop.types.messages import Messages, nearest, shown
+from roswire.definitions import Definitions
+
+_T = TypeVar("_T")
+
+_TAKEN = "revisions"
+MODIFIERS = frozenset({"hold", "begin"})
+IGNORED_MODIFIERS = frozenset({"unsynchronized", "decentralized", "perthread", "suffix", "creation"})
+"""Modifiers of MOP that say how a monitor is generated, and mean nothing here (`creation` does before an event)."""
+
+
+def compile_files(files: Sequence[tree.File], definitions: Definitions, *, margins: bool = False) -> Compiled:
+    """Compile a set of files; raises `SpecificationError` with everything that is wrong.
+
+    With `margins` the comparisons of numbers are noted (`margins.py`).
+    """
+    shared = Shared(Messages(definitions), value_of, margins=margins)
+    pairs = [(file, specification) for file in files for specification in file.specifications]
+    compiled = _compile_all(shared, pairs)
+    findings = list(dict.fromkeys(shared.findings))
+    if any(finding.severity == "error" for finding in findings):
+        raise SpecificationError(findings)
+    return Compiled(
+        tuple(compiled),
+        tuple(sorted(findings, key=lambda finding: finding.position)),
+        shared.functions,
+        shared.symbols.sites,
+        shared.types,
+        shared.messages,
+        tuple(shared.publications),
+    )
+
+
+def findings_of(files: Sequence[tree.File], definitions: Definitions) -> list[Finding]:
+    """What is wrong with these files while others of their set cannot be read; names may be declared in those."""
+    shared = Shared(Messages(definitions), value_of)
+    shared.partial = True
+    _compile_all(shared, [(file, specification) for file in files for specification in file.specifications])
+    return list(dict.fromkeys(shared.findings))
+
+
+def _compile_all(
+    shared: Shared, pairs: Sequence[tuple[tree.File, tree.Specification]]
+) -> list[SpecificationCode]:
+    names = [_declare(shared, specification) for _, specification in pairs]
+    _check_names(shared, [specification for _, specification in pairs])
+    compiled = []
+    for (file, specification), own in zip(pairs, names, strict=True):
+        code = _compile(shared, own, file, specification)
+        if code is not None:
+            compiled.append(code)
+    _check_types(shared, compiled)
+    return compiled
+
+
+def _declare(shared: Shared, specification: tree.Specification) -> SpecificationNames:
+    shared.symbols.begin(specification.name)
+    names = SpecificationNames(specification.name, shared.symbols.fresh("c"))
+    shared.specifications.append(names)
+    declare_parameters(shared, names, specification)
+    declare_variables(shared, names, specification)
+    declare_functions(shared, names, specification)
+    size = sum(shared.values.width(variable.type) for variable in names.variables.values())
+    if size > MAX_BYTES:
+        shared.findings.append(
+            Finding(
+                specification.position,
+                "error",
+                f"the variables take {size} bytes; a specification may hold {MAX_BYTES >> 20} MiB",
+            )
+        )
+    return names
+
+
+def _check_names(shared: Shared, specifications: Sequence[tree.Specification]) -> None:
+    seen: dict[str, tree.Specification] = {}
+    owners: dict[str, str] = {}
+    for specification, names in zip(specifications, shared.specifications, strict=True):
+        if specification.name in seen:
+            first = seen[specification.name].position
+            text = (
+                f"there is another specification {shown(specification.name)} at {first}; give it another name"
+            )
+            shared.findings.append(Finding(specification.position, "error", text))
+        seen[specification.name] = specification
+        for variable in names.variables.values():
+            if variable.sliced:
+                continue
+            other = owners.setdefault(variable.name, names.name)
+            if other != names.name:
+                text = f"{shown(variable.name)} is also a variable of {other}; each has its own"
+                shared.findings.append(Finding(variable.position, "warning", text))
+
+
+def _compile(
+    shared: Shared, names: SpecificationNames, file: tree.File, specification: tree.Specification
+) -> SpecificationCode | None:
+    shared.symbols.begin(specification.name)
+    _check_head(shared, specification)
+    start = _noted(shared, partial(compile_start, shared, names, specification))
+    for function in names.functions.values():
+        _noted(shared, partial(compile_function, shared, names, function))
+    events = [
+        _noted(shared, partial(compile_event, shared, names, specification, event))
+        for event in specification.events
+    ]
+    check_parameters(shared, names, specification)
+    good = tuple(event for event in events if event is not None)
+    properties = [_property(shared, names, specification, node) for node in specification.properties]
+    shared.findings += _seen_changes(names)
+    if start is None or len(good) < len(events) or None in properties:
+        return None
+    known = tuple(code for code in properties if code is not None)
+    shared.findings += unused_events(specification, known)
+    shared.findings += slips(specification)
+    if names.parameters:
+        shared.findings += kept_slices(names.name, good, known, specification.properties)
+    variables = {variable.name: variable.code for variable in names.variables.values()}
+    uses = frozenset(names.uses)
+    return SpecificationCode(
+        specification.name,
+        specification.position,
+        identity(specification),
+        reached(specification, shared.messages.definitions),
+        file.name,
+        any(modifier.parts == ("hold",) for modifier in specification.modifiers),
+        start,
+        names.context,
+        good,
+        known,
+        variables,
+        uses,
+        tuple(sorted(names.comparisons.values(), key=lambda comparison: comparison.position)),
+        slicing_of(shared, names, good, known),
+        any(modifier.parts == ("begin",) for modifier in specification.modifiers),
+    )
+
+
+def _seen_changes(names: SpecificationNames) -> Iterator[Finding]:
+    """Constant references through which a function would see what it changes: here they are what they were."""
+    for loan in names.lent:
+        if loan.variable.code in names.changed_by(loan.function):
+            text = (
+                f"`{loan.function}` gives `{loan.variable.name}` another value, which `{loan.parameter.name}` would"
+                f" not show: leave out the `&` of `{loan.parameter.name}`, or use `{loan.variable.name}` itself"
+            )
+            yield Finding(loan.position, "error", text)
+
+
+def _noted(shared: Shared, action: Callable[[], _T]) -> _T | None:
+    """What the action returns; None if it refused, which is noted."""
+    try:
+        return action()
+    except SpecificationError as error:
+        shared.findings += error.findings
+        return None
+
+
+def _check_head(shared: Shared, specification: tree.Specification) -> None:
+    for modifier in specification.modifiers:
+        word = modifier.parts[0]
+        if word in IGNORED_MODIFIERS:
+            shared.findings.append(Finding(modifier.position, "warning", f"{shown(word)} means nothing here"))
+        elif word not in MODIFIERS:
+            text = f"{shown(word)} is no modifier of a specification{nearest(word, MODIFIERS)}"
+            shared.findings.append(Finding(modifier.position, "error", text))
+    if {modifier.parts[0] for modifier in specification.modifiers} >= MODIFIERS:
+        text = "`hold` and `begin` exclude each other: leave one of them out"
+        shared.findings.append(Finding(specification.position, "error", text))
+    if specification.name == _TAKEN:
+        text = f"no specification can be called {shown(_TAKEN)}: over REST /v1/monitors/{_TAKEN} is their history"
+        shared.findings.append(Finding(specification.position, "error", text))
+    if not specification.events:
+        text = f"the specification {shown(specification.name)} has no event; write `event name() /topic …`"
+        shared.findings.append(Finding(specification.position, "error", text))
+    seen = set()
+    for event in specification.events:
+        if event.name in seen:
+            shared.findings.append(
+                Finding(event.position, "error", f"the event {shown(event.name)} occurs twice")
+            )
+        seen.add(event.name)
+        for modifier in event.modifiers:
+            if specification.parameters and modifier.parts == ("creation",):
+                continue
+            text = f"the modifier {shown(modifier.parts[0])} of an event means nothing here"
+            shared.findings.append(Finding(modifier.position, "warning", text))
+
+
+# Properties
+
+
+def _property(
+    shared: Shared, names: SpecificationNames, specification: tree.Specification, node: tree.Property
+) -> PropertyCode | None:
+    events = tuple(dict.fromkeys(event.name for event in specification.events))
+    try:
+        compiled = compile_property(node.logic, node.formula, events, node.formula_position, node.position)
+    except FormulaError as error:
+        shared.findings += error.findings
+        return None
+    why = unsliceable(compiled) if specification.parameters else None
+    if why is not None:
+        shared.findings.append(Finding(node.position, "error", why))
+    handlers: dict[str, str] = {}
+    published = _noted(shared, partial(topics_of_remedy, names, compiled))
+    if published is None:
+        return None
+    for handler in with_remedy(compiled, node):
+        text = _handler_refused(compiled, handlers, handler)
+        if text is not None:
+            shared.findings.append(Finding(handler.position, "error", text))
+            continue
+        refused = blocking_refused(compiled, specification, handler.category)
+        function = _noted(shared, partial(compile_handler, shared, names, handler, refused))
+        if function is not None:
+            handlers[handler.category] = function
+    shared.findings += lint_property(compiled, node)
+    made = {
+        category: {type(part) for part in nodes.walk(shared.functions[name])}
+        for category, name in handlers.items()
+    }
+    dropping = [category for category, parts in made.items() if nodes.Drop in parts]
+    if compiled.suppresses:
+        at = {handler.category: handler.position for handler in node.handlers}
+        shared.findings += [
+            Finding(
+                at[category],
+                "warning",
+                f"when @{category} drops the message, `__RESET;` does nothing: for `{compiled.logic}` a dropped message"
+                " has not happened; leave `__RESET;` out",
+            )
+            for category in dropping
+            if nodes.Reset in made[category]
+        ]
+    said = enforcement(compiled, specification, published, dropping)
+    return PropertyCode(compiled, handlers, tuple(handlers), said)
+
+
+def _handler_refused(
+    compiled: CompiledProperty, handlers: Mapping[str, str], handler: tree.Handler
+) -> str | None:
+    if handler.category in handlers:
+        return f"@{handler.category} is handled twice; put both into one handler"
+    if handler.category not in compiled.categories:
+        known = nearest(handler.category, compiled.categories)
+        return f"{compiled.logic} has no category {shown(handler.category)} here{known}"
+    return None
+
+
+def _check_types(shared: Shared, compiled: Sequence[SpecificationCode]) -> None:
+    """A topic has one type: in all events, and in all that is published."""
+    types: dict[tuple[str, str | None], tuple[str, object]] = {}
+    for specification in compiled:
+        for event in specification.events:
+            if event.topic is None or event.type is None:
+                continue
+            kind = event.service_type or event.type
+            key = (event.topic, "service" if event.part else None)
+            known, where = types.setdefault(key, (kind, event.position))
+            if known != kind:
+                text = f"{event.topic} has the type {known} at {where}, and {kind} here; a topic has one type"
+                shared.findings.append(Finding(event.position, "error", text))
+    for published in shared.publications:
+        known, where = types.setdefault((published.topic, None), (published.type, published.position))
+        if known != published.type:
+            text = f"{published.topic} has the type {known} at {where}, and {published.type} here"
+            shared.findings.append(Finding(published.position, "error", text))

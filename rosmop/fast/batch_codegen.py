@@ -1,0 +1,609 @@
+"""The walk over a read, as WebAssembly: frame by frame, the events of every message in order, patches in place.
+
+`written` writes one module for a set: for each topic an export `feed(at, end, now)` that takes the frames
+(4 bytes of length, little-endian, and the message) from `at` to before `end` in the memory, and answers where the first
+one begins that is left (i64: the low 32 bits), how many effects there are (the next 24), and `LEFT` if that one is for
+Python.
+
+- What a dropped message did to the states of properties that suppress it (`form.Advance.suppresses`) is taken back.
+- A message is either done, with all that follows from it, or left, and then `Feed.undo` says how to take back what was
+  begun. After a trap the message that is left begins at the number that stands at `POSITION`; if that is 0, nothing has
+  begun.
+- What holds for all messages stands at `Cells.source`: their sender; of which events (bit N for the topic's event N)
+  a drop is left, and with `LOUD` a change is (*told*); bits of the topic's specifications (*enabled*), and of which
+  verdicts (bit N for `Feed.verdicts[N]`) are only counted (*counted*): what comes to another is left.
+- An effect is 16 bytes: a set of events (i64) that changed so many (i64) messages on end, or -1 and from where to
+  where (i32, i32) frames were dropped.
+- Where a message brings a property with a clock to a deadline before the time at `Cells.until`, the walk ends behind it
+  with `SOONER`.
+- An event that happened is counted at `Feed.counters`, its drops behind those of all, and behind these the verdicts;
+  with `TOLD` there were some.
+"""
+
+import struct
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from rosmop.fast.abi import (
+    AREA,
+    LEFT,
+    NOW,
+    POSITION,
+    ROOM,
+    SAID,
+    SURE,
+    TOLD,
+    UNDO,
+    Cells,
+    Feed,
+    FeedModule,
+)
+from rosmop.fast.assembly import PAGE, assembled
+from rosmop.fast.codegen import CHANGED, DROPPED, HAPPENED, RESET, Writer, Written
+from rosmop.fast.function_parts import ELSEWHERE
+from rosmop.fast.layout import NotScalarError
+from rosmop.fast.wasm import (
+    ELSE,
+    END,
+    I32,
+    I64,
+    IF,
+    NOTHING,
+    RETURN,
+    SELECT,
+    constant,
+    load,
+    row,
+    store,
+    unsigned,
+)
+from rosmop.form import nodes
+from rosmop.run.causes import NO_NUMBER, SEQ
+from rosmop.run.explain import CLOCKED_ROOM, ENTRY, KEPT, RING, RUNS
+from rosmop.runtime.context import BUDGET
+from rosmop.runtime.values import Values
+
+EFFECT = 4
+"""Where the address of the last effect stands."""
+
+MAX_EVENTS = 63
+MAX_VERDICTS = 63
+MAX_EFFECTS = 4096
+MAX_TABLES = 8 << 20
+"""Bytes that the tables of all properties of a set may take."""
+
+_SLACK = 16  # bytes behind the frames that may be looked at
+_ADD, _SUB, _AND, _EQZ = b"\x6a", b"\x6b", b"\x71", b"\x45"
+_AND64, _OR64, _XOR64, _SHL64, _SHR64, _EQZ64 = b"\x83", b"\x84", b"\x85", b"\x86", b"\x88", b"\x50"
+_BR, _BR_IF, _LOOP, _BLOCK = b"\x0c", b"\x0d", b"\x03\x40", b"\x02\x40"
+
+
+@dataclass(frozen=True)
+class WrittenModule(FeedModule):
+    """A module whose `code` is WebAssembly, and what else there is to know of it."""
+
+    budgets: Mapping[str, int]
+    """Where the budget of each specification stands, by its context."""
+    strings: Mapping[bytes, int]
+    """Where constant strings stand."""
+    rooms: Sequence[range]
+    """Where vectors stand that are kept or made."""
+    places: Sequence[range]
+    """What it uses for messages that it makes."""
+    handlers: Mapping[str, Sequence[int]]
+    """The numbers of the functions of each topic's verdicts (`Feed.verdicts`)."""
+    functions: int
+    """How many functions there are besides those that are exported for topics."""
+
+
+def written(
+    functions: Mapping[str, nodes.Function],
+    components: Sequence[nodes.Component],
+    values: Values,
+    stamped: Container[str] = (),
+) -> WrittenModule:
+    """The module of all topics that can have a walk. The messages of the `stamped` begin with a `std_msgs/Header`."""
+    shared: dict[str, Cells] = {}
+    writer = Writer(functions, shared, values)
+    cells = []
+    for component in components:
+        variables = (*component.variables, *component.noted)
+        room = component.properties + len(variables)
+        base, source, until = writer.take(8 * room), writer.take(32), writer.take(8)
+        cells.append(Cells(base, component.properties, source, component.noted, until=until))
+        shared |= dict.fromkeys(variables, cells[-1])
+    effects = writer.take(16 * (MAX_EFFECTS + 2))
+    feeds: dict[str, Feed] = {}
+    walks: dict[str, _Walk] = {}
+    tables = _Tables(writer)
+    for component, own in zip(components, cells, strict=True):
+        for topic, events in component.topics:
+            try:
+                walks[topic] = _Walk(writer, own, tables, effects, events, stamped=topic in stamped)
+            except (NotScalarError, RecursionError):
+                continue
+    settled = [writer.settling(own) for own in cells if own.kept]
+    codes: list[bytes] = []
+    for topic, walk in walks.items():
+        try:
+            codes.append(walk.code())
+        except (NotScalarError, RecursionError):
+            continue
+        feeds[topic] = walk.feed(f"feed {len(feeds)}")
+    frames = -(-writer.take(0) // PAGE) * PAGE  # the kernel copies faster from and to what is aligned
+    memory = -(-(frames + AREA + _SLACK) // PAGE) * PAGE
+    wholes = [(one.parameters, one.result, one.code) for one in writer.written]
+    exports = {f"settle {number}": number for number in settled}
+    exports |= {feed.name: len(wholes) + place for place, feed in enumerate(feeds.values())}
+    wholes += [(_PARAMETERS, I64, code) for code in codes]
+    code = assembled(wholes, exports, writer.constants, memory)
+    return WrittenModule(
+        code,
+        memory,
+        frames,
+        effects,
+        feeds,
+        cells,
+        writer.throttles,
+        writer.lines,
+        writer.said,
+        writer.publications,
+        writer.budgets,
+        {raw: writer.constants[raw] for raw in writer.strings},
+        writer.rooms,
+        writer.places,
+        {topic: [one.number for one in walks[topic].handlers()] for topic in feeds},
+        len(writer.written),
+    )
+
+
+class _Tables:
+    """The tables of properties: 2 bytes for each state; of times 8."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._size = 0
+
+    def address(self, table: tuple[int, ...], code: str = "h") -> int:
+        try:
+            raw = struct.pack(f"<{len(table)}{code}", *table)
+        except struct.error:
+            raise NotScalarError("a table of a property") from None
+        if raw not in self._writer.constants:
+            self._size += len(raw)
+            if self._size > MAX_TABLES:
+                raise NotScalarError("tables of properties")
+        return self._writer.constant(raw)
+
+
+_AT, _END, _NOW, _TOLD, _ENABLED = range(5)
+_SIZE, _NEXT, _WHO, _LAST, _FIRST = range(5, 10)
+_PARAMETERS = (I32, I32, I64)
+
+
+def _get(local: int) -> bytes:
+    return b"\x20" + unsigned(local)
+
+
+def _set(local: int, value: bytes) -> bytes:
+    return value + b"\x21" + unsigned(local)
+
+
+class _Walk:
+    """Writes the walk for one topic. Raises `NotScalarError` if no message would come through."""
+
+    def __init__(
+        self,
+        writer: Writer,
+        cells: Cells,
+        tables: _Tables,
+        effects: int,
+        events: Sequence[nodes.Event],
+        *,
+        stamped: bool,
+    ) -> None:
+        if len(events) > MAX_EVENTS:
+            raise NotScalarError("many events")
+        self._cells = cells
+        self._events = events
+        self._effects = effects
+        self._writer = writer
+        self._written = [writer.event(event.function) for event in events]
+        self._known_tables = tables
+        self._handlers: dict[tuple[int | None, int], tuple[int, Written | None]] = {}
+        self.verdicts: list[tuple[int, int, int]] = []
+        self._tables = [
+            [self._table(number, place) for place in range(len(event.advances))]
+            for number, event in enumerate(events)
+        ]
+        functions = [*self._written, *self.handlers()]
+        says = any(written.says for written in functions)
+        self._publishes = sorted({each for written in functions for each in written.publishes})
+        self._says = says or bool(self._publishes)
+        if says and stamped and any(written.early for written in functions):
+            raise NotScalarError("output about a message whose header is changed")
+        self._budgets = sorted({writer.budget(writer.functions[event.function].context) for event in events})
+        self._counters = writer.take(16 * len(events) + 8 * len(self.verdicts))
+        assigned = sorted(
+            {name for written in functions for name in written.assigned}.difference(cells.noted)
+        )
+        self._settles = any(cells.texts_of(name) for name in assigned)
+        self._undo = tuple(
+            (address, cells.vectors[name] + 2 * ROOM if name in cells.vectors else writer.take(8))
+            for name in assigned
+            for address in cells.words(name)
+        )
+        self._log = writer.take(16 * sum(written.writes for written in self._written))
+        properties = {
+            advance.property for event in events for advance in event.advances if advance.property is not None
+        }
+        self._suppressing = {
+            advance.property for event in events for advance in event.advances if advance.suppresses
+        }
+        self._states = {
+            number: _FIRST + len(events) + place for place, number in enumerate(sorted(properties))
+        }
+        for advance in (advance for event in events for advance in event.advances):
+            if advance.property is not None and advance.property not in cells.exits:
+                room = ENTRY.size * len(advance.table) if advance.clock is None else CLOCKED_ROOM
+                cells.exits[advance.property] = writer.take(room)
+                if advance.clock is not None:
+                    cells.clocks[advance.property] = writer.take(16)
+        self._stamped = stamped
+        self._following = _FIRST + len(events) + len(self._states)
+        self._sooner = self._following + 2
+        clocked = sorted(properties.intersection(cells.clocks))
+        self._clocks = {number: self._following + 3 + 3 * place for place, number in enumerate(clocked)}
+        """The locals of each property with a clock for what stands at `Cells.clocks`, and its number of steps."""
+        self._telling = self._following + 3 + 3 * len(clocked)
+        """The first of the locals of handlers."""
+
+    def feed(self, name: str) -> Feed:
+        """What is said about it."""
+        return Feed(
+            name,
+            any(map(self._drops, range(len(self._events)))),
+            any(written.writes for written in self._written),
+            self.verdicts,
+            self._counters,
+            self._log,
+            self._undo,
+            all(written.brief for written in (*self._written, *self.handlers())),
+            [written.number for written in self._written],
+            self._says,
+            f"settle {self._cells.settle}" if self._settles else "",
+            self._publishes,
+        )
+
+    def handlers(self) -> list[Written]:
+        """The handlers that run here, by their verdicts."""
+        return [written for _, written in self._handlers.values() if written is not None]
+
+    def _drops(self, number: int) -> bool:
+        run = [written for advance in self._events[number].advances for _, written in self._handled(advance)]
+        return any(written.drops for written in (self._written[number], *run))
+
+    def _table(self, number: int, place: int) -> int | None:
+        """Where the table of a step stands (-1: that handler does not run here), None where it does nothing."""
+        advance = self._events[number].advances[place]
+        left: set[int] = set()
+        for index, handled in enumerate(advance.handlers):
+            key = advance.property, index
+            if key not in self._handlers and not handled.states.isdisjoint(advance.table):
+                try:
+                    written = self._writer.event(handled.function)
+                except (NotScalarError, RecursionError):
+                    written = None
+                if len(self.verdicts) == MAX_VERDICTS:
+                    written = None
+                self._handlers[key] = len(self.verdicts), written
+                self.verdicts += [(number, place, index)] if written is not None else []
+            if key in self._handlers and self._handlers[key][1] is None:
+                left |= handled.states
+        table = tuple(-1 if state in left else state for state in advance.table)
+        if not self._written[number].passes and max(table) < 0:
+            raise NotScalarError("a verdict with each message")
+        idle = advance.clock is None and not self._handled(advance) and table == tuple(range(len(table)))
+        return None if idle else self._known_tables.address(table)
+
+    def _handled(self, advance: nodes.Advance) -> dict[tuple[int, Written], frozenset[int]]:
+        """The verdicts that a step may come to here, with what their handlers do, and the states of each."""
+        found = {}
+        for index, handled in enumerate(advance.handlers):
+            verdict, written = self._handlers.get((advance.property, index), (0, None))
+            if written is not None and not handled.states.isdisjoint(advance.table):
+                found[verdict, written] = handled.states
+        return found
+
+    def code(self) -> bytes:
+        """The function."""
+        self._heap = self._writer.heap() if self._writer.has_heap else 0
+        here = _get(_AT) + b"\xad" + load(I32, EFFECT) + constant(I32, self._effects) + _SUB
+        here += constant(I32, 4) + b"\x76\xad" + constant(I64, 32) + _SHL64 + _OR64
+        if self.verdicts:
+            here += _get(self._telling + 2) + b"\xad" + constant(I64, TOLD.bit_length() - 1) + _SHL64 + _OR64
+        settle = b"\x10" + unsigned(self._cells.settle) + b"\x1a" if self._settles else b""
+        over = store(I32, POSITION, constant(I32, 0))
+        body = [
+            store(I64, NOW, _get(_NOW)),
+            store(I32, EFFECT, constant(I32, self._effects)),
+            store(I32, SAID, constant(I32, self._writer.said)) if self._says else b"",
+            store(I32, self._heap, constant(I32, self._heap + 8)) if self._heap else b"",
+            _set(_TOLD, load(I64, self._cells.source + 8)),
+            _set(_ENABLED, load(I64, self._cells.source + 16)),
+            *(_set(local, load(I32, self._state(number))) for number, local in self._states.items()),
+            *(_set(local, load(I64, at)) for _, local, at in self._clock_cells()),
+            _set(self._telling + 1, load(I64, self._cells.source + 24)) if self.verdicts else b"",
+            self._begin(), _BLOCK, _BLOCK, _LOOP,
+            self._frame(),
+            _BLOCK, _BLOCK,
+            *(self._event(number) for number in range(len(self._events))),
+            self._changed() if any(written.writes for written in self._written) else b"",
+            _BR + b"\x01", END,
+            self._dropped(), END,
+            self._done(),
+            _BR + b"\x00", END, END,
+            settle, over, here, _get(self._sooner), b"\xad", constant(I64, 61), _SHL64, _OR64, RETURN, END,
+            over, here, constant(I64, LEFT), _OR64, END,
+        ]  # fmt: skip
+        numbered = [I32] * (len(self._events) + len(self._states) + 3)
+        made = [I64, I64, I32, I32, I64, I32, *numbered, *[I64] * (3 * len(self._clocks) + 2)]
+        made += [I32] * (4 + len(self.verdicts))  # see `_handle`
+        whole = row([b"\x01" + bytes((machine,)) for machine in made]) + b"".join(body)
+        return unsigned(len(whole)) + whole
+
+    def _state(self, number: int) -> int:
+        return self._cells.base + 8 * number
+
+    def _clock_cells(self) -> Iterator[tuple[int, int, int]]:
+        """The properties with clocks, their locals, and where they stand: when it began, its time, and the steps."""
+        for number, local in self._clocks.items():
+            clock = self._cells.clocks[number]
+            for place, at in enumerate((clock, clock + 8, self._cells.exits[number])):
+                yield number, local + place, at
+
+    def _begin(self) -> bytes:
+        """Nothing has happened to the frame at hand: the runtime stops, if it does, at calls and where loops begin."""
+        code = store(I32, POSITION, _get(_AT)) + store(I32, UNDO, constant(I32, self._log))
+        code += store(I32, SURE, load(I32, SAID)) if self._says else b""
+        code += store(I32, self._heap + 4, load(I32, self._heap)) if self._heap else b""
+        return code + b"".join(store(I64, kept, load(I64, address)) for address, kept in self._undo)
+
+    def _frame(self) -> bytes:
+        """Leave unless the whole frame is there, and a place for an effect."""
+        room = _get(_END) + _get(_AT) + _SUB
+        stop = _BR_IF + b"\x01"
+        code = room + constant(I32, 4) + b"\x49" + stop
+        code += (
+            _set(_SIZE, _get(_AT) + b"\x28\x00\x00")
+            + _get(_SIZE)
+            + room
+            + constant(I32, 4)
+            + _SUB
+            + b"\x4b"
+            + stop
+        )
+        full = constant(I32, self._effects + 16 * MAX_EFFECTS)
+        code += load(I32, EFFECT) + full + b"\x4f" + stop
+        code += _set(_NEXT, _get(_AT) + _get(_SIZE) + _ADD + constant(I32, 4) + _ADD) + _set(
+            _WHO, constant(I64, 0)
+        )
+        code += b"".join(store(I64, budget, constant(I64, BUDGET)) for budget in self._budgets)
+        return code + b"".join(_set(_FIRST + number, constant(I32, 0)) for number in range(len(self._events)))
+
+    def _event(self, number: int) -> bytes:
+        """Blocks from here: the `if`, dropped (1), done (2), the loop (3), out (4), left (5)."""
+        event, written, bits = self._events[number], self._written[number], _FIRST + number
+        left = _BR_IF + b"\x05"
+        code = (
+            _get(_ENABLED) + constant(I64, 1 << event.specification) + _AND64 + _EQZ64 + _EQZ + IF + NOTHING
+        )
+        code += _set(
+            bits, _get(_AT) + constant(I32, 4) + _ADD + _get(_SIZE) + b"\x10" + unsigned(written.number)
+        )
+        code += self._is(bits, ELSEWHERE) + left
+        if written.writes:
+            loud = _get(_TOLD) + constant(I64, 0) + b"\x53"
+            changed = self._is(bits, CHANGED) + b"\x41\x00\x47"
+            code += changed + loud + _AND + left
+            code += _set(_WHO, _get(_WHO) + changed + b"\xad" + constant(I64, number) + _SHL64 + _OR64)
+        if written.drops:
+            code += self._drop(number, self._is(bits, DROPPED))
+        gone = self._telling + 3
+        steps = [
+            self._advance(advance, table)
+            for advance, table in zip(event.advances, self._tables[number], strict=True)
+            if table is not None
+        ]
+        if steps:
+            code += self._is(bits, HAPPENED) + IF + NOTHING + b"".join(steps) + END
+        if any(written.drops for advance in event.advances for _, written in self._handled(advance)):
+            code = _set(gone, constant(I32, 0)) + code + self._drop(number, _get(gone))
+        return code + END
+
+    def _drop(self, number: int, condition: bytes) -> bytes:
+        """The way of the message ends where a condition is not 0 (dropped: 1, left: 5)."""
+        dropped = condition + b"\x41\x00\x47"
+        hidden = _get(_TOLD) + constant(I64, 1 << number) + _AND64 + _EQZ64
+        code = dropped + hidden + _EQZ + _AND + _BR_IF + b"\x05"
+        return code + self._count(len(self._events) + number, dropped) + condition + _BR_IF + b"\x01"
+
+    def _is(self, bits: int, which: int) -> bytes:
+        return _get(bits) + constant(I32, which) + _AND
+
+    def _advance(self, advance: nodes.Advance, table: int) -> bytes:
+        left = b"\x06"
+        if advance.property is None:
+            return _BR + left
+        if advance.clock is not None:
+            return self._advance_clock(advance.property, advance.clock, advance.event, table)
+        state = self._states[advance.property]
+        following, room = self._following, self._following + 1
+        code = _set(following, _get(state) + constant(I32, 1) + b"\x74\x2e\x00" + unsigned(table)) + _get(
+            following
+        )
+        code += constant(I32, 0) + b"\x48" + _BR_IF + left
+        code += _get(following) + _get(state) + b"\x47" + IF + NOTHING
+        code += _set(room, _get(state) + constant(I32, ENTRY.size) + b"\x6c")
+        kind = constant(I64, (SEQ if self._stamped else NO_NUMBER) << 24 | advance.event)
+        exits = self._cells.exits[advance.property]
+        for offset, value in ((0, _get(_NOW)), (8, load(I64, self._cells.source) + kind + _OR64)):
+            code += _get(room) + value + b"\x37\x00" + unsigned(exits + offset)
+        if self._stamped:
+            code += _get(room) + _get(_AT) + b"\x28\x00\x04\x36\x00" + unsigned(exits + 16)
+        code += _set(state, _get(following)) + END
+        return code + self._handle(advance, state) if self._handled(advance) else code
+
+    def _handle(self, advance: nodes.Advance, state: int) -> bytes:
+        """Run the handlers of the state that was entered, in their order; then the property may begin anew.
+
+        Blocks from here: the `if` of the event's steps and of the event, ..., left (6).
+        """
+        handlers = self._handled(advance)
+        which, counted, _, gone, anew, some = range(self._telling, self._telling + 6)
+        masks = [0] * len(advance.table)
+        for (verdict, _), states in handlers.items():
+            for each in states:
+                masks[each] |= 1 << verdict
+        table = self._known_tables.address(tuple(masks), "q")
+        code = _set(which, _get(state) + constant(I32, 3) + b"\x74\x29\x00" + unsigned(table))
+        code += _get(which) + _EQZ64 + _EQZ + IF + NOTHING
+        code += _get(which) + _get(counted) + _AND64 + _get(which) + b"\x52" + _BR_IF + b"\x07"
+        code += _set(anew, constant(I32, 0)) + _set(some, constant(I32, 1))
+        bits, message = self._following, _get(_AT) + constant(I32, 4) + _ADD + _get(_SIZE)
+        for verdict, written in handlers:
+            code += _get(which) + constant(I64, 1 << verdict) + _AND64 + _EQZ64 + _EQZ + IF + NOTHING
+            code += _set(bits, message + b"\x10" + unsigned(written.number))
+            code += self._is(bits, ELSEWHERE) + _BR_IF + b"\x08"
+            for kept, bit in ((gone, DROPPED), (anew, RESET)):
+                code += _set(kept, _get(kept) + self._is(bits, bit) + b"\x72")
+            count = some + 1 + verdict
+            code += _set(count, _get(count) + constant(I32, 1) + _ADD) + END
+        again = _get(anew) + IF + NOTHING + _set(state, constant(I32, advance.initial)) + END
+        return code + again + END
+
+    def _advance_clock(self, number: int, clock: nodes.Clock, event: int, table: int) -> bytes:
+        """The same of a property with a clock, as `ClockedRun` and `ClockedSteps` do it."""
+        state, (since, now, count) = (
+            self._states[number],
+            range(self._clocks[number], self._clocks[number] + 3),
+        )
+        following, room, exits = self._following, self._following + 1, self._cells.exits[number]
+
+        def slot(entries: int, size: int, shift: int) -> bytes:
+            place = _get(count) + constant(I64, shift) + _SHR64 + constant(I64, entries - 1) + _AND64
+            return _set(room, place + b"\xa7" + constant(I32, size) + b"\x6c")
+
+        code = _get(count) + constant(I64, KEPT - 1) + _AND64 + _EQZ64 + IF + NOTHING
+        code += slot(RUNS, 24, KEPT.bit_length() - 1)
+        for place, value in enumerate((_get(state) + b"\xad", _get(since), _get(now))):
+            code += _get(room) + value + b"\x37\x00" + unsigned(exits + 8 + 8 * place)
+        code += END + slot(RING, ENTRY.size, 0)
+        kind = constant(I64, (SEQ if self._stamped else NO_NUMBER) << 24 | event)
+        for place, value in enumerate((_get(_NOW), load(I64, self._cells.source) + kind + _OR64)):
+            code += _get(room) + value + b"\x37\x00" + unsigned(exits + 8 + 24 * RUNS + 8 * place)
+        seq = _get(_AT) + b"\x28\x00\x04" if self._stamped else constant(I32, 0)
+        code += _get(room) + seq + b"\x36\x00" + unsigned(exits + 8 + 24 * RUNS + 16)
+        code += _set(count, _get(count) + constant(I64, 1) + b"\x7c")
+        code += _set(now, _get(_NOW) + _get(now) + _get(_NOW) + _get(now) + b"\x55" + SELECT)
+        late, waits = (
+            self._known_tables.address(*table) for table in ((clock.late, "h"), (clock.waits, "q"))
+        )
+        is_late = _get(now) + _get(since) + b"\x7d" + constant(I64, clock.within) + b"\x55"
+        code += constant(I32, late) + constant(I32, table) + is_late + SELECT
+        code += _get(state) + constant(I32, 1) + b"\x74" + _ADD + b"\x2e\x00\x00"
+        code = _set(following, code) + _get(following) + constant(I32, 0) + b"\x48" + _BR_IF + b"\x06"
+        code += _get(following) + constant(I32, 1) + _AND + IF + NOTHING + _set(since, _get(now)) + END
+        code += _set(state, _get(following) + constant(I32, 1) + b"\x75")
+        wait = _get(state) + constant(I32, 3) + b"\x74\x29\x00" + unsigned(waits)
+        sooner = _get(since) + wait + b"\x7c" + load(I64, self._cells.until) + b"\x53"
+        code += wait + constant(I64, 0) + b"\x59" + sooner + _AND
+        return code + IF + NOTHING + _set(self._sooner, constant(I32, 1)) + END
+
+    def _count(self, place: int, more: bytes) -> bytes:
+        address = self._counters + 8 * place
+        return store(I64, address, load(I64, address) + more + b"\xad\x7c")
+
+    def _changed(self) -> bytes:
+        """Note which events changed it. What several have changed may be as it was: that is left unless the first place
+        that was written has other bytes. (Blocks: dropped, done, the loop, out, left.)
+        """
+        entry = self._log
+        size = (
+            constant(I64, 64)
+            + load(I64, entry)
+            + constant(I64, 32)
+            + _SHR64
+            + constant(I64, 3)
+            + _SHL64
+            + b"\x7d"
+        )
+        differs = load(I32, entry) + b"\x29\x00\x00" + load(I64, entry + 8) + _XOR64 + size + _SHL64
+        several = _get(_WHO) + _get(_WHO) + constant(I64, 1) + b"\x7d" + _AND64 + _EQZ64 + _EQZ
+        unsure = several + IF + NOTHING + differs + _EQZ64 + _BR_IF + b"\x06" + END
+        last, one = _get(_LAST), constant(I64, 1)
+        same = _set(_LAST, load(I32, EFFECT)) + last + b"\x29\x00\x00" + _get(_WHO) + b"\x51"
+        again = last + last + b"\x29\x00\x08" + one + b"\x7c\x37\x00\x08"
+        new = self._next_effect() + last + _get(_WHO) + b"\x37\x00\x00" + last + one + b"\x37\x00\x08"
+        counted = same + IF + NOTHING + again + ELSE + new + END
+        return _get(_WHO) + _EQZ64 + _EQZ + IF + NOTHING + unsure + counted + END
+
+    def _next_effect(self) -> bytes:
+        more = _set(_LAST, _get(_LAST) + constant(I32, 16) + _ADD)
+        return more + store(I32, EFFECT, _get(_LAST))
+
+    def _dropped(self) -> bytes:
+        """Note which bytes do not go on, and take back the steps of what suppresses: the cells have what was before."""
+        last = _get(_LAST)
+        same = (
+            last
+            + b"\x29\x00\x00"
+            + constant(I64, -1)
+            + b"\x51"
+            + last
+            + b"\x28\x00\x0c"
+            + _get(_AT)
+            + b"\x46"
+            + _AND
+        )
+        new = (
+            self._next_effect()
+            + last
+            + constant(I64, -1)
+            + b"\x37\x00\x00"
+            + last
+            + _get(_AT)
+            + b"\x36\x00\x08"
+        )
+        code = b"".join(
+            _set(local, load(I32, self._state(number)))
+            for number, local in self._states.items()
+            if number in self._suppressing
+        )
+        code += b"".join(
+            _set(local, load(I64, at)) for number, local, at in self._clock_cells()
+            if number in self._suppressing and at != self._cells.clocks[number] + 8
+        )  # fmt: skip
+        code += _set(_LAST, load(I32, EFFECT)) + same + _EQZ + IF + NOTHING + new + END
+        return code + last + _get(_NEXT) + b"\x36\x00\x0c"
+
+    def _done(self) -> bytes:
+        """What came of the message stays."""
+        code = b"".join(
+            self._count(number, self._is(_FIRST + number, HAPPENED)) for number in range(len(self._events))
+        )
+        code += b"".join(
+            store(I32, self._state(number), _get(local)) for number, local in self._states.items()
+        )
+        code += b"".join(store(I64, at, _get(local)) for _, local, at in self._clock_cells())
+        if self.verdicts:
+            _, _, ever, _, _, some = range(self._telling, self._telling + 6)
+            code += _get(some) + IF + NOTHING
+            for verdict in range(len(self.verdicts)):
+                count = some + 1 + verdict
+                code += self._count(2 * len(self._events) + verdict, _get(count)) + _set(
+                    count, constant(I32, 0)
+                )
+            code += _set(some, constant(I32, 0)) + _set(ever, constant(I32, 1)) + END
+        code += _set(_AT, _get(_NEXT)) + self._begin()
+        return code + (_get(self._sooner) + _BR_IF + b"\x01" if self._clocks else b"")

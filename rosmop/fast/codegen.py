@@ -1,0 +1,722 @@
+"""A part of the form as WebAssembly: numbers, conditions, loops, what stands in the message, numbers put there, drops.
+
+Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
+has a fixed size (`places.py`); strings are kept (`texts.py`), vectors of numbers and times are kept, made and changed
+(`vectors.py`); messages are made, published and kept (`records.py`), also with arrays of any length of numbers or
+times (`arrays.py`).
+
+`Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
+
+- An event, and the handler of a verdict, takes where the message is in the memory and its size (i32, i32), and returns
+  bits (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`, `RESET`.
+- What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
+  it is taken back. Within what it calls it is a trap. Beyond are strings that are made or changed, vectors of anything
+  but numbers and times, of more than `ROOM` bytes, arrays of the message that become longer or shorter, messages by
+  reference, messages (and `MESSAGE`) with arrays of strings or messages, of more than `MOST_MADE` bytes or with what is
+  beyond, what is published with a string of more than `MOST_KEPT`, or first of its kind of a second, recursion, `sin`
+  and its like. An event of which no message can come past such a place has no module: `NotScalarError` names what is
+  beyond.
+- A line of output, and a message that is published, is noted behind those before, where `SAID` points, and the message
+  at hand stands at `POSITION` (`output.py`).
+- Before a field is written, what stood there is noted in the log (address, size, bytes; 16 bytes each) that `UNDO`
+  points behind.
+- What the form charges is taken from the budget of its specification, as everywhere.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+from rosmop.fast.abi import NOW, ROOM, UNDO, Cells
+from rosmop.fast.arithmetic import to_floating
+from rosmop.fast.codegen_access import loaded
+from rosmop.fast.deferred_output import BYTES, HEAD, Line, is_text
+from rosmop.fast.layout import (
+    Layout,
+    NotScalarError,
+    is_signed,
+    machine_type,
+)
+from rosmop.fast.records import Records
+from rosmop.fast.strings_codegen import settling
+from rosmop.fast.vectors_codegen import OF_VECTORS, made_in
+from rosmop.fast.wasm import (
+    COMPARE,
+    DROP,
+    END,
+    F32,
+    F64,
+    I32,
+    I64,
+    MOVES,
+    RETURN,
+    UNREACHABLE,
+    constant,
+    row,
+    unsigned,
+)
+from rosmop.form import nodes
+from rosmop.runtime.values import Values, struct_code, struct_size
+from rosmop.runtime.wire import FEW
+from rosmop.types import kinds
+from rosmop.types.kinds import Type
+
+_LOADS = {I32: 0x28, I64: 0x29, F32: 0x2A, F64: 0x2B}
+_STORES = {I32: 0x36, I64: 0x37, F32: 0x38, F64: 0x39}
+HAPPENED, DROPPED, CHANGED, RESET = 1, 2, 4, 16
+
+EARLY = 16
+"""Bytes of a message: what is written into a header begins in them."""
+
+
+@dataclass(frozen=True)
+class Written:
+    """A function that is written: its types and code; what it assigns, how many fields it writes, and whether it drops.
+
+    `brief`: without loops. `passes`: some message comes to its end. `says`: it may put out lines. `early`: it may write
+    into the first bytes of the message, where a header is. `publishes`: contexts, and topics on which they may publish.
+    `references`: where the values of its references stand when it has returned.
+    """
+
+    number: int
+    parameters: tuple[int, ...]
+    result: int
+    code: bytes
+    assigned: frozenset[str]
+    writes: int
+    drops: bool
+    brief: bool
+    passes: bool
+    says: bool
+    early: bool
+    publishes: frozenset[tuple[str, str]] = frozenset()
+    references: tuple[tuple[str, int], ...] = ()
+
+
+class Writer(Layout):
+    """The functions that are needed, in the order of their numbers, and what stands where in the memory."""
+
+    def __init__(
+        self, functions: Mapping[str, nodes.Function], shared: Mapping[str, Cells], values: Values
+    ) -> None:
+        super().__init__(functions, shared, values)
+        self.written: list[Written] = []
+        self._numbers: dict[tuple[object, ...], Written] = {}
+
+    def event(self, name: str) -> Written:
+        """The function of an event, or of a handler. Raises `NotScalarError`."""
+        function = self.functions[name]
+        return self.function(function, {"at": I32, "size": I32}, I32, function.context)
+
+    def function(
+        self,
+        function: nodes.Function | nodes.Skipper,
+        parameters: Mapping[str, int],
+        result: int,
+        context: str,
+    ) -> Written:
+        """A function, written when it is first asked for; `context` is whose budget it takes from."""
+        key = (function.name, tuple(parameters), result, context)
+        if key not in self._numbers:
+            written = _Body(self, function, parameters, result, context).written()
+            self._numbers[key] = written
+            self.written.append(written)
+        return self._numbers[key]
+
+    def routine(self, key: tuple[object, ...], parameters: int, write: Callable[[], bytes]) -> int:
+        """The number of a function of so many addresses, which is written once."""
+        if key not in self._numbers:
+            self._numbers[key] = self._added((I32,) * parameters, write())
+        return self._numbers[key].number
+
+    def settling(self, cells: Cells) -> int:
+        """The number of the function that copies the strings of variables, which must all be known."""
+        cells.settle = self._added((), settling(self, cells)).number
+        return cells.settle
+
+    def _added(self, parameters: tuple[int, ...], code: bytes) -> Written:
+        """A function that no form has; what it returns is in 32 bits."""
+        written = Written(
+            len(self.written), parameters, I32, code, frozenset(), 0,
+            drops=False, brief=True, passes=True, says=False, early=False,
+        )  # fmt: skip
+        self.written.append(written)
+        return written
+
+
+class _Body(Records):
+    """Writes one function."""
+
+    def __init__(
+        self,
+        writer: Writer,
+        function: nodes.Function | nodes.Skipper,
+        parameters: Mapping[str, int],
+        result: int,
+        context: str,
+    ) -> None:
+        answers = isinstance(function, nodes.Function) and function.parameters == ("m",)
+        super().__init__(writer, parameters, context, answers=answers)
+        self._own_places(function)
+        self._writer = writer
+        self._function = function
+        self._made, self._begun = made_in(function, writer.shared)
+        self._references: dict[str, int] = {}
+        """Where the values of references stand when it has returned."""
+        self._result = result
+        self._is_handler = answers and function.happens is None  # type: ignore[union-attr]  # has looked
+        self._types = tuple(parameters.values())
+        self._depends = False  # whether messages may have left before
+        self._writes = 0
+        self._drops = False
+        self._says = False
+        self._early = False
+        self._bits: tuple[tuple[str, int], ...] = ()
+        """What is answered besides whether it happened: the local variables, and how far each is shifted."""
+        if answers:
+            self._bits = (("dropped", 1), ("changed", 2), *([("reset", 4)] if self._is_handler else ()))
+        for name, _ in self._bits:
+            self._local(name, I32)
+
+    def written(self) -> Written:
+        """The function. Raises `NotScalarError`."""
+        body = self._block(self._function.body)
+        if isinstance(self._function, nodes.Skipper):
+            body += self._position(self._function.end) + RETURN
+        if self._is_handler:
+            body += self._leave(nodes.Leave(-1, None))
+        made = sorted(self._locals.values())[len(self._types) :]
+        whole = row([b"\x01" + bytes((machine,)) for _, machine in made]) + body + UNREACHABLE + END
+        return Written(
+            len(self._writer.written),
+            self._types,
+            self._result,
+            unsigned(len(whole)) + whole,
+            frozenset(self._assigned.intersection(self._writer.shared)),
+            self._writes,
+            self._drops,
+            self._brief,
+            self._depends,
+            self._says,
+            self._early,
+            frozenset(self._publishes),
+            tuple(self._references.items()),
+        )
+
+    def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
+        number = self._writer.routine((write, *given), parameters, partial(write, *given))
+        return b"\x10" + unsigned(number)
+
+    # Statements
+
+    def _block(self, statements: Sequence[nodes.Statement]) -> bytes:
+        return b"".join(self._statement(statement) for statement in statements)
+
+    def _statement(self, node: nodes.Statement) -> bytes:
+        depth, loops = self._depth, len(self._loops)
+        try:
+            method = _STATEMENTS.get(type(node))
+            if method is None:
+                raise NotScalarError(type(node).__name__)
+            return method(self, node)
+        except NotScalarError:
+            if not depth and not self._depends:
+                raise
+            self._depth = depth
+            del self._loops[loops:]
+            return self._elsewhere()
+
+    def _evaluate(self, node: nodes.Evaluate) -> bytes:
+        value = node.value.value if isinstance(node.value, nodes.Discard) else node.value
+        if isinstance(value, nodes.Assign):
+            return self._assigned_to(value)
+        if isinstance(value, nodes.Call) and self._changes_message(value):
+            return self._change(value)
+        if isinstance(value, nodes.Literal) and value.value is None:
+            return b""
+        if isinstance(value, nodes.Sequence):
+            return b"".join(self._evaluate(nodes.Evaluate(node.site, item)) for item in value.items)
+        if isinstance(value, nodes.Conditional) and value.type == kinds.VOID:
+            yes, no = ((nodes.Evaluate(node.site, branch),) for branch in (value.yes, value.no))
+            return self._if(nodes.If(node.site, value.test, yes, no))
+        return self._value(value) + DROP
+
+    def _if(self, node: nodes.If) -> bytes:
+        test = self._value(node.test)
+        self._depends = True
+        no = (lambda: self._block(node.no)) if node.no else None
+        return self._when(test, lambda: self._block(node.yes), no)
+
+    def _loop(self, node: nodes.Loop) -> bytes:
+        self._brief = False
+        return self._repeated(b"", node.body)
+
+    def _for_each(self, node: nodes.ForEach) -> bytes:
+        kind, size = self._writer.element(node.values.type)
+        first, place, count = self._elements(node.values)
+        self._brief = False
+        at, left = (f"{what} {len(self._locals)}" for what in ("element", "left"))
+        if isinstance(kind, kinds.String):
+            each, begin, length = self._text_at(self._get(at))
+            each += begin + self._set(f"place of {node.name}") + length
+            each += self._set(f"count of {node.name}", I64)
+        elif isinstance(kind, kinds.Record):
+            each = self._get(at) + self._set(f"place of {node.name}")
+        else:
+            each = loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
+        following = self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
+        code = first + place + self._set(at) + count + self._set(left, I64)
+        with self._apart(node.values):
+            return code + self._times(left, each + following, node.body)
+
+    def _break(self, _node: nodes.Break) -> bytes:
+        return b"\x0c" + unsigned(self._depth - self._loops[-1] + 1)
+
+    def _continue(self, _node: nodes.Continue) -> bytes:
+        return b"\x0c" + unsigned(self._depth - self._loops[-1])
+
+    def _select(self, node: nodes.Select) -> bytes:
+        machine = machine_type(node.value.type)
+        value = f"{node.name} value"
+        code = self._value(node.value) + self._set(value, machine) + constant(I32, node.default)
+        code += self._set(node.name)
+        for wanted, index in node.table:
+            test = self._get(value, machine) + constant(machine, wanted) + bytes((COMPARE[machine]["=="],))
+            chosen = constant(I32, index) + self._set(node.name)
+            code += self._when(test, lambda chosen=chosen: chosen)  # type: ignore[misc]  # the row of this turn
+        return code
+
+    def _leave(self, node: nodes.Leave) -> bytes:
+        code = constant(I32, bool(node.happened))
+        for name, shift in self._bits:
+            code += self._get(name) + constant(I32, shift) + b"\x74\x72"
+        return code + RETURN
+
+    def _charge(self, node: nodes.Charge) -> bytes:
+        return self._spend(constant(I64, node.instructions))
+
+    def _allocate(self, node: nodes.Allocate) -> bytes:
+        """Nothing is made here, but it costs the same."""
+        if node.size is not None:
+            return self._allocated(constant(I64, node.size))
+        many = self._length() + constant(I64, nodes.CHARGED) + b"\x56"
+        return self._when(many, lambda: self._allocated(self._length()))
+
+    def _pending(self, node: nodes.Pending) -> bytes:
+        """Only `Whole` asks for it."""
+        self._assigned_fields[node.name] = node.writes
+        return b""
+
+    def _drop(self, _node: nodes.Drop) -> bytes:
+        self._drops = True
+        return constant(I32, 1) + self._set("dropped")
+
+    def _reset(self, _node: nodes.Reset) -> bytes:
+        return constant(I32, 1) + self._set("reset")
+
+    def _require(self, node: nodes.Require) -> bytes:
+        test, leave = self._value(node.test) + b"\x45", nodes.Leave(node.site, False)
+        self._depends = True
+        return self._when(test, lambda: self._leave(leave))
+
+    def _not_past(self, node: nodes.NotPast) -> bytes:
+        past = self._get(node.count, I64) + constant(I64, node.index) + b"\x57"
+        self._depends = True
+        return self._when(past, self._elsewhere)
+
+    def _skip(self, node: nodes.Skip) -> bytes:
+        count = constant(I64, node.count) if isinstance(node.count, int) else self._get(node.count, I64)
+        left, place = (f"{what} {len(self._locals)}" for what in ("left", "place"))
+        code = count + self._set(left, I64) + self._position(node.at) + self._set(place, I64)
+        if node.inner:
+            code += self._spend(self._get(left, I64) + constant(I64, 1) + b"\x7c")
+        else:
+            many = self._get(left, I64) + constant(I64, FEW) + b"\x56"
+            code += self._when(many, lambda: self._spend(self._get(left, I64)))
+        if node.skipper is None:
+            end = self._after_text(nodes.AfterText(node.site, place, nodes.Spot(place, 0)))
+        else:
+            given = {"at": I32, "size": I32, "p": I64}
+            skipper = self._writer.function(node.skipper, given, I64, self._context)
+            end = self._get("at") + self._get("size") + self._get(place, I64)
+            end += b"\x10" + unsigned(skipper.number) + self._set(place, I64)
+        code += self._times(left, end)
+        return code + self._get(place, I64) + self._set(node.name, I64)
+
+    def _write_back(self, node: nodes.WriteBack) -> bytes:
+        code = self._when(self._get("dropped"), lambda: self._leave(nodes.Leave(node.site, True)))
+        for write in sorted(node.writes, key=lambda write: write.end is not None):
+            self._early = self._early or (write.at.base is None and write.at.offset < EARLY)
+            put = partial(self._put_field if write.end is None else self._put_array, write)
+            code += self._when(self._get(write.flag), partial(self._or_elsewhere, put))
+        return code
+
+    def _or_elsewhere(self, put: Callable[[], bytes]) -> bytes:
+        try:
+            return put()
+        except NotScalarError:
+            return self._elsewhere()
+
+    def _put_array(self, write: nodes.Write) -> bytes:
+        """Put the elements of an array there that is as long. A NaN that is put there, or that Python would change, is
+        left.
+        """
+        value, end = write.value, write.end
+        if not isinstance(value, nodes.Copy) or not isinstance(value.value, nodes.Read) or end is None:
+            raise NotScalarError(str(value.type))
+        room, at = self._room(value.value), write.at
+        code, place, count = self._noted(b"".join(self._elements(value)))
+        if isinstance(value.type, kinds.Vector) and value.type.length is None:
+            at = at.plus(4)
+        behind = self._position(at) + count + constant(I64, room.size) + b"\x7e\x7c"
+        other = behind + self._get(end, I64) + b"\x52" + self._is_elsewhere(room) + b"\x72"
+        code += self._when(other, self._elsewhere)
+        element, to = (f"{what} {len(self._locals)}" for what in ("element", "target"))
+        code += (
+            place + self._set(element) + self._get("at") + self._position(at) + b"\xa7\x6a" + self._set(to)
+        )
+        left = f"left {len(self._locals)}"
+        each = self._put_element(room.element, self._get(element), self._get(to))
+        for name in (element, to):
+            each += self._get(name) + constant(I32, room.size) + b"\x6a" + self._set(name)
+        self._brief = False
+        self._writes += ROOM // room.size
+        return code + count + self._set(left, I64) + self._times(left, each)
+
+    def _put_element(self, kind: Type, element: bytes, to: bytes) -> bytes:
+        size, machine = self._writer.size(kind), machine_type(kind)
+        if isinstance(kind, kinds.Bool):
+            return self._put_bits(to, 0, size, loaded(element, 0, kind))
+        if len(struct_code(kind) or "") == 2:
+            code, bits = self._parts_of(kind, loaded(element, 0, kind))
+            return code + self._put_bits(to, 0, size, bits)
+        bits = element + bytes((MOVES[size][0], 0, 0))
+        if machine not in (F32, F64):
+            return self._put_bits(to, 0, size, bits)
+        value = loaded(element, 0, kind)
+        other = bits + to + bytes((MOVES[size][0], 0, 0)) + bytes((COMPARE[I64 if size == 8 else I32]["!="],))
+        if machine == F32:  # a signalling one comes from Python as a quiet one
+            other += bits + constant(I32, 1 << 22) + b"\x71\x45\x72"
+        none = value + value + bytes((COMPARE[machine]["!="],)) + other + b"\x71"
+        return self._when(none, self._elsewhere) + self._put_bits(to, 0, size, bits)
+
+    def _put_field(self, write: nodes.Write) -> bytes:
+        """Put a number where it differs, bit by bit; Python decides which bits a NaN has."""
+        codes = struct_code(write.value.type) or ""
+        machine, size = machine_type(write.value.type), struct_size(codes)
+        value = self._value(write.value)
+        code = b""
+        if machine in (F32, F64):
+            kept = f"kept {machine}"
+            none = self._get(kept, machine) + self._get(kept, machine) + bytes((COMPARE[machine]["!="],))
+            code = value + self._set(kept, machine) + self._when(none, self._elsewhere)
+            value = self._get(kept, machine) + (b"\xbc" if machine == F32 else b"\xbd")
+        elif len(codes) == 2:
+            code, value = self._parts_of(write.value.type, value)
+        self._writes += 1
+        base = b"" if write.at.base is None else self._get(write.at.base, I64) + b"\xa7\x6a"
+        return code + self._put_bits(self._get("at") + base, write.at.offset, size, value)
+
+    def _put_bits(self, place: bytes, offset: int, size: int, bits: bytes) -> bytes:
+        """Put so many bytes there if others stand there, which are noted."""
+        whole = I64 if size == 8 else I32
+        load, store = (bytes((code, 0)) + unsigned(offset) for code in MOVES[size])
+        new, mask = f"new {whole}", constant(I32, (1 << 8 * size) - 1) + b"\x71" if size < 4 else b""
+        old = place + load
+        differs = old + self._get(new, whole) + mask + bytes((COMPARE[whole]["!="],))
+
+        def put() -> bytes:
+            entry, end = self._get("entry"), self._cell(0x28, UNDO) + self._set("entry")
+            note = entry + place + constant(I32, offset) + b"\x6a\x36\x00\x00"
+            note += entry + constant(I32, size) + b"\x36\x00\x04"
+            note += entry + old + (b"" if whole == I64 else b"\xad") + b"\x37\x00\x08"
+            note += self._cell(0x36, UNDO, entry + constant(I32, 16) + b"\x6a")
+            return (
+                end + note + place + self._get(new, whole) + store + constant(I32, 1) + self._set("changed")
+            )
+
+        return bits + self._set(new, whole) + self._when(differs, put)
+
+    # Expressions
+
+    def _value(self, node: nodes.Expression) -> bytes:
+        method = _EXPRESSIONS.get(type(node))
+        if method is None:
+            raise NotScalarError(type(node).__name__)
+        return method(self, node)
+
+    def _read(self, node: nodes.Read) -> bytes:
+        machine = machine_type(node.type)
+        cells = self._writer.shared.get(node.name)
+        if cells is None:
+            return self._get(node.name, machine)
+        return self._cell(_LOADS[machine], self._writer.variable(node.name, node.type))
+
+    def _assigned_to(self, node: nodes.Assign) -> bytes:
+        if isinstance(node.type, kinds.String):
+            return self._assigned_text(node)
+        if isinstance(node.type, kinds.Vector):
+            return self._assigned_vector(node)
+        if isinstance(node.type, kinds.Record):
+            return self._assigned_record(node)
+        if node.type == kinds.VOID:
+            return self._handed(node.name, node.value)
+        machine, value = machine_type(node.type), self._value(node.value)
+        cells = self._writer.shared.get(node.name)
+        if cells is None:
+            return value + self._set(node.name, machine)
+        self._assigned.add(node.name)
+        return self._cell(_STORES[machine], self._writer.variable(node.name, node.type), value)
+
+    def _assign(self, node: nodes.Assign) -> bytes:
+        return self._assigned_to(node) + self._read(nodes.Read(node.type, node.name))
+
+    def _log(self, node: nodes.Log) -> bytes:
+        """Note the values of a line, and what line it is."""
+        line, number = Line(self._context, node), len(self._locals)
+        code, cost, stores = b"", constant(I64, line.cost), b""
+        for place, value in enumerate(line.values):
+            first, slot, size = self._slot(value, f"value {place} {number}", HEAD.size + 8 * place)
+            code, stores, cost = code + first, stores + slot, cost + size
+        self._says = True
+        return code + self._noted_line(line, cost) + stores + constant(I32, 0)
+
+    def _slot(self, node: nodes.Expression, name: str, at: int) -> tuple[bytes, bytes, bytes]:
+        """What comes first; what puts a value into the line (of a string: its place and length); its cost."""
+        line, to = self._get("line"), unsigned(at)
+        if is_text(node):
+            first, place, count = self._elements(node)
+            first += place + self._set(name) + count + self._set(f"count of {name}", I64)
+            length = self._get(f"count of {name}", I64)
+            put = (
+                line + self._get(name) + b"\x36\x00" + to + line + length + b"\xa7\x36\x00" + unsigned(at + 4)
+            )
+            return first, put, length + constant(I64, BYTES) + b"\x80\x7c"
+        machine = machine_type(node.type)
+        first, value = self._value(node) + self._set(name, machine), self._get(name, machine)
+        if machine in (F32, F64):
+            return first, line + value + (b"\xbb" if machine == F32 else b"") + b"\x39\x00" + to, b""
+        wide = (b"\xac" if is_signed(node.type) else b"\xad") if machine == I32 else b""
+        return first, line + value + wide + b"\x37\x00" + to, b""
+
+    def _throttle(self, node: nodes.Throttle) -> bytes:
+        """Output that is not due yet; Python puts out what is, and notes when."""
+        seconds = self._value(node.seconds) + to_floating(
+            machine_type(node.seconds.type), F64, signed=is_signed(node.seconds.type)
+        )
+        last, now = self._cell(0x29, self._writer.throttle(self._context, node.site)), self._cell(0x29, NOW)
+        until = last + b"\xb9" + seconds + constant(F64, 1e9) + b"\xa2\xa0\x9b\xfc\x06"
+        waits = last + now + b"\x57" + now + until + b"\x53\x71"
+        return self._when(waits + b"\x45", self._elsewhere) + constant(I32, 0)
+
+    def _accumulate(self, node: nodes.Accumulate) -> bytes:
+        kind, size = self._writer.element(node.vector.type)
+        code, place, count = self._elements(node.vector)
+        number = len(self._locals)
+        total, each = (f"{what} {number}" for what in ("sum", "summand"))
+        at, left, last = (f"{what} {number}" for what in ("element", "left", "last"))
+        with self._apart(node.vector):
+            code += self._value(node.start) + self._set(total, machine_type(node.type))
+            code += self._value(node.first) + self._set(left, I64)
+            code += self._value(node.last) + self._set(last, I64)
+        outside = self._get(left, I64) + self._get(last, I64) + b"\x56" + self._get(last, I64) + count
+        code += self._when(outside + b"\x56\x72", self._elsewhere)
+        code += place + self._get(left, I64) + b"\xa7" + constant(I32, size) + b"\x6c\x6a" + self._set(at)
+        code += self._get(last, I64) + self._get(left, I64) + b"\x7d" + self._set(left, I64)
+        code += self._spend(self._get(left, I64))
+        one, other = (
+            nodes.Convert(node.wide, nodes.Read(*part)) for part in ((node.type, total), (kind, each))
+        )
+        added = nodes.Convert(node.type, nodes.Arithmetic(node.wide, "+", one, other, node.site))
+        span = nodes.Assign(node.type, total, added)
+        summed = loaded(self._get(at), 0, kind) + self._set(each, machine_type(kind))
+        summed += self._evaluate(nodes.Evaluate(node.site, span))
+        summed += self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
+        self._brief = False
+        code += self._times(left, summed)
+        return code + self._get(total, machine_type(node.type))
+
+    def _call(self, node: nodes.Call) -> bytes:
+        special = _SPECIAL.get(node.function)
+        if special is not None:
+            return special(self, node)
+        of_vectors = OF_VECTORS.get(node.function)
+        if of_vectors is not None:
+            return of_vectors(self, node)
+        argument = node.arguments[0]
+        if node.function in _OF_COUNTS:
+            first, _, count = self._elements(argument)
+            return first + count + _OF_COUNTS[node.function]
+        if node.function in _QUESTIONS:
+            return self._question(argument, _QUESTIONS[node.function])
+        if (
+            isinstance(node.type, kinds.Index)
+            and isinstance(argument, nodes.Call)
+            and argument.function != "l_len"
+        ):
+            raise NotScalarError("a sum of more than two that must not wrap")
+        opcode = _OPCODES.get((node.function, machine_type(argument.type)))
+        if opcode is not None:
+            return b"".join(map(self._value, node.arguments)) + opcode
+        if node.function not in _OF_MOMENTS:
+            raise NotScalarError(node.function)
+        code = self._value(argument) + _OF_MOMENTS[node.function](self)
+        return code + b"\xa7" if machine_type(node.type) == I32 else code
+
+    def _sequence(self, node: nodes.Sequence) -> bytes:
+        chosen = node.chosen % len(node.items)
+        return b"".join(
+            self._value(item) if index == chosen else self._evaluate(nodes.Evaluate(-1, item))
+            for index, item in enumerate(node.items)
+        )
+
+    def _after(self, node: nodes.Sequence) -> tuple[bytes, bytes, bytes]:
+        *before, last = node.items
+        if node.chosen not in (-1, len(before)):
+            raise NotScalarError(str(node.type))
+        code = b"".join(self._evaluate(nodes.Evaluate(-1, item)) for item in before)
+        first, place, count = self._elements(last)
+        return code + first, place, count
+
+    # What functions are given, and hand back
+
+    def _invoke(self, node: nodes.Invoke) -> bytes:
+        return self._called(node)[0]
+
+    def _called(self, node: nodes.Invoke) -> tuple[bytes, tuple[tuple[str, int], ...]]:
+        """A call, and where the values of its references stand behind it. A string or vector that it returns is where
+        it is (32 bits) and how long.
+        """
+        if node.depth is not None:
+            raise NotScalarError("recursion")
+        result = I32 if node.type == kinds.VOID else I64 if _has_place(node.type) else machine_type(node.type)
+        function = self._writer.functions[node.function]
+        parameters: dict[str, int] = {}
+        code = b""
+        with self._apart(*node.arguments):
+            for name, argument in zip(function.parameters, node.arguments, strict=True):
+                if _has_place(argument.type):
+                    parameters |= {f"place of {name}": I32, f"count of {name}": I64}
+                    code += b"".join(self._elements(argument))
+                elif isinstance(argument.type, kinds.Record):
+                    parameters[f"place of {name}"] = I32
+                    code += b"".join(self._place(argument))
+                else:
+                    parameters[name] = machine_type(argument.type)
+                    code += self._value(argument)
+            called = self._writer.function(function, parameters, result, function.context)
+            self._assigned |= called.assigned
+        self._brief = self._brief and called.brief
+        self._says = self._says or called.says
+        self._publishes |= called.publishes
+        return code + b"\x10" + unsigned(called.number), called.references
+
+    def _return(self, node: nodes.Return) -> bytes:
+        kind, code, answer = node.value.type, b"", constant(I32, 0)
+        if _has_place(kind):
+            code, place, count = self._noted(b"".join(self._elements(node.value)))
+            answer = place + b"\xad" + count + constant(I64, 32) + b"\x86\x84"
+        elif kind != kinds.VOID:
+            name = f"answer {machine_type(kind)}"
+            code, answer = (
+                self._value(node.value) + self._set(name, machine_type(kind)),
+                self._get(name, machine_type(kind)),
+            )
+        for name in node.references:
+            at = self._references.setdefault(name, self._writer.room(8))
+            if f"count of {name}" in self._locals:
+                code += self._cell(0x36, at, self._get(f"place of {name}"))
+                code += self._cell(0x36, at + 4, self._get(f"count of {name}", I64) + b"\xa7")
+            elif name in self._locals:
+                machine = self._locals[name][1]
+                code += self._cell(_STORES[machine], at, self._get(name, machine))
+            else:
+                raise NotScalarError("a message by reference")
+        return code + answer + RETURN
+
+    def _handed(self, name: str, node: nodes.Expression) -> bytes:
+        """Call a function with references; what it hands back is in local variables that are numbered, from its value
+        on.
+        """
+        if not isinstance(node, nodes.Invoke):
+            raise NotScalarError(str(node.type))
+        code, references = self._called(node)
+        if _has_place(node.type):
+            code += self._put_span(f"{name} 0")
+        else:
+            code += DROP if node.type == kinds.VOID else self._set(f"{name} 0", machine_type(node.type))
+        kinds_of = dict(zip(self._writer.functions[node.function].parameters, node.arguments, strict=True))
+        for number, (reference, at) in enumerate(references, 1):
+            kind = kinds_of[reference].type
+            if _has_place(kind):
+                code += self._cell(0x29, at) + self._put_span(f"{name} {number}")
+            else:
+                machine = machine_type(kind)
+                code += self._cell(_LOADS[machine], at) + self._set(f"{name} {number}", machine)
+        return code
+
+    def _put_span(self, name: str) -> bytes:
+        """An address and length (32 bits each, from the stack) in local variables."""
+        code = self._set("span", I64) + self._get("span", I64) + b"\xa7" + self._set(f"place of {name}")
+        return (
+            code + self._get("span", I64) + constant(I64, 32) + b"\x88" + self._set(f"count of {name}", I64)
+        )
+
+    def _handed_back(self, node: nodes.Invoke) -> tuple[bytes, bytes, bytes]:
+        name = f"handed back {len(self._locals)}"
+        code = self._invoke(node) + self._put_span(name)
+        return code, self._get(f"place of {name}"), self._get(f"count of {name}", I64)
+
+    def _elements(self, node: nodes.Expression) -> tuple[bytes, bytes, bytes]:
+        if isinstance(node, nodes.Item) and node.base.type == kinds.VOID:
+            return super()._elements(_part_of(node))
+        if isinstance(node.type, kinds.String) and isinstance(node, nodes.Invoke):
+            return self._handed_back(node)
+        if isinstance(node.type, kinds.String) and isinstance(node, nodes.Sequence):
+            return self._after(node)
+        return super()._elements(node)
+
+    def _item(self, node: nodes.Item) -> bytes:
+        if node.base.type != kinds.VOID:
+            return super()._item(node)
+        return constant(I32, 0) if node.type == kinds.VOID else self._value(_part_of(node))
+
+
+def _has_place(kind: Type) -> bool:
+    """Whether a value is where it is and how long it is."""
+    return isinstance(kind, kinds.String | kinds.Vector)
+
+
+def _part_of(node: nodes.Item) -> nodes.Read:
+    """The local variable that has a part of what a function has handed back."""
+    assert isinstance(node.base, nodes.Read)  # noqa: S101  as the form has it
+    return nodes.Read(node.type, f"{node.base.name} {node.number}")
+
+
+_EXACT = {"fabs": 0x99, "ceil": 0x9B, "floor": 0x9C, "trunc": 0x9D, "rint": 0x9E, "nearbyint": 0x9E, "sqrt": 0x9F,
+          "copysign": 0xA6}  # fmt: skip
+_OPCODES = {
+    **{(f"h_{name}", F64): bytes((code,)) for name, code in _EXACT.items()},
+    **{(f"h_{name}f", F32): bytes((code - 14,)) for name, code in _EXACT.items()},
+    ("m_is_zero", I64): b"\x50",
+    ("m_whole", I64): b"",
+    ("k_after", I64): b"\x7c",
+    ("k_before", I64): b"\x7d",
+}
+_SPECIAL: Mapping[str, Callable[[_Body, nodes.Call], bytes]] = MappingProxyType(
+    {
+        **dict.fromkeys(("h_min", "h_max", "h_fmin", "h_fmax", "h_fminf", "h_fmaxf"), _Body._least),
+        "a_part": _Body._with_part,
+        "l_element": _Body._element_at,
+    }
+)
+_OF_COUNTS = {"l_len": b"", "l_empty": b"\x50", "l_last": constant(I64, 1) + b"\x7d"}
+_QUESTIONS = {"h_isinf": "==", "h_isfinite": "<", "h_isnan": "!<="}
+_OF_MOMENTS: Mapping[str, Callable[[_Body], bytes]] = MappingProxyType(
+    {"m_nsec": _Body._nanoseconds, "m_sec": _Body._seconds, "m_seconds": _Body._in_seconds}
+)
+
+_STATEMENTS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = nodes.methods_of(_Body, nodes.Statement)
+_EXPRESSIONS: Mapping[type[Any], Callable[[_Body, Any], bytes]] = nodes.methods_of(_Body, nodes.Expression)

@@ -1,0 +1,92 @@
+"""What every function of a module is made of: local variables, branches, loops, what is charged, what is left."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from rosmop.fast.layout import Layout, NotScalarError
+from rosmop.fast.wasm import ELSE, END, I32, I64, IF, NOTHING, RETURN, UNREACHABLE, constant, unsigned
+from rosmop.form import nodes
+from rosmop.runtime.context import BYTES_PER_INSTRUCTION, UNMEASURED
+
+ELSEWHERE = 8
+"""The answer of an event or handler whose message is left."""
+
+
+class Parts(ABC):
+    """Writes one function. `context` is whose budget it takes from; `answers`: it is that of an event or handler."""
+
+    def __init__(self, layout: Layout, parameters: Mapping[str, int], context: str, *, answers: bool) -> None:
+        self._layout = layout
+        self._context = context
+        self._answers = answers
+        self._locals = {name: (index, kind) for index, (name, kind) in enumerate(parameters.items())}
+        self._depth = 0  # blocks that are open
+        self._loops: list[int] = []  # at which depth the block of each loop is
+        self._assigned: set[str] = set()  # variables of the set, and local vectors
+        self._rooms: dict[str, int] = {}  # where local vectors are
+        self._brief = True
+        self._publishes: set[tuple[str, str]] = set()  # contexts and topics
+
+    @abstractmethod
+    def _block(self, statements: Sequence[nodes.Statement]) -> bytes:
+        """What statements do."""
+
+    @abstractmethod
+    def _value(self, node: nodes.Expression) -> bytes:
+        """What puts the value of an expression of numbers on the stack. Raises `NotScalarError` for another."""
+
+    @abstractmethod
+    def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
+        """A call of a function of so many addresses (i32), which `write` writes of what it is given."""
+
+    def _local(self, name: str, machine: int) -> bytes:
+        number, known = self._locals.setdefault(name, (len(self._locals), machine))
+        if known != machine:
+            raise NotScalarError(name)
+        return unsigned(number)
+
+    def _get(self, name: str, machine: int = I32) -> bytes:
+        return b"\x20" + self._local(name, machine)
+
+    def _set(self, name: str, machine: int = I32) -> bytes:
+        return b"\x21" + self._local(name, machine)
+
+    def _when(self, test: bytes, yes: Callable[[], bytes], no: Callable[[], bytes] | None = None) -> bytes:
+        self._depth += 1
+        inner = yes() + (ELSE + no() if no is not None else b"")
+        self._depth -= 1
+        return test + IF + NOTHING + inner + END
+
+    def _elsewhere(self) -> bytes:
+        return constant(I32, ELSEWHERE) + RETURN if self._answers else UNREACHABLE
+
+    def _cell(self, opcode: int, address: int, value: bytes = b"") -> bytes:
+        """Load or store at an address."""
+        return constant(I32, 0) + value + bytes((opcode, 0)) + unsigned(address)
+
+    def _spend(self, instructions: bytes) -> bytes:
+        budget = self._layout.budget(self._context)
+        left = self._cell(0x37, budget, self._cell(0x29, budget) + instructions + b"\x7d")
+        return left + self._when(self._cell(0x29, budget) + constant(I64, 0) + b"\x53", self._elsewhere)
+
+    def _allocated(self, size: bytes) -> bytes:
+        """Charge for so many bytes (i64) that would be made; elsewhere if what the specification holds is measured."""
+        many = size + constant(I64, UNMEASURED) + b"\x56"
+        spent = size + constant(I64, BYTES_PER_INSTRUCTION) + b"\x80"
+        return self._when(many, self._elsewhere) + self._spend(spent)
+
+    def _times(self, left: str, each: bytes, body: Sequence[nodes.Statement] = ()) -> bytes:
+        """A loop that is run as often as a local variable says, which counts down."""
+        over = self._get(left, I64) + b"\x50\x0d\x01"
+        less = self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
+        return self._repeated(over + less + each, body)
+
+    def _repeated(self, before: bytes, body: Sequence[nodes.Statement]) -> bytes:
+        """A loop without end; `before` may leave the outer of the two blocks."""
+        self._depth += 2
+        self._loops.append(self._depth)
+        code = before + self._block(body)
+        self._loops.pop()
+        self._depth -= 2
+        return b"\x02\x40\x03\x40" + code + b"\x0c\x00" + END + END

@@ -1,0 +1,604 @@
+"""Runs the module of a set (`ir/feed.py`): when a walk of a topic, or part of a service, may be used, and what it does.
+
+Invariants:
+- A walk ends before the first message that it leaves to the engine; of that message nothing has happened yet.
+- What a walk has done to the messages before is what `MonitorSet.process` does to them, one after the other, at the
+  time of the walk: bytes, variables, states of properties, which events happened.
+- The state of specifications that share topics or variables is in one place: in the module's memory from a walk on
+  (`Home.enter`), in Python until then, and again before Python looks at it (`Home.leave`).
+- Frames that were received into the module's memory (`Walks.area`) are looked at and changed where they stand. Of
+  one that stands elsewhere the beginning is copied, and back if it was changed: what looks further leaves the message.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
+from types import MappingProxyType
+from typing import Any, NamedTuple, Protocol
+
+from rosmop.fast.abi import (
+    AREA,
+    LEFT,
+    LOUD,
+    POSITION,
+    REST,
+    SOONER,
+    SURE,
+    TOLD,
+    UNDO,
+    Cells,
+    Feed,
+    FeedModule,
+)
+from rosmop.fast.deferred_output import HEAD
+from rosmop.fast.variables import KeptMessage, element_code, entered, left
+from rosmop.fast.wasm_instance import Machine, MachineTrap
+from rosmop.form.compiled import Compiled
+from rosmop.form.components import groups
+from rosmop.run.explain import ClockedSteps, Exits
+from rosmop.run.interpreter import Interpreter
+from rosmop.run.monitor import CellNames, Monitor, RunningProperty
+from rosmop.run.outcomes import Outcome, Verdict
+from rosmop.runtime.context import FUEL_PER_SECOND, Context, LogLine, Published
+from rosmop.runtime.values import Values, struct_code
+from rosmop.runtime.wire import Buffer
+from rosmop.types import kinds
+from rosmop.types.kinds import Type
+
+FUEL = FUEL_PER_SECOND // 1000
+"""Instructions of one call at most: about a millisecond. What a call leaves is for the next ones: setting it costs a
+quarter of a call. Where it ends, the walk pauses before the message at hand.
+"""
+
+MESSAGE_FUEL = 10 * FUEL
+"""Instructions of one message at most, unless a caller of `walk_one` has others."""
+
+BEGINNING = 8192
+"""Bytes that are looked at of a frame that was not received into the module's memory."""
+
+_FIRST = 512  # that are shown if they suffice: caches are cold when a large frame has gone through them
+
+_NO_FUEL = "out of fuel"
+_ADDRESS = 0xFFFFFFFF
+_LENGTH = struct.Struct("<I")
+_POSITION = struct.Struct("<II")
+_EFFECT = struct.Struct("<qq")
+_LOG = struct.Struct("<II8s")
+_PREPARED = struct.Struct("<4q")
+_TIME = struct.Struct("<q")
+_CLOCK = struct.Struct("<qq")
+_NEVER = (1 << 63) - 1  # comes after every time, so that output is due
+
+
+Output = LogLine | Published
+
+
+class Walked(NamedTuple):
+    """What a walk has done.
+
+    `position` is where the first message begins that is left; `run` where what goes on in its buffer begins (behind the
+    last dropped message). `dropped` are counts for each of the walker's events, if any was, `told` for each of its
+    verdicts, if there was any. `sooner`: something is due earlier than it was. `output` are the lines that were put out
+    and the messages that were published, in order, each with where the frame begins of the message that it is about.
+    `paused`: the walk used up its fuel, and the message at `position` may be walked next.
+    """
+
+    position: int
+    run: int
+    dropped: Sequence[int]
+    told: Sequence[int] = ()
+    sooner: bool = False
+    output: Sequence[tuple[int, Output]] = ()
+    paused: bool = False
+
+
+class Prepared(NamedTuple):
+    """What holds for all walks of a topic until the engine, or anything else, has done something: the sender of
+    the messages; bits of `told` (and whether no message may be changed), `enabled` and `counted`, as the module takes
+    them; where walks add up how many messages a set of events (see `Walker.writers`) has changed; and
+    where is said which publications may be made, for each whether it may.
+    """
+
+    source: int
+    told: int
+    enabled: int
+    counted: int
+    changed: dict[int, int]
+    publishes: Sequence[tuple[int, bool]] = ()
+
+
+class Due(Protocol):
+    """Says when the next tick or deadline is due (ns; None: nothing is waited for)."""
+
+    def __call__(self, *, anew: bool) -> int | None:
+        """`anew`: find out, as there may be an earlier deadline."""
+
+
+class Home:
+    """Where the state of specifications is that share topics or variables."""
+
+    def __init__(
+        self,
+        machine: Machine,
+        cells: Cells,
+        interpreter: Interpreter,
+        running: Sequence[RunningProperty],
+        throttles: Sequence[tuple[Context, int, int]],
+        *,
+        values: Values,
+        due: Due,
+        properties: Sequence[tuple[str, int]] = (),
+        known: Mapping[str, tuple[str, str]] = MappingProxyType({}),
+    ) -> None:
+        """`throttles`: specification, site, and address of when output there was last due. `properties` are those of
+        `running` by monitor and number, `known` the variables by monitor and name.
+        """
+        self.machine = machine
+        self._memory = machine.memory
+        self._base = cells.base
+        self._contexts, self._values = interpreter.contexts, interpreter.variables
+        self._running = running
+        self._throttles = throttles
+        variables = dict(sorted(cells.variables.items(), key=lambda item: item[1][0]))
+        self._names = [*variables]
+        self._cells = struct.Struct(
+            "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in variables.values())
+        )
+        buffers = {cells.variables[name][0]: buffer for name, buffer in cells.vectors.items()} | cells.texts
+        self._spans = [
+            (place, buffers[address], element_code(kind))
+            for place, (address, kind) in enumerate(variables.values())
+            if isinstance(kind, kinds.String | kinds.Vector)
+        ]
+        self._records = {
+            name: KeptMessage(
+                values, kind, at, cells.known[name], {each: cells.texts[each] for each in cells.inner[name]}
+            )
+            for name, (at, kind) in cells.records.items()
+        }
+        codes = "".join(_cell(kind) for _, kind in variables.values())
+        self.names = CellNames([*properties], [*map(known.get, variables)], codes, [*cells.clocks])
+        self._end = cells.base + self._cells.size
+        self._clocked = [*cells.clocks.values()]
+        plain = not (self._spans or self._records)
+        self.size = self._cells.size + _CLOCK.size * len(self._clocked) if plain else 0
+        self.left = False
+        self._generation = cells.generation
+        self._source, self._until = cells.source, cells.until
+        self._clocks = [(running[number], address) for number, address in cells.clocks.items()]
+        self._due = due
+        self._inside = False
+        self.prepared: Prepared | None = None
+        """For whom the module was prepared last, with the state in its memory; None where that is with Python."""
+
+    def prepare(self, prepared: Prepared) -> None:
+        """Take the state into the module, and name the sender of what comes now."""
+        if not self._inside:
+            self._enter()
+        self.prepared = prepared
+        self.machine.refuel(FUEL)
+        _PREPARED.pack_into(self._memory, self._source, prepared.source << 32, *prepared[1:4])
+        for address, counted in prepared.publishes:
+            _TIME.pack_into(self._memory, address, counted)
+
+    def _enter(self) -> None:
+        states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
+        values = [self._values[name] for name in self._names]
+        if self._generation:
+            _LENGTH.pack_into(self._memory, self._generation, 0)
+        for place, buffer, code in self._spans:
+            values[place] = entered(self._memory, values[place], buffer, code)
+        self._cells.pack_into(self._memory, self._base, *states, *values)
+        for name, kept in self._records.items():
+            kept.enter(self._memory, self._values[name])
+        for context, site, address in self._throttles:
+            _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
+        for running, address in self._clocks:
+            run: Any = running.run
+            _CLOCK.pack_into(self._memory, address, run.since, run.now)
+        due = self._due(anew=False)
+        _TIME.pack_into(self._memory, self._until, _NEVER if due is None else min(due - 1, _NEVER))
+        self._inside = True
+
+    def cells(self) -> bytes | None:
+        """The state as it is in the module's memory, if it is only numbers; empty if Python has it, and had it when it
+        was last kept. None: it is to be kept as Python has it.
+        """
+        if not self._inside and not self.left:
+            return b""
+        if self.left or not self.size:
+            return None
+        memory = self._memory
+        cells = memory[self._base : self._end].tobytes()
+        for address in self._clocked:
+            cells += memory[address : address + _CLOCK.size]
+        return cells
+
+    def hasten(self) -> None:
+        """A deadline is earlier than what was due."""
+        self.leave()
+        self._due(anew=True)
+
+    def named(self, context: str) -> str:
+        """The monitor whose context has this name."""
+        return self._contexts[context].monitor
+
+    def leave(self) -> None:
+        """Give it back to Python."""
+        if self._inside:
+            self.show()
+            self._inside, self.prepared, self.left = False, None, True
+
+    def show(self) -> None:
+        """Give Python a copy of what is in the module's memory."""
+        if not self._inside:
+            return
+        values = self._cells.unpack_from(self._memory, self._base)
+        for running, state in zip(self._running, values, strict=False):
+            running.run.state = state  # type: ignore[attr-defined]  # of tables
+        for running, address in self._clocks:
+            run: Any = running.run
+            run.since, run.now = _CLOCK.unpack_from(self._memory, address)
+        found = dict(zip(self._names, values[len(self._running) :], strict=True))
+        for place, _, code in self._spans:
+            name = self._names[place]
+            found[name] = left(self._memory, found[name], code, self._values[name])
+        for name, kept in self._records.items():
+            found[name] = kept.left(self._memory, self._values[name])
+        self._values.update(found)
+
+
+def _cell(kind: Type) -> str:
+    """The `struct` code of a variable in the module's memory, 8 bytes."""
+    if isinstance(kind, kinds.String | kinds.Vector):
+        return "Q"
+    if isinstance(kind, kinds.Bool):
+        return "?7x"
+    if isinstance(kind, kinds.Integer) and kind.bits <= 32:
+        return "i4x" if kind.signed else "I4x"
+    code = struct_code(kind) or ""
+    return "q" if len(code) == 2 else "f4x" if code == "f" else code
+
+
+class Walker:
+    """The walk of one topic, or part of a service."""
+
+    def __init__(
+        self,
+        home: Home,
+        module: FeedModule,
+        feed: Feed,
+        monitors: Sequence[Monitor],
+        events: Sequence[str],
+    ) -> None:
+        self.events = tuple((name,) for name in events)
+        """For each event: what outcomes have as `events` where only it happens."""
+        self.monitors = tuple(monitor.name for monitor in monitors)
+        """For each event: the name of its monitor."""
+        self.drops = feed.drops
+        """Whether messages may be dropped."""
+        self.changes = feed.changes
+        """Whether messages may be changed."""
+        self._lines = [(line, home.named(line.context)) for line in module.lines] if feed.says else []
+        self._said = module.said
+        self.publishes = tuple((home.named(context), topic) for context, topic in feed.publishes)
+        """What it may publish: the name of the monitor, and the topic."""
+        self._publications = [module.publications[each] for each in feed.publishes]
+        self._monitors = tuple(dict.fromkeys(monitors))
+        self._memory = home.machine.memory  # it does not grow
+        self._owner = self._memory.obj
+        self._feed = feed
+        self._frames = module.frames
+        self._machine = home.machine
+        self._shown = _FIRST
+        self._effects = module.effects + _EFFECT.size
+        self._home = home
+        self.verdicts = tuple(
+            _verdict(monitors[event], place, category) for event, place, category in feed.verdicts
+        )
+        """The verdicts that it may come to, not explained."""
+        self._counts = struct.Struct(f"<{len(events)}q")
+        self._none = (0,) * len(events)
+        self._later = struct.Struct(f"<{len(events) + len(feed.verdicts)}q")
+        self._before: Sequence[int] = (0,) * (len(events) + len(feed.verdicts))
+        self._call = home.machine.function(feed.name)
+        self._settle = home.machine.function(feed.settle) if feed.settle else None
+
+    def writers(self, who: int) -> tuple[str, ...]:
+        """What outcomes have as `changed_by`, from a set of events: bit N stands for event N."""
+        return tuple(name for number, (name,) in enumerate(self.events) if who >> number & 1)
+
+    def happened(self) -> Sequence[int]:
+        """How often each event has happened since this was last asked."""
+        counts: Sequence[int] = self._counts.unpack_from(self._memory, self._feed.counters)
+        self._counts.pack_into(self._memory, self._feed.counters, *self._none)
+        return counts
+
+    def ready(self) -> bool:
+        """Whether no monitor waits for its first message, or holds its topics."""
+        for monitor in self._monitors:  # noqa: SIM110  for each batch: half the price of a generator
+            if monitor.enabled and (monitor.held or not monitor.seen):
+                return False
+        return True
+
+    def prepare(
+        self,
+        *,
+        loud: bool,
+        told: Sequence[bool],
+        counted: Sequence[bool] = (),
+        source: int = 0,
+        changed: dict[int, int] | None = None,
+        published: Sequence[bool] = (),
+    ) -> Prepared:
+        """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none,
+        `counted` for each verdict whether there may be more, `published` the same of what it `publishes`. Good until
+        the engine is asked for anything.
+        """
+        bits = sum(1 << number for number, silent in enumerate(told) if silent) - (LOUD if loud else 0)
+        enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
+        only = sum(1 << number for number, silent in enumerate(counted) if silent)
+        publishes = [*zip_longest(self._publications, published, fillvalue=False)]
+        return Prepared(source, bits, enabled, only, {} if changed is None else changed, publishes)
+
+    def walk(  # noqa: PLR0912, PLR0917  called for every batch: calls and keywords would cost a tenth of it
+        self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
+    ) -> Walked | None:
+        """Take messages from `position` on, as many as need nothing special. None: all, and all go on in their buffer.
+
+        Only while the walker is `ready` and nothing of the set is due. `view` has whole frames and can be written: the
+        beginning of `Walks.area`, or others. What goes on before a dropped message is appended to `pieces`.
+        """
+        if view.obj is not self._owner:
+            return self._walk_elsewhere(view, position, run, pieces, time_ns, prepared)
+        if self._home.prepared is not prepared:
+            self._home.prepare(prepared)
+        frames = self._frames
+        end = frames + len(view)
+        begun, said = run, 0
+        output: list[tuple[int, Output]] = []
+        paused = False
+        while True:
+            try:
+                answer = self._call(frames + position, end, time_ns) or 0
+            except MachineTrap as trap:
+                paused = trap.reason == _NO_FUEL
+                answer = self._stopped(frames + position, end, time_ns)
+            said |= answer
+            if self._lines:
+                self._put_out(output)
+            if answer >= LEFT:
+                self._undo()
+            effects = (answer >> 32 & 0xFFFFFF) * _EFFECT.size
+            if effects:
+                for who, what in _EFFECT.iter_unpack(self._memory[self._effects : self._effects + effects]):
+                    if who != -1:
+                        prepared.changed[who] = prepared.changed.get(who, 0) + what
+                        continue
+                    first = (what & _ADDRESS) - frames
+                    if first > run:
+                        pieces.append(view[run:first])
+                    run = (what >> 32) - frames
+            if answer & _ADDRESS == end and run == begun and said < TOLD and not output:
+                return None
+            position = (answer & _ADDRESS) - frames
+            sooner = bool(answer & SOONER)
+            if answer >= LEFT or position == len(view) or sooner:
+                if sooner:
+                    self._home.hasten()
+                dropped, told = self._counted() if run != begun or said & TOLD else ((), ())
+                return Walked(position, run, dropped, told, sooner, output, paused and answer >= LEFT)
+
+    def walk_one(  # noqa: PLR0917  as `walk`
+        self,
+        view: memoryview,
+        position: int,
+        run: int,
+        pieces: list[Any],
+        time_ns: int,
+        prepared: Prepared,
+        fuel: int = MESSAGE_FUEL,
+    ) -> Walked:
+        """As `walk`, but only the message at `position`, with so much fuel; `paused`: it was not enough."""
+        following = position + 4 + _LENGTH.unpack_from(view, position)[0]
+        if self._home.prepared is not prepared:
+            self._home.prepare(prepared)
+        self._machine.refuel(fuel)
+        walked = self.walk(view[:following], position, run, pieces, time_ns, prepared)
+        self._machine.refuel(FUEL)
+        return Walked(following, run, ()) if walked is None else walked
+
+    def take(
+        self, message: Buffer, time_ns: int, prepared: Prepared, fuel: int = MESSAGE_FUEL
+    ) -> Outcome | None:
+        """What is to be done with one message; None if it is left. Verdicts are not explained, and it is not said where
+        it was changed.
+
+        Only as `walk`, with what is prepared for this alone, and where nobody asks what has `happened`.
+        """
+        end = self._frames + 4 + len(message)
+        if end > self._frames + AREA:
+            return None
+        frame = self._memory[self._frames : end]
+        _LENGTH.pack_into(frame, 0, len(message))
+        frame[4:] = message
+        prepared.changed.clear()
+        walked = self.walk_one(frame, 0, 0, [], time_ns, prepared, fuel)
+        if walked is not None and not walked.position:
+            return None
+        outcome = Outcome(message, time_ns)
+        happened = zip(self.events, self.happened(), strict=True)
+        outcome.events = tuple([name for (name,), count in happened if count])
+        for who in prepared.changed:
+            outcome.result, outcome.buffer, outcome.changed_by = (
+                "changed",
+                bytes(frame[4:]),
+                self.writers(who),
+            )
+        if walked is not None:
+            outcome.log = [each for _, each in walked.output if isinstance(each, LogLine)]
+            outcome.published = [each for _, each in walked.output if isinstance(each, Published)]
+            counts = zip(self.verdicts, walked.told, strict=False)  # none is counted where there is none
+            outcome.verdicts = tuple(verdict for verdict, count in counts for _ in range(count))
+        return outcome
+
+    def _walk_elsewhere(  # noqa: PLR0917  as `walk`
+        self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
+    ) -> Walked:
+        dropped: Sequence[int] = ()
+        told: Sequence[int] = ()
+        output: list[tuple[int, Output]] = []
+        sooner = paused = False
+        while position < len(view) and not sooner:
+            following = position + 4 + _LENGTH.unpack_from(view, position)[0]
+            frame = view[position:following]
+            walked = self._walk_beginning(frame, self._shown, time_ns, prepared)
+            if (
+                walked is not None
+                and not (walked.position or walked.paused)
+                and self._shown < min(len(frame), BEGINNING)
+            ):
+                walked = self._walk_beginning(frame, BEGINNING, time_ns, prepared)
+                if walked is None or walked.position:
+                    self._shown = BEGINNING
+            if walked is not None:
+                if not walked.position:
+                    paused = walked.paused
+                    break
+                sooner = walked.sooner
+                told = _sums(told, walked.told)
+                output += [(position, each) for _, each in walked.output]
+                if walked.run:
+                    if position > run:
+                        pieces.append(view[run:position])
+                    run = following
+                    dropped = _sums(dropped, walked.dropped)
+            position = following
+        return Walked(position, run, dropped, told, sooner, output, paused)
+
+    def _walk_beginning(
+        self, frame: memoryview, shown: int, time_ns: int, prepared: Prepared
+    ) -> Walked | None:
+        """The walk over one frame of which so many bytes are shown."""
+        size, before = min(len(frame), shown), prepared.changed.copy()
+        area = self._memory[self._frames : self._frames + size]
+        area[4:] = frame[4:size]
+        _LENGTH.pack_into(area, 0, size - 4)
+        _TIME.pack_into(self._memory, REST, len(frame) - size)
+        try:
+            walked = self.walk(area, 0, 0, [], time_ns, prepared)
+        finally:
+            _TIME.pack_into(self._memory, REST, 0)
+        if prepared.changed != before:
+            frame[4:size] = area[4:]
+        return walked
+
+    def _put_out(self, output: list[tuple[int, Output]]) -> None:
+        """Append what is put out and published, each with where its frame begins."""
+        at, end = self._said, _LENGTH.unpack_from(self._memory, SURE)[0]
+        while at < end:
+            number, frame = HEAD.unpack_from(self._memory, at)
+            line, monitor = self._lines[number]
+            output.append((frame - self._frames, line.put_out(self._memory, at, monitor)))
+            at += line.size
+
+    def _stopped(self, *call: int) -> int:
+        """What the module would have answered where it was stopped: the message that it looked at is left.
+
+        If none had begun it is called again: the calls before have used up the fuel.
+        """
+        self._home.machine.refuel(FUEL)
+        at, effect = _POSITION.unpack_from(self._memory, POSITION)
+        if at:
+            _POSITION.pack_into(self._memory, POSITION, 0, effect)
+            effects = (effect + _EFFECT.size - self._effects) // _EFFECT.size
+            return int(at | effects << 32 | LEFT | TOLD | SOONER)  # there may be an earlier deadline
+        try:
+            return self._call(*call) or 0
+        except MachineTrap:
+            return self._stopped(*call)
+
+    def _undo(self) -> None:
+        """Take back what was done to the message that is left."""
+        memory = self._memory
+        for address, kept in self._feed.undo:
+            memory[address : address + 8] = memory[kept : kept + 8]
+        end = _LENGTH.unpack_from(memory, UNDO)[0]
+        for at, size, old in [*_LOG.iter_unpack(memory[self._feed.log : end])][::-1]:
+            memory[at : at + size] = old[:size]
+        if self._settle is not None:
+            self._home.machine.refuel(FUEL)
+            self._settle()
+
+    def _counted(self) -> tuple[Sequence[int], Sequence[int]]:
+        """How many messages each event has dropped, and how often there was each verdict, since this was last asked."""
+        counts = self._later.unpack_from(self._memory, self._feed.counters + self._counts.size)
+        before, self._before = self._before, counts
+        more = [now - then for now, then in zip(counts, before, strict=True)]
+        return more[: len(self.events)], more[len(self.events) :]
+
+
+def _sums(one: Sequence[int], other: Sequence[int]) -> Sequence[int]:
+    return [sum(counts) for counts in zip_longest(one, other, fillvalue=0)]
+
+
+def _verdict(monitor: Monitor, place: int, handler: int) -> Verdict:
+    code = monitor.properties[place].code
+    source = code.property.source
+    return Verdict(monitor.name, monitor.properties[place].index, source.logic, code.order[handler], source)
+
+
+class Walks(NamedTuple):
+    """The walkers of a set by topic (see `EventCode.way`), and the part of their module's memory to receive frames
+    into, if there is one.
+    """
+
+    of_topic: Mapping[str, Walker] = MappingProxyType({})
+    area: memoryview | None = None
+
+
+def walks_of(
+    compiled: Compiled, module: FeedModule, interpreter: Interpreter, monitors: Sequence[Monitor], due: Due
+) -> Walks:
+    """The walkers of all topics that the module of a set has; their monitors are told where their state is."""
+    if not module.feeds:
+        return Walks()
+    found = list(groups(compiled.specifications))
+    values = Values(compiled.messages)
+    machine = Machine(module.code, module.memory)
+    walks: dict[str, Walker] = {}
+    for group, cells in zip(found, module.cells, strict=True):
+        running = [monitors[number].properties[index] for number, index in group.properties]
+        for number, address in cells.exits.items():
+            kept = running[number].history
+            assert isinstance(kept, Exits | ClockedSteps)  # noqa: S101  it has tables
+            kept.move(machine, machine.memory[address:])
+        contexts = {compiled.specifications[number].context for number in group.specifications}
+        throttles = [
+            (interpreter.contexts[context], site, address)
+            for (context, site), address in module.throttles.items()
+            if context in contexts
+        ]
+        specifications = [compiled.specifications[number] for number in group.specifications]
+        home = Home(
+            machine,
+            cells,
+            interpreter,
+            running,
+            throttles,
+            values=values,
+            due=due,
+            properties=[(monitors[number].name, index) for number, index in group.properties],
+            known={code: (one.name, name) for one in specifications for name, code in one.variables.items()},
+        )
+        for number in group.specifications:
+            monitors[number].home = home
+        for (topic, _), events in zip(group.component.topics, group.events, strict=True):
+            if topic in module.feeds:
+                own = [monitors[number] for number, _ in events]
+                names = [
+                    f"{monitors[number].name}.{monitors[number].code.events[index].name}"
+                    for number, index in events
+                ]
+                walks[topic] = Walker(home, module, module.feeds[topic], own, names)
+    return Walks(walks, machine.memory[module.frames : module.frames + AREA])

@@ -1,0 +1,388 @@
+"""What may be said of a topic's messages and of their order, each with the bound that the recordings support.
+
+A bound is the level that `extremes` expects to be passed once in `QUIET_HOURS` by all bounds of the file together.
+What says little is left out: a rate that would let any value follow any other, a standstill as long as the drive.
+Of each topic only so many are kept (`MOST`); those that most messages exercised come first.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+from rosmop.learn import extremes
+from rosmop.learn.orders import Orders, Pair
+from rosmop.learn.recordings import Windows
+from rosmop.learn.series import Highs, Series, Values
+from rosmop.learn.text import identifier, literal, number, rounded_down, rounded_up, short_names
+from rosmop.learn.topics import Content, Rhythm
+
+QUIET_HOURS = 10.0
+MOST = {"range": 10, "constant": 12, "values": 6, "rate": 6, "unchanged": 6, "moves": 2, "order": 2}
+"""Of each kind for one topic; of the others there are as many as there are fields, or one."""
+
+_FEWEST = 20  # messages that something said of all of them stands on
+_FEWEST_SET = 10
+_ALWAYS_CHANGING = 0.5  # of the messages brought another value
+_REGULAR = 8.0  # usual gaps: a topic that pauses for longer is not one that comes regularly
+
+
+@dataclass(frozen=True)
+class Support:
+    """What a candidate stands on."""
+
+    messages: int
+    seconds: float
+    recordings: int
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One thing that held in all recordings.
+
+    `says` begins the warning, as no other's does; `condition` is that of the alarm in the language, with `{v}` for the
+    field's value, `{n}` for a name made of its path and `{t}` for a prefix of the topic's own. It needs the
+    declarations `state`, and the statements `first` before and `then` after all conditions. Or a `formula` instead.
+    """
+
+    topic: str
+    kind: str
+    path: str
+    says: str
+    seen: str
+    support: Support
+    element: int | None = None
+    folded: bool = False
+    length: int | None = None
+    condition: str = ""
+    shown: str = ""
+    state: tuple[str, ...] = ()
+    first: tuple[str, ...] = ()
+    then: tuple[str, ...] = ()
+    formula: str = ""
+    events: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+    """Of an order: its events' topics and patterns."""
+    alarms: int = 0
+    """On the recordings that were held out."""
+    widened: str = ""
+
+    @property
+    def key(self) -> tuple[str, str, str, int | None]:
+        """What it is about, whatever its bound."""
+        return self.topic, self.kind, self.path, self.element
+
+    @property
+    def topics(self) -> set[str]:
+        """The topics it listens to."""
+        return {topic for topic, _ in self.events.values()} | {self.topic}
+
+    @property
+    def place(self) -> str:
+        """The field as people write it."""
+        return self.path if self.element is None else f"{self.path}[{self.element}]"
+
+
+@dataclass
+class Knowledge:
+    """What was seen of all topics."""
+
+    types: Mapping[str, str]
+    rhythms: Mapping[str, Rhythm]
+    contents: Mapping[str, Content]
+    orders: Orders
+    windows: Windows
+    trimmed: Counter[str] = field(default_factory=Counter)
+    """How many conditions of each topic `candidates` left out because there are more than `MOST`."""
+
+    @property
+    def short(self) -> Mapping[str, str]:
+        """A name for each topic: its last words, as far as they are its own."""
+        paths = {topic: identifier(topic).replace("_", ".") for topic in self.contents}
+        names = short_names(paths.values())
+        return {topic: names[path] for topic, path in paths.items()}
+
+    def candidates(self) -> Iterator[Candidate]:
+        """All that is worth saying, topic by topic."""
+        bounds = sum(3 * len(content.types) for content in self.contents.values()) + len(self.orders.pairs)
+        proposer = _Proposer(self, QUIET_HOURS * 3600 / self.windows.mean * max(bounds, 1))
+        self.trimmed.clear()
+        for topic in sorted(self.contents):
+            found: Counter[str] = Counter()
+            for candidate in proposer.of_topic(topic):
+                found[candidate.kind] += 1
+                if found[candidate.kind] <= MOST.get(candidate.kind, len(self.contents[topic].types)):
+                    yield candidate
+                else:
+                    self.trimmed[topic] += 1
+        yield from proposer.of_orders()
+
+
+# Path, element and length of an array, and what is known of it
+_Place = tuple[str, int | None, int | None, Series]
+
+
+class _Proposer:
+    def __init__(self, known: Knowledge, windows: float) -> None:
+        self._known = known
+        self._windows = windows
+
+    def of_topic(self, topic: str) -> Iterator[Candidate]:
+        rhythm, content = self._known.rhythms[topic], self._known.contents[topic]
+        support = self._support(rhythm)
+        yield from self._rhythm(topic, rhythm, content, support)
+        if rhythm.count < _FEWEST_SET:
+            return
+        yield from self._stamps(topic, content, support)
+        for path, lengths in content.lengths.items():
+            if len(lengths.windows) == 1:
+                (length,) = lengths.windows
+                yield Candidate(
+                    topic, "length", path, f"{path} has another length", f"always {length} elements", support,
+                    condition=f"{{v}}.size() != {length}", shown="(long) {v}.size()",
+                )  # fmt: skip
+        yield from self._sets(topic, content, support)
+        if rhythm.count < _FEWEST:
+            return
+        for place in sorted(self._numbers(content), key=lambda found: -found[3].changed):
+            yield from self._number(topic, content, rhythm, place)
+
+    def _support(self, rhythm: Rhythm) -> Support:
+        return Support(rhythm.count, round(self._known.windows.seconds, 1), len(rhythm.recordings))
+
+    def _upper(self, highs: Highs, *, stops: bool = False) -> float | None:
+        return extremes.upper(highs.of.values(), self._windows, stops=stops)
+
+    def _rhythm(self, topic: str, rhythm: Rhythm, content: Content, support: Support) -> Iterator[Candidate]:
+        most = self._upper(content.counts)
+        if most is not None and rhythm.count >= _FEWEST:
+            span, limit = rhythm.interval, math.ceil(most)
+            yield Candidate(
+                topic, "often", "", "comes too often", f"at most {content.counts.top:g} in {span:g} s", support,
+                condition=f"{{t}}messages > {limit}", shown="(long) {t}messages",
+                state=("double {t}opened = 0.0;", "int {t}messages = 0;"),
+                first=(
+                    f"if (now - {{t}}opened >= {number(span)}) {{ {{t}}opened = now; {{t}}messages = 0; }}",
+                    "{t}messages = {t}messages + 1;",
+                ),
+            )  # fmt: skip
+        longest = self._upper(rhythm.gaps)
+        if longest is None or rhythm.count < _FEWEST or longest > _REGULAR * rhythm.period:
+            return
+        # A message that is less than half a period late is not one that is missing.
+        milliseconds = math.ceil(max(longest, 1.5 * rhythm.period) * 1000)
+        yield Candidate(
+            topic, "late", "", f"is silent for {milliseconds} ms",
+            f"every {rhythm.period * 1000:.1f} ms, at most {rhythm.gaps.top * 1000:.1f} ms apart", support,
+            formula=f"pattern: globally: message causes message within {milliseconds}ms",
+        )  # fmt: skip
+
+    def _stamps(self, topic: str, content: Content, support: Support) -> Iterator[Candidate]:
+        age, lead = self._upper(content.ages), self._upper(content.leads)
+        if not content.ages.of:
+            return
+        if not content.backward:
+            yield Candidate(
+                topic, "stamp", "header.stamp", "header.stamp goes backward", "never backward", support,
+                condition="{v}.toSec() < {t}stamped", shown="{t}stamped - {v}.toSec()",
+                state=("double {t}stamped = 0.0;",), then=("{t}stamped = {v}.toSec();",),
+            )  # fmt: skip
+        if age is not None and lead is not None:
+            width = max(content.ages.top + content.leads.top, 1e-4)  # a tenth of a millisecond is no delay
+            low, high = rounded_down(-lead - 1e-4, width), rounded_up(age + 1e-4, width)
+            yield Candidate(
+                topic, "age", "header.stamp", "header.stamp is too old or too new",
+                f"{-content.leads.top * 1000:.2f} to {content.ages.top * 1000:.2f} ms before the reception", support,
+                condition=f"now - {{v}}.toSec() < {low} || now - {{v}}.toSec() > {high}",
+                shown="now - {v}.toSec()",
+            )  # fmt: skip
+
+    def _sets(self, topic: str, content: Content, support: Support) -> Iterator[Candidate]:
+        for path, values in content.sets.items():
+            if content.types[path] != "string[]":
+                yield from self._set(topic, content, path, values, support)
+            elif len(values.windows) == 1 and values.closed:
+                (texts,) = values.windows
+                pieces = [literal(text) for text in texts]
+                if texts and None not in pieces:
+                    unlike = " || ".join(f"{{v}}[{place}] != {text}" for place, text in enumerate(pieces))
+                    yield Candidate(
+                        topic, "constant", path, f"{path} is another", f"always {', '.join(map(str, pieces))}", support,
+                        condition=unlike, length=len(texts),
+                    )  # fmt: skip
+        integers = {
+            path: series for path, series in content.numbers.items() if not content.types[path].startswith("float")
+        }  # fmt: skip
+        for path, series in integers.items():
+            if not content.types[path].endswith("]"):
+                yield from self._set(topic, content, path, series.values, support)
+
+    def _set(
+        self, topic: str, content: Content, path: str, values: Values, support: Support
+    ) -> Iterator[Candidate]:
+        texts = [literal(value) for value in values.windows]
+        if not values.closed or None in texts:
+            return
+        if content.types[path] == "bool" and len(texts) == 2:  # there are no others
+            yield from self._moves(topic, content, path, values, support)
+            return
+        shown = "{v}.c_str()" if content.types[path] == "string" else "(long) {v}"
+        yield Candidate(
+            topic, "constant" if len(texts) == 1 else "values", path, f"{path} has a new value",
+            f"always {texts[0]}" if len(texts) == 1 else f"one of {', '.join(map(str, texts))}", support,
+            condition=" && ".join(f"{{v}} != {text}" for text in texts), shown=shown,
+        )  # fmt: skip
+        yield from self._moves(topic, content, path, values, support)
+
+    def _moves(
+        self, topic: str, content: Content, path: str, values: Values, support: Support
+    ) -> Iterator[Candidate]:
+        """The automaton of a field's values, if some value never followed some other and all moves are well known."""
+        moves = content.moves.get(path, {})
+        ordered = list(values.windows)
+        count = len(ordered)
+        if (
+            count < 3
+            or len(moves) >= count * (count - 1)
+            or min((row[0] for row in moves.values()), default=0) < 3
+        ):
+            return
+        names = {value: f"value{place}" for place, value in enumerate(ordered)}
+        go = {value: f"{name} -> at_{name}" for value, name in names.items()}
+        states = " ".join(
+            f"at_{names[value]} [ {', '.join(go[to] for to in ordered if to == value or (value, to) in moves)} ]"
+            for value in ordered
+        )
+        begin = ", ".join(go.values())
+        told = "; ".join(f"{literal(a)} to {literal(b)}" for a, b in moves)
+        yield Candidate(
+            topic, "moves", path, f"{path} makes a move that was never seen", told, support,
+            formula=f"fsm: start [ {begin} ] {states}",
+            events={names[value]: (topic, f"{path}:{literal(value)}") for value in ordered},
+        )  # fmt: skip
+
+    def _numbers(self, content: Content) -> Iterator[_Place]:
+        for path, series in content.numbers.items():
+            row = content.elements.get(path)
+            if row:
+                yield from ((path, place, len(row), element) for place, element in enumerate(row))
+            elif (
+                content.types[path].endswith("]")
+                or content.types[path].startswith("float")
+                or series.values.many
+            ):
+                yield path, None, None, series
+
+    def _number(self, topic: str, content: Content, rhythm: Rhythm, place_of: _Place) -> Iterator[Candidate]:
+        path, element, length, series = place_of
+        support = self._support(rhythm)
+        integer = not content.types[path].startswith("float")
+        folded = content.types[path].endswith("]") and element is None
+        place = path if element is None else f"{path}[{element}]"
+        shown = "(long) {v}" if integer else "{v}"
+        base = Candidate(
+            topic, "", path, "", "", support, element=element, folded=folded, length=length, shown=shown
+        )
+        if not series.highs.of:
+            return
+        low, high = -series.lows.top, series.highs.top
+        if low == high:
+            only = literal(int(low) if integer else low)
+            same = f"{{v}} != {only}" if not series.nan else f"{{v}} < {only} || {{v}} > {only}"
+            yield replace(
+                base, kind="constant", says=f"{place} has a new value", seen=f"always {only}",
+                condition=same + (" && !isinf({v})" if series.infinite else ""),
+            )  # fmt: skip
+            return
+        top, bottom = (self._upper(side, stops=True) for side in (series.highs, series.lows))
+        if top is None or bottom is None:
+            return
+        width = high - low
+        if integer:
+            above, below = number(math.ceil(top)), number(-math.ceil(bottom))
+        else:
+            above, below = rounded_up(top, width), rounded_down(-bottom, width)
+        within = f"{{v}} >= {below} && {{v}} <= {above}"
+        outside = f"({{v}} < {below} || {{v}} > {above})" if series.nan else f"!({within})"
+        also = [word for word, seen in (("NaN", series.nan), ("infinite", series.infinite)) if seen]
+        yield replace(
+            base, kind="range", says=f"{place} is out of range",
+            seen=f"{low:.6g} to {high:.6g}" + (f", also {' and '.join(also)}" if also else ""),
+            condition=outside + (" && !isinf({v})" if series.infinite else ""),
+        )  # fmt: skip
+        if folded:
+            return
+        rate = self._upper(series.rates)
+        usual = max(rhythm.period, 1e-3)
+        if rate is not None and rate * usual < width / 2:
+            yield replace(
+                base, kind="rate", says=f"{place} jumps", seen=f"at most {series.rates.top:.4g} a second",
+                condition="{t}begun && std::abs({v} - {t}last_{n}) > "
+                f"{rounded_up(rate, series.rates.top)} * elapsed",
+                state=("double {t}last_{n} = 0.0;",), then=("{t}last_{n} = {v};",),
+            )  # fmt: skip
+        stays = self._upper(series.stays)
+        mean = support.seconds / max(support.recordings, 1)
+        if stays is not None and series.changed >= _ALWAYS_CHANGING * series.count and stays < mean / 3:
+            limit = max(stays, 3 * usual)
+            yield replace(
+                base, kind="unchanged", says=f"{place} is stuck",
+                seen=f"never the same for more than {series.stays.top:.3g} s",
+                condition=f"now - {{t}}since_{{n}} > {rounded_up(limit, limit)}",
+                state=("double {t}last_{n} = 0.0;", "double {t}since_{n} = 0.0;"),
+                first=("if (!{t}begun || {v} != {t}last_{n}) { {t}since_{n} = now; }",), then=("{t}last_{n} = {v};",),
+            )  # fmt: skip
+
+    def of_orders(self) -> Iterator[Candidate]:
+        """Orders of topics, the strongest first."""
+        orders = self._known.orders
+        found: list[tuple[float, Candidate]] = []
+        done: set[frozenset[str]] = set()
+        for (a, b), pair in orders.pairs.items():
+            if pair.turns and orders.pairs[b, a].turns and frozenset((a, b)) not in done:
+                if not pair.requires:
+                    continue  # told of (b, a), which begins
+                done.add(frozenset((a, b)))
+                formula = "fsm: first [ a -> second ] second [ b -> first ]"
+                found.append((0.0, self._order((a, b), "turns", formula, "one after the other, always")))
+        for (a, b), pair in orders.pairs.items():
+            taking_turns = frozenset((a, b)) in done
+            found += [
+                row for row in self._timed(a, b, pair, orders) if row[1].kind == "causes" or not taking_turns
+            ]
+        told: dict[str, int] = {}
+        for _, candidate in sorted(found, key=lambda ranked: ranked[0]):
+            names = [topic for topic, _ in candidate.events.values()]
+            if all(told.get(name, 0) < MOST["order"] for name in names):
+                told.update({name: told.get(name, 0) + 1 for name in names})
+                yield candidate
+
+    def _timed(self, a: str, b: str, pair: Pair, orders: Orders) -> Iterator[tuple[float, Candidate]]:
+        rhythms = self._known.rhythms
+        seconds = max(self._known.windows.seconds, 1e-3)
+        back = self._upper(pair.back)
+        if pair.requires and back is not None:
+            rate, count = rhythms[a].count / seconds, rhythms[b].count
+            if not orders.by_chance(back, rate, count):
+                formula = f"pattern: globally: b requires a within {max(math.ceil(back * 1000), 1)}ms"
+                seen = f"at most {pair.back.top * 1000:.1f} ms before"
+                yield back * rate, self._order((a, b), "requires", formula, seen)
+        forth = self._upper(pair.forth)
+        if forth is None or pair.answered < _FEWEST:
+            return
+        rate = rhythms[b].count / seconds
+        if not orders.by_chance(forth, rate, pair.answered):
+            formula = f"pattern: globally: a causes b within {max(math.ceil(forth * 1000), 1)}ms"
+            seen = f"at most {pair.forth.top * 1000:.1f} ms after"
+            yield forth * rate, self._order((a, b), "causes", formula, seen)
+
+    def _order(self, topics: tuple[str, str], kind: str, formula: str, seen: str) -> Candidate:
+        a, b = topics
+        rhythms = self._known.rhythms
+        less = min((rhythms[a], rhythms[b]), key=lambda rhythm: rhythm.count)
+        says = {
+            "turns": f"and {b} do not take turns",
+            "requires": f"did not come before {b}",
+            "causes": f"was not followed by {b}",
+        }
+        events = {"a": (a, ""), "b": (b, "")}
+        return Candidate(a, kind, b, says[kind], seen, self._support(less), formula=formula, events=events)

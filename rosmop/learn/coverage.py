@@ -1,0 +1,276 @@
+"""What of specifications recordings exercised: events, branches, handlers, functions, states and transitions.
+
+The specifications are compiled once more with a counter of their own in front of each action, branch and handler, put
+into the tree and not into the text, so lines stay what they are; the runs of state machines are watched from outside.
+What the monitors do is otherwise the same, and nobody's messages are kept.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+from rosmop.check.specification import compile_files
+from rosmop.form.positions import Position
+from rosmop.learn.recordings import Recording
+from rosmop.logics.fsm import FAIL, TIMEOUT, StateText, read_machine
+from rosmop.logics.interface import Categories, CompiledProperty, Run, Source
+from rosmop.run.engine import MonitorSet
+from rosmop.run.explain import history_of
+from rosmop.text import tree
+from rosmop.text.parser import parse
+from roswire.definitions import Definitions
+
+_MACHINES = frozenset({"fsm", "tfsm"})
+
+
+@dataclass(frozen=True)
+class Item:
+    """Something that a recording may exercise: its kind (`event`, `branch`, `state`, …), what it is, and where."""
+
+    specification: str
+    kind: str
+    what: str
+    position: Position
+
+
+def covered(
+    texts: Mapping[str, str], definitions: Definitions, recordings: Iterable[Recording]
+) -> dict[Item, int]:
+    """How often the recordings exercised each item, in the order of the text.
+
+    A state counts how often it was entered or stayed in by an event. Raises `SpecificationError`.
+    """
+    MonitorSet.load(texts, definitions)  # errors are those of the text as it is
+    marked = _Marked([parse(text, name) for name, text in texts.items()])
+    counts: Counter[Item] = Counter()
+    for recording in recordings:
+        monitors = MonitorSet(compile_files(marked.files, definitions), "drop", lambda: lambda: False)
+        # who explains tries runs, which are no part of the recording
+        monitors.explain_when(lambda *_: False, lambda *_: False)
+        watches = _watch(monitors)
+        monitors.start(recording.began, frozenset(recording.topics))
+        for topic, time, data in recording.messages():
+            monitors.process(topic, data, time)
+        for monitor in monitors.monitors:
+            for name, item in marked.items.items():
+                if item.specification == monitor.name:
+                    counts[item] += monitors.value(monitor.name, name)
+        for watch in watches:
+            counts.update(watch.seen())
+    items = [*marked.items.values(), *(item for file in marked.files for item in _machine_items(file))]
+    return {item: counts[item] for item in sorted(items, key=lambda item: item.position)}
+
+
+# Counters in the tree
+
+
+class _Marked:
+    """Files with a counter in front of each thing; `items` by the names of the counters."""
+
+    def __init__(self, files: Sequence[tree.File]) -> None:
+        self.items: dict[str, Item] = {}
+        self._declared: list[tree.Declaration] = []
+        self._specification = ""
+        self.files = [
+            replace(
+                file,
+                specifications=tuple(self._marked(specification) for specification in file.specifications),
+            )
+            for file in files
+        ]
+
+    def _marked(self, node: tree.Specification) -> tree.Specification:
+        self._specification, self._declared = node.name, []
+        events = tuple(
+            replace(event, action=self._block("event", event.name, event.position, event.action))
+            for event in node.events
+        )
+        functions = tuple(
+            replace(function, body=self._block("function", function.name, function.position, function.body))
+            for function in node.functions
+        )
+        inits = tuple(
+            replace(block, body=self._block("function", "init", block.position, block.body))
+            for block in node.inits
+        )
+        properties = tuple(
+            replace(
+                declared,
+                handlers=tuple(
+                    replace(
+                        handler,
+                        body=self._block("handler", f"@{handler.category}", handler.position, handler.body),
+                    )
+                    for handler in declared.handlers
+                ),
+            )
+            for declared in node.properties
+        )
+        return replace(
+            node, declarations=(*node.declarations, *self._declared), events=events, functions=functions, inits=inits,
+            properties=properties,
+        )  # fmt: skip
+
+    def _block(self, kind: str, what: str, position: Position, body: tree.Statement) -> tree.Block:
+        mark = self._mark(Item(self._specification, kind, what, position))
+        inside = self._inside(body)
+        statements = inside.statements if isinstance(inside, tree.Block) else (inside,)
+        return tree.Block(body.position, (mark, *statements))
+
+    def _mark(self, item: Item) -> tree.Statement:
+        name = f"covered_{len(self.items)}_"
+        self.items[name] = item
+        text = f"m() {{ static long {name} = 0; init() {{ {name} = {name} + 1; }} }}"
+        (specification,) = parse(text, item.position.file).specifications
+        self._declared += specification.declarations
+        return specification.inits[0].body.statements[0]
+
+    def _inside(self, node: tree.Statement) -> tree.Statement:
+        if isinstance(node, tree.Block):
+            return replace(node, statements=tuple(self._inside(statement) for statement in node.statements))
+        if isinstance(node, tree.If):
+            yes = self._block("branch", "if", node.position, node.yes)
+            no = node.no or tree.Block(node.position, ())
+            if isinstance(no, tree.If):  # its own branches are marked
+                return replace(node, yes=yes, no=self._inside(no))
+            return replace(node, yes=yes, no=self._block("branch", "else", no.position, no))
+        if isinstance(node, tree.While | tree.For | tree.RangeFor):
+            return replace(node, body=self._block("branch", "loop", node.position, node.body))
+        if isinstance(node, tree.Switch):
+            cases = tuple(
+                replace(
+                    case,
+                    statements=(
+                        self._mark(Item(self._specification, "branch", "case", case.position)),
+                        *(self._inside(statement) for statement in case.statements),
+                    ),
+                )
+                for case in node.cases
+            )
+            return replace(node, cases=cases)
+        return node
+
+
+# State machines
+
+
+def _watch(monitors: MonitorSet) -> list["_Watch"]:
+    """Watch every state machine of a set, before it starts."""
+    watches = []
+    for monitor in monitors.monitors:
+        for running in monitor.properties:
+            if running.code.property.logic in _MACHINES:
+                watch = _Watch(monitor.name, running.code.property)
+                running.code = replace(running.code, property=watch)
+                running.history = history_of(watch, 0)
+                watches.append(watch)
+    return watches
+
+
+class _Watch(CompiledProperty):
+    """A state machine whose runs count the transitions that they take."""
+
+    def __init__(self, specification: str, machine: CompiledProperty) -> None:
+        super().__init__(machine.source, machine.categories)
+        self.expiry = machine.expiry
+        self.taken: Counter[tuple[str, str]] = Counter()
+        self._machine = machine
+        self._specification = specification
+        self.timed = machine.timed
+
+    def start(self, time_ns: int) -> Run:
+        """A run of the machine that is watched."""
+        states = read_machine(self.source, timed=self._machine.timed).states
+        return _Run(self, self._machine.start(time_ns), next(iter(states)))
+
+    def seen(self) -> dict[Item, int]:
+        """How often each state and transition was exercised."""
+        counts: Counter[Item] = Counter()
+        states = read_machine(self.source, timed=self.timed).states
+        for (state, event), count in self.taken.items():
+            if state in states:
+                target = _target(states[state], event)
+                counts[_transition(self._specification, self.source, state, event, states[state])] += count
+                if target in states:
+                    counts[_state(self._specification, self.source, target)] += count
+        return dict(counts)
+
+
+class _Run:
+    """A run that says which state it was in."""
+
+    keeps = ()
+
+    def __init__(self, watch: _Watch, run: Run, state: str) -> None:
+        self._watch = watch
+        self._run = run
+        self._state = state
+
+    def __copy__(self) -> "_Run":
+        return _Run(self._watch, copy(self._run), self._state)
+
+    @property
+    def deadline(self) -> int | None:
+        """The machine's."""
+        return self._run.deadline
+
+    @property
+    def as_new(self) -> bool:
+        """Never: what is watched is not tried out."""
+        return False
+
+    def step(self, event: int, time_ns: int) -> Categories:
+        """Take an event, and count it."""
+        categories = self._run.step(event, time_ns)
+        self._watch.taken[self._state, self._watch.events[event]] += 1
+        self._state = categories[0]
+        return categories
+
+    def expire(self) -> Categories:
+        """Let the deadline pass, and count it if the machine moved."""
+        categories = self._run.expire()
+        self._watch.taken[self._state, TIMEOUT] += 1
+        self._state = categories[1] if len(categories) > 1 else self._state
+        return categories
+
+
+def _target(state: StateText, event: str) -> str:
+    if event == TIMEOUT:
+        return state.timeout[1].text if state.timeout is not None else FAIL
+    move = state.moves.get(event, state.default)
+    return move.text if move is not None else FAIL
+
+
+def _state(specification: str, source: Source, name: str) -> Item:
+    found = re.search(rf"\b{name}\s*\[", source.text)
+    return Item(
+        specification, "state", name, source.origin.within(source.text, found.start() if found else 0)
+    )
+
+
+def _transition(specification: str, source: Source, state: str, event: str, text: StateText) -> Item:
+    written = event if event in text.moves or event == TIMEOUT else "default"
+    target = _target(text, event)
+    token = text.timeout[1] if event == TIMEOUT and text.timeout else text.moves.get(event, text.default)
+    position = source.origin.within(source.text, token.offset) if token is not None else source.origin
+    what = f"{state}: {written} -> {target}" if token is not None else f"{state}: any other event -> {FAIL}"
+    return Item(specification, "transition", what, position)
+
+
+def _machine_items(file: tree.File) -> Iterator[Item]:
+    for node in file.specifications:
+        names = tuple(event.name for event in node.events)
+        for declared in node.properties:
+            if declared.logic.lower() in _MACHINES:
+                logic = declared.logic.lower()
+                source = Source(logic, declared.formula, names, declared.formula_position)
+                for name, state in read_machine(source, timed=logic == "tfsm").states.items():
+                    yield _state(node.name, source, name)
+                    for event in state.moves:
+                        yield _transition(node.name, source, name, event, state)
+                    if state.default is not None:
+                        yield _transition(node.name, source, name, "default", state)
+                    if state.timeout is not None:
+                        yield _transition(node.name, source, name, TIMEOUT, state)

@@ -1,0 +1,82 @@
+"""Pieces of `.rv` text: numbers, strings, names and conditions as the language writes them."""
+
+import math
+import re
+from collections.abc import Iterable
+from decimal import ROUND_CEILING, Decimal
+
+from rosmop.text.complaints import FORBIDDEN, RESERVED
+
+_ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
+_PRINTABLE = re.compile(r"[ -~]*\Z")
+CPP = {
+    "float32": "float", "float64": "double", "byte": "int8_t", "char": "uint8_t", "string": "std::string",
+    "bool": "bool", **{f"{sign}int{size}": f"{sign}int{size}_t" for sign in ("", "u") for size in (8, 16, 32, 64)},
+}  # fmt: skip
+"""The language's types for those of messages."""
+
+
+def rounded_up(value: float, width: float) -> str:
+    """A number not below the value, with no more digits than a hundredth of the width needs."""
+    if not width > 0:
+        return number(value)
+    quantum = Decimal(1).scaleb(math.floor(math.log10(width / 100)))
+    return number(float(Decimal(value).quantize(quantum, ROUND_CEILING)))
+
+
+def rounded_down(value: float, width: float) -> str:
+    """A number not above the value."""
+    return number(-float(rounded_up(-value, width)))
+
+
+def number(value: float) -> str:
+    """A number as the language reads it; an integer stays one."""
+    text = repr(value)
+    return "0.0" if text == "-0.0" else text
+
+
+def literal(value: object) -> str | None:
+    """A bool, number or string; None where the language cannot write it."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return f'"{quoted(value)}"' if _PRINTABLE.match(value) else None
+    return number(value) if isinstance(value, int | float) and math.isfinite(value) else None
+
+
+def quoted(text: str) -> str:
+    """What stands between the quotes of a string."""
+    return "".join(_ESCAPES.get(letter, letter) for letter in text)
+
+
+def formatted(text: str) -> str:
+    """Text for a format of printf."""
+    return quoted(text).replace("%", "%%")
+
+
+def identifier(text: str) -> str:
+    """A name made of any text."""
+    name = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_") or "root"
+    return f"n{name}" if name[0].isdigit() else name
+
+
+def short_names(paths: Iterable[str]) -> dict[str, str]:
+    """For each path the shortest end of it that no other has, as a name that the language has not taken."""
+    paths = list(paths)
+    names: dict[str, str] = {}
+    for path in paths:
+        steps = path.split(".")
+        for count in range(1, len(steps) + 1):
+            end = ".".join(steps[-count:])
+            others = (other for other in paths if other != path)
+            if count == len(steps) or not any(other == end or other.endswith("." + end) for other in others):
+                name = "_".join(steps[-count:])
+                taken = name in FORBIDDEN or name in RESERVED or name in names.values() or name in _OWN
+                names[path] = f"{name}_field" if taken else name
+                break
+    return names
+
+
+_OWN = frozenset(
+    {"now", "elapsed", "before", "begun", "i", "messages", "opened", "message", "stamped", "abs", "isinf"}
+)

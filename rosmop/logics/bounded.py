@@ -1,0 +1,740 @@
+"""Monitors for formulas that look into the future within bounds of time: the other part of mtl.
+
+The formula is asked at every event, and the answer for an event is told once it is certain: by an event, or when a
+bound passes. What is certain is found part by part: `x or y` is once one of them is, `x until[l,h] y` once `y` has
+come in time and `x` held until then, or `x` has failed, or the time is over.
+
+Theory of operation. A `Program` (`past.py`) has the distinct parts of the formula. Those that look back only are
+computed at their event (`Folded`). Of the others a *cell* stands for the value of one part at one event
+while that is open; a cell tells its *users* when it is decided. Cells are made for what is asked for only: of
+`fire => eventually[0,1s] safe` nothing is kept but the events `fire` that wait.
+
+- `until` over parts that are known at once keeps the events asked about in order, and decides them from the oldest on:
+  a step costs the same however many wait.
+- `until` and `since` over parts that are open themselves keep *rows*, one for each event that matters. What is certain
+  is what comes out alike whether all that is open were to fail or to hold (both operators only gain when a part comes
+  to hold). When a part is decided that was open, `until` looks at the rows that this may decide, `since` at all.
+
+A run waits for at most `MOST_OPEN` events; a step beyond that is a fault, and its event is not seen.
+
+To take a step back (`BoundedRun.mark`) the operators' rows are copied, each cell as it was before it is first changed
+(`Cell.touch`); rows do not change once their step is over.
+"""
+
+from abc import ABC, abstractmethod
+from bisect import bisect_left, insort
+from collections import deque
+from collections.abc import Mapping
+from copy import copy, deepcopy
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from rosmop.logics.formula import Formula
+from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
+from rosmop.logics.past import FOREVER, VERDICTS, Instruction, Program, Window, fold
+
+MOST_OPEN = 10_000
+
+MOST_OPEN_IN_SLICE = 1_000
+"""The same of a slice of a parametric specification, of which there may be many."""
+
+_LATER = ("until", "next")
+
+
+class Cell:
+    """The value of a part at an event that is not decided yet; `tells`: the part is the whole formula, at this event
+    (`BoundedRun.place`; 0: it is not the whole).
+
+    The value of a `kind` (`and`, `or`, `xor`, `not`) comes from `operands`, of which `missing` are open.
+    """
+
+    __slots__ = ("journal", "kind", "missing", "operands", "tells", "users", "value")
+    keeps = ("kind", "missing", "operands", "tells", "users", "value")
+
+    def __init__(self, journal: "Journal") -> None:
+        self.journal = journal
+        self.users: list[Cell | _Operator] = []
+        self.tells = 0
+        self.value: bool | None = None
+        self.kind, self.missing = "", 0
+        self.operands: tuple[Value, ...] = ()
+
+    def touch(self) -> None:
+        """Note what it is before it is changed, unless that is noted."""
+        if self not in self.journal:
+            self.journal[self] = (
+                [*self.users], self.tells, self.value, self.kind, self.operands, self.missing,
+            )  # fmt: skip
+
+    def restore(self, noted: tuple[Any, ...]) -> None:
+        """Be again what was noted."""
+        self.users, self.tells, self.value, self.kind, self.operands, self.missing = noted
+
+    def stand_for(self, kind: str, operands: tuple["Value", ...]) -> None:
+        """Take the value from these."""
+        self.touch()
+        self.kind, self.operands = kind, operands
+        self.missing = sum(_use(operand, self) for operand in operands)
+
+    @property
+    def wanted(self) -> bool:
+        """Whether it is open, and somebody waits for it."""
+        return self.value is None and bool(self.tells or self.users)
+
+    def hear(self, value: bool) -> bool | None:
+        """What it is worth now that one more operand has this value; None: that is still open."""
+        self.touch()
+        self.missing -= 1
+        if self.kind == "not":
+            return not value
+        if value is _ABSORBING.get(self.kind):
+            return value
+        return None if self.missing else _together(self.kind, self.operands)
+
+
+Value = bool | Cell
+Journal = dict[Cell, tuple[Any, ...]]
+"""What cells were at the last mark, of those that have changed since."""
+
+
+def _known(value: Value) -> bool | None:
+    return value.value if isinstance(value, Cell) else value
+
+
+def _use(value: Value, user: "Cell | _Operator") -> bool:
+    """Whether the value is open; its user is told then."""
+    if isinstance(value, Cell) and value.value is None:
+        value.touch()
+        value.users.append(user)
+        return True
+    return False
+
+
+def _leave(value: Value, user: "Cell | _Operator") -> None:
+    """The user waits no more; what only it waited for is not waited for either."""
+    waiting = [(value, user)]
+    while waiting:
+        left, leaver = waiting.pop()
+        if isinstance(left, Cell) and left.value is None:
+            left.touch()
+            left.users.remove(leaver)
+            if not left.wanted:
+                waiting += [(operand, left) for operand in left.operands]
+
+
+_ABSORBING = {"and": False, "or": True}
+
+
+def _together(kind: str, operands: tuple[Value, ...]) -> bool:
+    """The value of operands that are all known, none of them absorbing."""
+    if kind == "xor":
+        return sum(map(bool, map(_known, operands))) % 2 == 1
+    return bool(_known(operands[0])) is not (kind == "not")
+
+
+@dataclass(eq=False, slots=True)
+class _Row:
+    """An event that an operator keeps: its time, what its operands are worth at it, and what it was asked for."""
+
+    keeps: ClassVar = ("place", "time", "left", "right", "cell")
+
+    place: int
+    time: int
+    left: Value | None
+    right: Value | None
+    cell: Cell | None
+
+
+class _Operator(ABC):
+    """An operator in a run. `ask` comes before `take` for each event, and `pass_by` between events."""
+
+    keeps: ClassVar[tuple[str, ...]] = ("rows",)
+
+    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
+        self.run, self.number = run, number
+        self.left, self.right = instruction.operands[0], instruction.operands[-1]
+        self.low, self.high = instruction.low, FOREVER if instruction.high is None else instruction.high
+        self.rows: deque[_Row] = deque()
+
+    def ask(self, now: int) -> Value:
+        """Its value at the event that happens now."""
+        self.rows.append(_Row(self.run.place, now, None, None, Cell(self.run.journal)))
+        return self.rows[-1].cell or False
+
+    @abstractmethod
+    def take(self, now: int) -> None:
+        """Look at the event."""
+
+    def settle(self) -> None:  # noqa: B027  two have open operands, and something to decide then
+        """Decide what can be, now that operands are decided."""
+
+    def hear(self, cell: Cell) -> None:
+        """An operand that was open has a value; `settle` is called for all such together."""
+        del cell
+
+    def pass_by(self, time: int) -> None:
+        """There will be no event any more up to this time."""
+        del time
+
+    @property
+    def deadline(self) -> int | None:
+        """When a bound passes on which something depends."""
+        return None
+
+
+class _Until(_Operator):
+    """`until` over what is known at once."""
+
+    def take(self, now: int) -> None:
+        rows = self.rows
+        if not rows:
+            return
+        if self.run.value(self.right):
+            while rows and rows[0].time <= now - self.low:
+                self.run.decide(rows.popleft().cell, True)
+        if not self.run.value(self.left):
+            while rows:
+                self.run.decide(rows.popleft().cell, False)
+
+    def pass_by(self, time: int) -> None:
+        while self.rows and self.rows[0].time + self.high <= time:
+            self.run.decide(self.rows.popleft().cell, False)
+
+    @property
+    def deadline(self) -> int | None:
+        while self.rows and not _wanted(self.rows[0]):
+            self.rows.popleft()
+        return self.rows[0].time + self.high if self.rows else None
+
+
+def _wanted(row: _Row) -> bool:
+    return row.cell is not None and row.cell.wanted
+
+
+_Mark = tuple[int, int]
+"""The time and the place of an event."""
+_Marks = tuple[list[_Mark], ...]
+
+
+class _Rows(_Operator):
+    """An operator that keeps what its operands are worth."""
+
+    def keep(self, now: int) -> _Row:
+        """The row of the event that happens now."""
+        if not self.rows or self.rows[-1].left is not None:
+            self.rows.append(_Row(self.run.place, now, None, None, None))
+        row = self.rows[-1]
+        row.left, row.right = self.run.value(self.left), self.run.value(self.right)
+        _use(row.left, self)
+        _use(row.right, self)
+        return row
+
+    def drop(self) -> _Row:
+        """Keep the oldest row no longer."""
+        row = self.rows.popleft()
+        for value in (row.left, row.right):
+            if value is not None:
+                _leave(value, self)
+        return row
+
+
+class _OpenUntil(_Rows):
+    """`until` over what may be open. All time up to `passed` is over.
+
+    `pending` are the rows that are not decided. For the others of them there is where the right operand holds (`holds`)
+    or may (`hopes`), and where the left one fails (`fails`) or may (`doubts`), as times and places in order. Whatever
+    becomes known concerns those pending rows only for which it was the first or the last of its kind: they are found by
+    their times, so a step costs the same however many wait, unless it decides them.
+    """
+
+    keeps = ("rows", "passed", "pending", "holds", "hopes", "fails", "doubts", "waits")
+
+    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
+        super().__init__(run, number, instruction)
+        self.passed = -FOREVER
+        self.pending: list[tuple[int, int, _Row]] = []
+        self.holds: list[_Mark] = []
+        self.hopes: list[_Mark] = []
+        self.fails: list[_Mark] = []
+        self.doubts: list[_Mark] = []
+        self.waits: dict[Cell, list[tuple[_Mark, bool]]] = {}
+        self.heard: list[Cell] = []
+
+    def take(self, now: int) -> None:
+        if not self.rows:
+            return
+        row = self.keep(now)
+        mark = row.time, row.place
+        if row.cell is not None:
+            self.pending.append((*mark, row))
+        for value, of_right, waiting in ((row.left, False, self.doubts), (row.right, True, self.hopes)):
+            if isinstance(value, Cell):
+                self.waits[value] = [*self.waits.get(value, ()), (mark, of_right)]
+                waiting.append(mark)
+        if row.right is True:
+            self._know_right(mark, True)
+        if row.left is False:
+            self._know_left(mark, False)
+        self._forget()
+
+    def hear(self, cell: Cell) -> None:
+        self.heard.append(cell)
+
+    def settle(self) -> None:
+        heard, self.heard = self.heard, []
+        for cell in heard:
+            for mark, of_right in self.waits.pop(cell, ()):
+                waiting = self.hopes if of_right else self.doubts
+                del waiting[bisect_left(waiting, mark)]
+                (self._know_right if of_right else self._know_left)(mark, bool(cell.value))
+        self._forget()
+
+    def _know_right(self, mark: _Mark, holds: bool) -> None:
+        time, place = mark
+        begins = [(time - self.high, 0), _behind(_last((self.fails,), mark))]
+        ends = [(time - self.low + 1, 0), (time, place + 1)]
+        if holds:
+            insort(self.holds, mark)
+            begins.append(_behind(_last((self.doubts,), mark)))
+        else:
+            begins.append(_behind(_last((self.holds, self.hopes), mark), self.low))
+            following, fail = _first((self.holds, self.hopes), mark), _first((self.fails,), mark)
+            if following is not None and (fail is None or following <= fail):
+                ends.append((following[0] - self.high, 0))
+            elif fail is None:
+                ends.append((self.passed - self.high + 1, 0))
+        self._look(begins, ends)
+
+    def _know_left(self, mark: _Mark, holds: bool) -> None:
+        time, place = mark
+        if not holds:
+            insort(self.fails, mark)
+            come = _last((self.holds, self.hopes), (time, place + 1))
+            self._look([_behind(_last((self.fails,), mark)), _behind(come, self.low)], [(time, place + 1)])
+            return
+        until = _first((self.fails, self.doubts), mark) or (FOREVER, 0)
+        good = _first((self.holds,), (time, place + 1))
+        best = _last((self.holds,), (until[0], until[1] + 1))
+        if good is not None and best is not None and good <= best:
+            begins = [(good[0] - self.high, 0), _behind(_last((self.fails, self.doubts), mark))]
+            self._look(begins, [(best[0] - self.low + 1, 0), (time, place + 1)])
+
+    def _look(self, begins: list[_Mark], ends: list[_Mark]) -> None:
+        """Decide what can be of the pending rows from the last of these beginnings to the first of these ends."""
+        begin = bisect_left(self.pending, max(begins))
+        end = max(begin, bisect_left(self.pending, min(ends)))
+        self.pending[begin:end] = [entry for entry in self.pending[begin:end] if not self._decided(entry[2])]
+
+    def _decided(self, row: _Row) -> bool:
+        if _wanted(row):
+            sure = self._value(row, (self.holds,), (self.fails, self.doubts))
+            onward = (
+                row.time + self.high > self.passed and _first((self.fails,), (row.time, row.place)) is None
+            )
+            possible = onward or self._value(row, (self.holds, self.hopes), (self.fails,))
+            if sure is not possible:
+                return False
+            self.run.decide(row.cell, sure)
+        return True
+
+    def _value(self, row: _Row, goods: _Marks, bads: _Marks) -> bool:
+        """Whether one of these is in the row's time before the first of those, or with it."""
+        good = _first(goods, (row.time + self.low, row.place))
+        if good is None or good[0] > row.time + self.high:
+            return False
+        bad = _first(bads, (row.time, row.place))
+        return bad is None or good <= bad
+
+    def _forget(self) -> None:
+        """Keep no row that nobody waits for, nor one before it."""
+        while self.rows and not _wanted(self.rows[0]):
+            row = self.drop()
+            for value in (row.left, row.right):
+                if isinstance(value, Cell) and value in self.waits:
+                    self.waits[value] = [wait for wait in self.waits[value] if wait[0][1] > row.place]
+                    if not self.waits[value]:
+                        del self.waits[value]
+        kept = self.rows[0].place if self.rows else self.run.place + 1
+        for marks in (self.holds, self.hopes, self.fails, self.doubts, self.pending):
+            while marks and marks[0][1] < kept:
+                del marks[0]
+
+    def pass_by(self, time: int) -> None:
+        before, self.passed = self.passed, time
+        self._look([(before - self.high + 1, 0)], [(time - self.high + 1, 0)])
+        self._forget()
+
+    @property
+    def deadline(self) -> int | None:
+        following = bisect_left(self.pending, (self.passed - self.high + 1, 0))
+        while following < len(self.pending) and not _wanted(self.pending[following][2]):
+            del self.pending[following]
+        return self.pending[following][0] + self.high if following < len(self.pending) else None
+
+
+def _first(kinds: _Marks, mark: _Mark) -> _Mark | None:
+    """The first of these that is not before a mark."""
+    found = ((marks, bisect_left(marks, mark)) for marks in kinds)
+    return min((marks[index] for marks, index in found if index < len(marks)), default=None)
+
+
+def _last(kinds: _Marks, mark: _Mark) -> _Mark | None:
+    """The last of these that is before a mark."""
+    found = ((marks, bisect_left(marks, mark)) for marks in kinds)
+    return max((marks[index - 1] for marks, index in found if index), default=None)
+
+
+def _behind(mark: _Mark | None, low: int = 0) -> _Mark:
+    """Where the rows begin for which a mark is too early."""
+    return (-FOREVER, 0) if mark is None else (mark[0] - low, mark[1] + 1)
+
+
+def _supposed(value: Value | None, *, hopeful: bool) -> bool:
+    known = None if value is None else _known(value)
+    return hopeful if known is None else known
+
+
+class _OpenSince(_Rows):
+    """`since` over what may be open; `window` is where the rows begin.
+
+    `least` and `most` are behind the newest row, if all that is open were to fail, or to hold.
+    """
+
+    keeps = ("rows", "window", "least", "most")
+
+    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
+        super().__init__(run, number, instruction)
+        self.window = Window(self.low, self.high)
+        self.least, self.most = copy(self.window), copy(self.window)
+
+    def take(self, now: int) -> None:
+        self._judge(self.keep(now))
+        self._forget()
+
+    def settle(self) -> None:
+        self.least, self.most = copy(self.window), copy(self.window)
+        for row in self.rows:
+            self._judge(row)
+        self._forget()
+
+    def _judge(self, row: _Row) -> None:
+        sure, possible = (
+            window.step(_supposed(row.left, hopeful=hopeful), _supposed(row.right, hopeful=hopeful), row.time)
+            for window, hopeful in ((self.least, False), (self.most, True))
+        )
+        if sure is possible:
+            self.run.decide(row.cell, sure)
+
+    def _forget(self) -> None:
+        while self.rows:
+            row = self.rows[0]
+            left, right = (None if value is None else _known(value) for value in (row.left, row.right))
+            if left is None or right is None:
+                break
+            self.window.step(left, right, self.drop().time)
+
+
+class _OpenPreviously(_Operator):
+    """`previously` of what may be open: what that was at the event before."""
+
+    keeps = ("rows", "before", "time")
+
+    before: Value = False
+    time = -FOREVER
+
+    def ask(self, now: int) -> Value:
+        return self.before if self.low <= now - self.time <= self.high else False
+
+    def take(self, now: int) -> None:
+        _leave(self.before, self)
+        self.before, self.time = self.run.value(self.left), now
+        _use(self.before, self)
+
+
+class _Next(_Operator):
+    """`next`: the rows ask about the event before; `fresh` are those of the event that happens now."""
+
+    keeps = ("rows", "before")
+
+    def __init__(self, run: "BoundedRun", number: int, instruction: Instruction) -> None:
+        super().__init__(run, number, instruction)
+        self.before: deque[_Row] = deque()
+
+    def take(self, now: int) -> None:
+        before, self.before, self.rows = self.before, self.rows, deque()
+        for row in before:
+            if not _wanted(row) or row.cell is None:
+                continue
+            inside = self.low <= now - row.time <= self.high
+            value = self.run.value(self.left) if inside else False
+            if isinstance(value, Cell):  # it is open
+                row.cell.stand_for("or", (value,))
+            else:
+                self.run.decide(row.cell, value)
+
+    def pass_by(self, time: int) -> None:
+        while self.before and self.before[0].time + self.high <= time:
+            self.run.decide(self.before.popleft().cell, False)
+
+    @property
+    def deadline(self) -> int | None:
+        return next((row.time + self.high for row in self.before if _wanted(row)), None)
+
+
+class BoundedProperty(CompiledProperty):
+    """A formula of mtl about the future, and perhaps the past."""
+
+    timed = True
+    most = MOST_OPEN
+    """How many events of a run may wait."""
+
+    def __init__(self, source: Source, formula: Formula) -> None:
+        super().__init__(source, VERDICTS)
+        self.program = program = Program(formula, source.events)
+        self.later: set[int] = set()
+        """The instructions whose value may come after their event."""
+        for number, instruction in enumerate(program.instructions):
+            if instruction.operator in _LATER or not self.later.isdisjoint(instruction.operands):
+                self.later.add(number)
+        asked = {operand for number in self.later for operand in program.instructions[number].operands}
+        at_once = sorted(asked - self.later)
+        self.folded = fold(program, at_once)
+        self.at_once = {number: index for index, number in enumerate(at_once)}
+        """Those that these need to know at their event, as `folded` has them."""
+        self.order = {
+            number: sorted(program.instructions[number].operands, key=self.later.__contains__)
+            for number in self.later
+        }
+        self._failing = self._decided_late()
+
+    def start(self, time_ns: int) -> Run:
+        """A fresh run."""
+        return BoundedRun(self, time_ns)
+
+    def operators(self, run: "BoundedRun") -> dict[int, _Operator]:
+        """Those whose values may come later, for a run; the outermost first."""
+        found: dict[int, _Operator] = {}
+        for number in sorted(self.later, reverse=True):
+            instruction = self.program.instructions[number]
+            kind = _KINDS.get(instruction.operator)
+            if instruction.operator == "until" and self.later.isdisjoint(instruction.operands):
+                kind = _Until
+            if kind is not None:
+                found[number] = kind(run, number, instruction)
+        return found
+
+    def _decided_late(self) -> set[str]:
+        """The verdicts that the passing of a bound may bring: then an `until` or `next` fails, nothing else.
+
+        So it is `violation` where one stands that the formula needs, `validation` where one that it must not have.
+        """
+        signs: dict[int, set[bool]] = {self.program.result: {False}}
+        for number in sorted(self.later, reverse=True):
+            instruction = self.program.instructions[number]
+            mine = signs.get(number, set())
+            given = {"not": {not sign for sign in mine}, "xor": {False, True}}.get(instruction.operator, mine)
+            for operand in instruction.operands:
+                signs.setdefault(operand, set()).update(given)
+        found = (
+            signs[number] for number in self.later if self.program.instructions[number].operator in _LATER
+        )
+        return {VERDICTS[sign] for signs_of in found for sign in signs_of}
+
+    def blocking_refused(self, category: str) -> str | None:
+        """What a deadline decides is decided when no message comes."""
+        super().blocking_refused(category)
+        if category not in self._failing:
+            return None
+        return (
+            f"`{category}` may come when a bound of time passes, and the message that would have to be stopped has"
+            " long been passed on then"
+        )
+
+
+_CONTAINERS = (deque, list, dict, Window)
+"""What operators have that a step changes in place."""
+
+_KINDS: dict[str, type[_Operator]] = {
+    "until": _OpenUntil,
+    "since": _OpenSince,
+    "previously": _OpenPreviously,
+    "next": _Next,
+}
+
+
+_FORWARD = (_Until, _OpenUntil, _Next)
+"""Operators that keep nothing but the events that wait (`rows`)."""
+
+
+class BoundedRun:
+    """A run of a formula about the future."""
+
+    keeps = ("_at_once", "place", "_now", "_told", "_about", "operators")
+
+    def __init__(self, compiled: BoundedProperty, time_ns: int) -> None:
+        self._compiled = compiled
+        self._at_once = compiled.folded.start()
+        self.later = compiled.later
+        self.place = 0
+        self.operators = compiled.operators(self)
+        self._now = time_ns
+        self._places: tuple[int, ...] = ()
+        self._values: dict[int, Value] = {}
+        self._decided: list[Cell] = []
+        self.changed: set[_Operator] = set()
+        self.journal: Journal = {}
+        self._told: dict[bool, int] = {}
+        self._about: dict[bool, int] = {}
+
+    @property
+    def deadline(self) -> int | None:
+        """When the first bound passes on which a verdict depends."""
+        found = (operator.deadline for operator in self.operators.values())
+        return min((deadline for deadline in found if deadline is not None), default=None)
+
+    @property
+    def as_new(self) -> bool:
+        """Whether no event waits, and the part about the past is as at the beginning."""
+        operators = self.operators.values()
+        return (
+            all(type(operator) in _FORWARD and not operator.rows for operator in operators)
+            and self.deadline is None
+            and self._at_once == self._compiled.folded.start()
+        )
+
+    def __copy__(self) -> "BoundedRun":
+        program = self._compiled.program
+        shared = (self._compiled, program, *program.instructions)
+        return deepcopy(self, {id(one): one for one in shared})
+
+    def step(self, event: int, time_ns: int) -> Categories:
+        """Take the event."""
+        if self._now < time_ns:
+            deadline = self.deadline
+            if deadline is not None and time_ns > deadline:
+                raise ValueError("the deadline has passed: expire the run first")
+            self._now = time_ns
+        if sum(len(operator.rows) for operator in self.operators.values()) >= self._compiled.most:
+            raise RunFaultError(f"more than {self._compiled.most} events wait for what follows them")
+        self.place += 1
+        self._places = self._compiled.folded.take(self._at_once, event, self._now)
+        self._values = {}
+        whole = self.value(self._compiled.program.result)
+        if isinstance(whole, Cell):
+            whole.touch()
+            whole.tells = self.place
+        else:
+            self._told[whole] = self.place
+        for operator in self.operators.values():
+            operator.take(self._now)
+        return self._tell()
+
+    def expire(self) -> Categories:
+        """Let the deadline pass."""
+        deadline = self.deadline
+        if deadline is None:
+            raise ValueError("this run has no deadline")
+        self._now = deadline
+        for operator in self.operators.values():
+            operator.pass_by(deadline)
+        return self._tell()
+
+    def mark(self) -> tuple[Any, ...]:
+        """The place, the values that look back, and the rows of the operators."""
+        self.journal.clear()
+        operators = [
+            {
+                name: copy(value) if isinstance(value, _CONTAINERS) else value
+                for name, value in vars(operator).items()
+            }
+            for operator in self.operators.values()
+        ]
+        return self.place, list(map(copy, self._at_once)), operators
+
+    def take_back(self, mark: tuple[Any, ...]) -> None:
+        """Return to them; the time stays."""
+        self.place, self._at_once, operators = mark
+        for operator, before in zip(self.operators.values(), operators, strict=True):
+            operator.__dict__ = before
+        for cell, noted in self.journal.items():
+            cell.restore(noted)
+        self.journal.clear()
+
+    def value(self, number: int) -> Value:
+        """What an instruction is worth at the event that happens now: a cell only while it is open."""
+        index = self._compiled.at_once.get(number)
+        if index is not None:
+            return bool(self._at_once[self._places[index]])
+        value = self._values.get(number)
+        if value is None:
+            value = self._values[number] = self._find(number)
+        known = _known(value)
+        return value if known is None else known
+
+    def _find(self, number: int) -> Value:
+        operator = self.operators.get(number)
+        if operator is not None:
+            return operator.ask(self._now)
+        kind = self._compiled.program.instructions[number].operator
+        absorbing = _ABSORBING.get(kind)
+        operands = []
+        for operand in self._compiled.order[number]:
+            value = self.value(operand)
+            if value is absorbing:
+                return value
+            operands.append(value)
+        cell = Cell(self.journal)
+        cell.stand_for(kind, tuple(operands))
+        return cell if cell.missing else _together(kind, cell.operands)
+
+    def decide(self, cell: Cell | None, value: bool) -> None:
+        """The value of a cell is known (None: nobody has asked)."""
+        if cell is not None and cell.value is None:
+            cell.touch()
+            cell.value = value
+            self._decided.append(cell)
+
+    def _tell(self) -> Categories:
+        """Let everybody know what is decided; the verdicts that come of it."""
+        while self._decided or self.changed:
+            while self._decided:
+                self._pass_on(self._decided.pop())
+            if self.changed:
+                innermost = min(self.changed, key=lambda operator: operator.number)
+                self.changed.remove(innermost)
+                innermost.settle()
+        told, self._told = self._told, {}
+        self._about = told
+        return _CATEGORIES[False in told, True in told]
+
+    def about(self, category: str) -> int:
+        """At which event, counted from 1, the formula is what the last step or deadline told."""
+        return self._about[category == VERDICTS[True]]
+
+    def _pass_on(self, cell: Cell) -> None:
+        assert cell.value is not None  # noqa: S101  it was decided
+        cell.touch()
+        if cell.tells:
+            self._told[cell.value] = cell.tells
+        for user in cell.users:
+            if not isinstance(user, Cell):
+                user.hear(cell)
+                self.changed.add(user)
+            elif user.wanted:  # another user may have decided it a moment ago
+                value = user.hear(cell.value)
+                if value is not None:
+                    self.decide(user, value)
+                    for operand in user.operands:
+                        _leave(operand, user)
+        cell.users, cell.operands = [], ()
+
+
+_CATEGORIES: dict[tuple[bool, bool], Categories] = {
+    (False, False): (),
+    (True, False): VERDICTS[:1],
+    (False, True): VERDICTS[1:],
+    (True, True): VERDICTS,
+}
+
+PARTS: Mapping[str, type] = {"cell": Cell, "row": _Row, "window": Window}
+"""What runs of these formulas are made of, besides numbers and truth values, by the names that `kept_runs.py` uses."""

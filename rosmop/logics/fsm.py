@@ -1,0 +1,170 @@
+"""``fsm``: finite state machines, as MOP's FSM plugin reads them.
+
+``s0 [ a -> s1, default s0 ] s1 [ b -> s0 ] alias bad = s1``. The first state is the initial one; an event
+without a transition and without a default leads to ``fail``, which no event leaves. Categories are the
+states, the aliases and ``fail``. ``read_machine`` reads the language of ``tfsm`` as well, where a state may
+have a ``timeout``.
+"""
+
+from dataclasses import dataclass, field
+
+from rosmop.logics.automaton import MAX_STATES, Automaton
+from rosmop.logics.interface import FiniteProperty, Source
+from rosmop.logics.lexer import Token, TokenReader, describe, suggestion
+
+FAIL = "fail"
+TIMEOUT = "timeout"
+
+
+@dataclass
+class StateText:
+    """A state as written: where each event leads, the default, and the time bound (tfsm)."""
+
+    moves: dict[str, Token] = field(default_factory=dict)
+    default: Token | None = None
+    timeout: tuple[int, Token] | None = None
+
+
+@dataclass
+class Machine:
+    """A state machine as written; ``order`` are the states in source order."""
+
+    states: dict[str, StateText]
+    aliases: dict[str, list[str]]
+
+    @property
+    def order(self) -> list[str]:
+        """The names of the states, ``fail`` last."""
+        return [*self.states, FAIL]
+
+    def verdict(self, state: str) -> tuple[str, ...]:
+        """The categories of a state: itself, then its aliases in source order."""
+        return (state, *(alias for alias, members in self.aliases.items() if state in members))
+
+    def categories(self) -> list[str]:
+        """All names that may have handlers."""
+        return [*self.states, *self.aliases, FAIL]
+
+
+def compile_fsm(source: Source) -> FiniteProperty:
+    """Compile an ``fsm`` formula. Raises FormulaError."""
+    machine = read_machine(source, timed=False)
+    return FiniteProperty(source, machine.categories(), machine_automaton(source, machine))
+
+
+def machine_automaton(source: Source, machine: Machine) -> Automaton:
+    """The transitions on events; state ``i`` is ``machine.order[i]``."""
+    order = machine.order
+    number = {name: index for index, name in enumerate(order)}
+    fail = number[FAIL]
+    table = []
+    for state in machine.states.values():
+        default = fail if state.default is None else number[state.default.text]
+        moves = {event: number[target.text] for event, target in state.moves.items()}
+        table.append(tuple(moves.get(event, default) for event in source.events))
+    table.append((fail,) * len(source.events))
+    return Automaton(0, tuple(table), tuple(machine.verdict(name) for name in order), tuple(order))
+
+
+def read_machine(source: Source, *, timed: bool) -> Machine:
+    """Parse a state machine and check its names. Raises FormulaError with all that was found."""
+    reader = TokenReader(source, ("->", "[", "]", "=", ","))
+    machine = Machine({}, {})
+    used: list[Token] = []
+    if reader.token.kind == "end":
+        raise reader.unexpected("a state such as `s0 [ event -> s1, default s0 ]`")
+    while reader.token.kind != "end":
+        if reader.token.text == "alias" and reader.ahead(1).kind != "[":
+            _read_alias(reader, machine, used)
+        else:
+            _read_state(reader, machine, used, timed=timed)
+    _check_names(reader, machine, used)
+    reader.finish()
+    return machine
+
+
+def _read_state(reader: TokenReader, machine: Machine, used: list[Token], *, timed: bool) -> None:
+    name = reader.expect("name", "the name of a state")
+    reserved = (FAIL, TIMEOUT) if timed else (FAIL,)
+    if name.text in reserved:
+        reader.note(
+            name, f"`{name.text}` is a category of its own and cannot name a state; choose another name"
+        )
+    if name.text in machine.states:
+        reader.note(name, f"state `{name.text}` is defined twice; put all its transitions into one `[ … ]`")
+    if machine.aliases:
+        reader.note(name, f"state `{name.text}` stands after an alias; write the states first")
+    if len(machine.states) >= MAX_STATES:
+        raise reader.source.error(name.offset, f"more than {MAX_STATES} states")
+    state = machine.states.setdefault(name.text, StateText())
+    reader.expect("[", f"`[` and the transitions of state `{name.text}`")
+    while not reader.accept("]"):
+        _read_transition(reader, state, used, timed=timed)
+        reader.accept(",")
+
+
+def _read_transition(reader: TokenReader, state: StateText, used: list[Token], *, timed: bool) -> None:
+    event = reader.expect("name", "a transition such as `event -> state`, `default state` or `]`")
+    if event.text == TIMEOUT and reader.token.kind == "number":
+        if not timed:
+            raise reader.source.error(
+                event.offset, "a time bound in an untimed machine; write `tfsm:` for `fsm:`"
+            )
+        _read_timeout(reader, state, event, used)
+        return
+    if event.text == "default":
+        reader.accept("->")
+        target = reader.expect("name", "the state that `default` leads to")
+        if state.default is not None:
+            reader.note(event, "a second `default` in one state; keep one")
+        state.default = target
+    else:
+        reader.check_event(event)
+        reader.expect("->", f"`->` and the state that `{event.text}` leads to")
+        target = reader.expect("name", f"the state that `{event.text}` leads to")
+        if event.text in state.moves:
+            reader.note(event, f"a second transition for `{event.text}` in one state; keep one")
+        state.moves[event.text] = target
+    used.append(target)
+
+
+def _read_timeout(reader: TokenReader, state: StateText, clause: Token, used: list[Token]) -> None:
+    number = reader.token
+    nanoseconds = reader.duration("a time bound")
+    if nanoseconds == 0:
+        reader.note(number, "a timeout must be longer than 0")
+    reader.expect("->", "`->` and the state that the timeout leads to")
+    target = reader.expect("name", "the state that the timeout leads to")
+    if state.timeout is not None:
+        reader.note(clause, "a second `timeout` in one state; keep one")
+    state.timeout = (nanoseconds, target)
+    used.append(target)
+
+
+def _read_alias(reader: TokenReader, machine: Machine, used: list[Token]) -> None:
+    reader.take()
+    name = reader.expect("name", "the name of an alias")
+    if name.text in machine.states or name.text in (FAIL, TIMEOUT):
+        reader.note(name, f"alias `{name.text}` has the name of a category that exists; choose another name")
+    if name.text in machine.aliases:
+        reader.note(name, f"alias `{name.text}` is defined twice; put all its states into one list")
+    reader.expect("=", "`=` and the states of the alias")
+    members = machine.aliases.setdefault(name.text, [])
+    while True:
+        member = reader.expect("name", "the name of a state")
+        members.append(member.text)
+        used.append(member)
+        if not reader.accept(",") and not _more_members(reader):
+            return
+
+
+def _more_members(reader: TokenReader) -> bool:
+    """MOP lets commas be left out; the next alias, or a state that stands too late, ends the list."""
+    return reader.token.kind == "name" and reader.token.text != "alias" and reader.ahead(1).kind != "["
+
+
+def _check_names(reader: TokenReader, machine: Machine, used: list[Token]) -> None:
+    known = [*machine.states, FAIL]
+    for token in used:
+        if token.text not in machine.states and token.text != FAIL:
+            reader.note(token, f"there is no state {describe(token)}{suggestion(token.text, known)}")

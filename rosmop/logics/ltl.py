@@ -1,0 +1,166 @@
+"""``ltl``: future linear temporal logic over infinite traces, as MOP's LTL plugin reads it, with three
+verdicts.
+
+Each event is one position, where exactly its own atom holds. The category is ``violation`` once no
+continuation satisfies the formula, ``validation`` once all do; both are for good. (Bauer, Leucker,
+Schallhart: LTL3.)
+
+Theory of operation: the formula and its negation are brought into normal form and each becomes a
+generalised Büchi automaton (``buchi``). States without an accepted word are cut away; both automata are
+determinised side by side; an empty left side is a violation, an empty right side a validation. The result
+is minimised.
+
+An operator about the past becomes a proposition of its own, which is guessed at each position, and a formula about the
+future that only the right guesses satisfy (``_Past``). There is one right guess for every trace: so neither the
+formula nor its negation gains or loses a trace. An event stands for all letters that differ in the guesses only.
+"""
+
+from rosmop.logics.automaton import TooManyStatesError, explore, letter_classes, spread
+from rosmop.logics.buchi import Automata, Sets, TooLargeError
+from rosmop.logics.formula import (
+    Formula,
+    Level,
+    Syntax,
+    boolean_levels,
+    event_names,
+    nodes,
+    read_formula,
+)
+from rosmop.logics.interface import FiniteProperty, Source
+from rosmop.logics.ptltl import SYNTAX as PTLTL
+
+_LEVELS = boolean_levels([])
+SYNTAX = Syntax(
+    unary={
+        **PTLTL.unary,
+        "o": "next",
+        "~o": "next",
+        "[]": "always",
+        "<>": "eventually",
+    },
+    levels=(
+        *_LEVELS[:-1],
+        Level(
+            {
+                **_LEVELS[-1].operators,
+                "U": "until",
+                "R": "release",
+                "~U": "release",
+                "S": "since",
+                "~S": "dual since",
+            },
+            "once",
+        ),
+    ),
+    refused={
+        "~": "has no meaning in ltl; write `!` for a negation",
+        "X": "is no operator of ltl; write `o` for next",
+        "F": "is no operator of ltl; write `<>` for eventually",
+        "G": "is no operator of ltl; write `[]` for always",
+        "W": "is no operator of ltl; write `b R (a or b)` for `a W b`",
+    },
+)
+_PAST = {"previously", "dual previously", "historically", "once", "since", "dual since"}
+_FUTURE = {"next", "always", "eventually", "until", "release"}
+VERDICTS = ("violation", "validation")
+MOST_LETTERS = 1024
+"""Classes of events, times two for each operator about the past."""
+
+
+def compile_ltl(source: Source) -> FiniteProperty:
+    """Compile an ``ltl`` formula. Raises FormulaError."""
+    formula = read_formula(source, SYNTAX)
+    _refuse_past_alone(source, formula)
+    named = event_names(formula)
+    of_event, classes = letter_classes(source.events, named)
+    past = _Past()
+    future = past.replaced(formula)
+    guesses = 1 << len(past.propositions)
+    if len(classes) * guesses > MOST_LETTERS:
+        raise source.error(
+            0, f"{len(past.propositions)} different operators about the past; write a smaller formula"
+        )
+    of_class = [((1 << guesses) - 1) << letter * guesses for letter in range(len(classes))]
+    atoms = {named[index]: of_class[letter] for letter, index in enumerate(classes) if index >= 0}
+    letters = range(len(classes) * guesses)
+    for number, name in enumerate(past.propositions.values()):
+        atoms[name] = sum(1 << letter for letter in letters if letter >> number & 1)
+    automata = Automata(len(letters))
+    sides = [Formula("and", (side, *past.right)) for side in (future, _not(future))]
+    try:
+        starts = [automata.live(automata.translate(side, atoms)) for side in sides]
+        automaton = explore(
+            _settled(starts[0], starts[1]),
+            len(classes),
+            lambda state, letter: _settled(*(automata.after(side, of_class[letter]) for side in state)),
+            lambda state: ("violation",) if not state[0] else ("validation",) if not state[1] else (),
+        )
+    except TooManyStatesError as error:
+        raise source.error(0, f"the monitor of this formula has {error}; write a smaller one") from None
+    except TooLargeError:
+        raise source.error(
+            0, "the monitor of this formula is too large to build; write a smaller one"
+        ) from None
+    return FiniteProperty(source, VERDICTS, spread(automaton, of_event))
+
+
+def _settled(for_it: Sets, against_it: Sets) -> tuple[Sets, Sets]:
+    """A pair of states; once the verdict is certain, what is left of the other side does not matter."""
+    if not for_it:
+        return frozenset(), _SOMETHING
+    if not against_it:
+        return _SOMETHING, frozenset()
+    return for_it, against_it
+
+
+_SOMETHING: Sets = frozenset((0,))
+
+
+class _Past:
+    """Takes the operators about the past out of a formula; `right` is what the guesses have to satisfy."""
+
+    def __init__(self) -> None:
+        self.propositions: dict[Formula, str] = {}
+        self.right: list[Formula] = []
+
+    def replaced(self, formula: Formula) -> Formula:
+        """The formula with propositions in the place of its operators about the past."""
+        operator = formula.operator
+        operands = tuple(self.replaced(operand) for operand in formula.operands)
+        if operator == "once":
+            return self._proposition("since", (Formula("true"), *operands))
+        if operator == "historically":
+            return _not(self._proposition("since", (Formula("true"), _not(operands[0]))))
+        if operator.startswith("dual "):
+            return _not(self._proposition(operator.removeprefix("dual "), tuple(map(_not, operands))))
+        if operator in _PAST:
+            return self._proposition(operator, operands)
+        return Formula(operator, operands, formula.name)
+
+    def _proposition(self, operator: str, operands: tuple[Formula, ...]) -> Formula:
+        """What stands for `previously x`, or for `x since y`: now `y`, or `x` and it held at the event before."""
+        formula = Formula(operator, operands)
+        if formula in self.propositions:
+            return Formula("event", name=self.propositions[formula])
+        name = self.propositions[formula] = f"past {len(self.propositions)}"
+        mine = Formula("event", name=name)
+        if operator == "previously":
+            first = _not(mine)
+            ways = ((operands[0], mine), (_not(operands[0]), first))
+        else:
+            left, right = operands
+            first = Formula("iff", (mine, right))
+            ways = ((mine, Formula("iff", (mine, Formula("or", (right, left))))), (_not(mine), first))
+        after = (Formula("implies", (now, Formula("next", (following,)))) for now, following in ways)
+        self.right += [first, *(Formula("always", (formula,)) for formula in after)]
+        return mine
+
+
+def _not(formula: Formula) -> Formula:
+    return Formula("not", (formula,))
+
+
+def _refuse_past_alone(source: Source, formula: Formula) -> None:
+    past = [node for node in nodes(formula) if node.operator in _PAST]
+    if past and not any(node.operator in _FUTURE for node in nodes(formula)):
+        raise source.error(past[0].offset, "a formula about the past; write `ptltl:` for `ltl:`")

@@ -1,0 +1,47 @@
+"""``mtl``: metric temporal logic, in words, with closed time bounds.
+
+``once[0,500ms] a``, ``historically[…] a``, ``a since[…] b``, ``previously[…] a``; without bounds an
+operator means ``[0,inf]``. ``eventually[0,500ms] a``, ``always[…] a``, ``a until[…] b``, ``next[…] a``: about the
+future the upper bound has to be there. Pointwise: a formula is asked only at events, and its operators see events
+only, at the times at which they were received. The category is ``validation`` where the formula holds at an event,
+``violation`` where not; it is told once that is certain, at the latest when the bounds have passed.
+"""
+
+from rosmop.logics.bounded import BoundedProperty
+from rosmop.logics.formula import NOT, Level, Syntax, boolean_levels, nodes, read_formula
+from rosmop.logics.interface import CompiledProperty, Source
+from rosmop.logics.past import compile_past
+
+_PAST = ("previously", "once", "historically", "since")
+FUTURE = ("next", "eventually", "always", "until")
+_SYMBOLS = {
+    "(*)": "previously",
+    "<*>": "once",
+    "[*]": "historically",
+    "S": "since",
+    "[]": "always",
+    "<>": "eventually",
+    "o": "next",
+    "U": "until",
+}
+
+SYNTAX = Syntax(
+    unary={**NOT, **{word: word for word in (*_PAST[:3], *FUTURE[:3])}},
+    levels=boolean_levels([Level({"since": "since", "until": "until"}, "left")]),
+    bounded=frozenset((*_PAST, *FUTURE)),
+    refused={symbol: f"is written `{word}` in mtl" for symbol, word in _SYMBOLS.items()},
+)
+
+
+def compile_mtl(source: Source) -> CompiledProperty:
+    """Compile an ``mtl`` formula. Raises FormulaError."""
+    formula = read_formula(source, SYNTAX)
+    future = [node for node in nodes(formula) if node.operator in FUTURE]
+    for node in future:
+        if node.bounds is None or node.bounds[1] is None:
+            raise source.error(
+                node.offset,
+                f"`{node.operator}` has no upper bound, so its verdict might never come; write"
+                f" `{node.operator}[0,10s]` with the time that there is, or `ltl` for what may come at any time",
+            )
+    return BoundedProperty(source, formula) if future else compile_past(source, formula)

@@ -1,0 +1,297 @@
+"""``pattern``: properties in near-English, scopes and patterns after Dwyer, with the meaning of HPL (Santos
+et al.).
+
+``globally: no c``, ``after a: some c within 2s``, ``until b: c causes d``, ``after a until b: c requires d
+within 1s``, ``… c forbids d``.
+
+Scopes. ``globally`` is open from the start, ``until b`` from the start to the first ``b``, ``after a`` from
+the first ``a`` on; ``after a until b`` opens at an ``a``, closes at the next ``b``, and so on. The events
+that open and close a scope are not inside it. An open scope counts at once, whether it will be closed or
+not.
+
+Patterns, all about events inside one scope; a time bound is closed:
+
+- ``no c [within t]``: no ``c`` (up to t after the scope opened).
+- ``some c [within t]``: a ``c`` (up to t after the scope opened) before the scope closes.
+- ``c causes d [within t]``: after each ``c`` there is a ``d`` (up to t later) before the scope closes.
+- ``c requires d [within t]``: before each ``c`` there was a ``d`` (up to t earlier).
+- ``c forbids d [within t]``: after a ``c`` there is no ``d`` (up to t later).
+
+``before`` and ``after`` are strict: no event answers, requires or forbids itself.
+
+The category is ``violation`` once the property is certainly violated, ``validation`` once nothing can
+violate it any more. Both are for good. A pattern that waits (``some``, ``causes``) may be silent for ever:
+silence violates nothing unless there is a time bound, and validates nothing.
+
+``some c within t enforced by f`` and ``… causes d within t enforced by f``: when the deadline passes, ``f`` publishes
+what was due, which counts as having come. The category is ``enforced`` then.
+
+Theory of operation. A run is in a *mode*: the scope is waited for, is over, or is open and *quiet* or
+*stirred*. What stirs is: for ``some`` and ``requires`` that the good event came, for ``causes`` that an
+answer is due, for ``forbids`` that the first event came. With the time of one event this is the whole
+state. Which modes settle the verdict is found by looking at which modes can follow.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from rosmop.logics.automaton import explore
+from rosmop.logics.interface import (
+    Categories,
+    ClockedProperty,
+    CompiledProperty,
+    FiniteProperty,
+    Move,
+    Source,
+    Wait,
+)
+from rosmop.logics.lexer import Token, TokenReader
+
+VIOLATION: Categories = ("violation",)
+VALIDATION: Categories = ("validation",)
+UNDECIDED: Categories = ()
+
+Mode = Literal["waiting", "quiet", "stirred", "over", "violated"]
+MODES: tuple[Mode, ...] = ("waiting", "quiet", "stirred", "over", "violated")
+_DUE: dict[str, Mode] = {"some": "quiet", "causes": "stirred"}
+"""The mode in which something has to come yet."""
+_DONE: dict[str, Mode] = {"some": "stirred", "causes": "quiet"}
+"""The mode in which it has come."""
+ENFORCED: Categories = ("enforced",)
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A pattern as written. ``first`` is None for ``no`` and ``some``; events are indexes; ``within_ns``
+    may be None."""
+
+    kind: str
+    opens: int | None
+    closes: int | None
+    first: int | None
+    second: int
+    within_ns: int | None
+    enforced: bool = False
+
+    def initial(self) -> Mode:
+        """The mode of a fresh run."""
+        return "quiet" if self.opens is None else "waiting"
+
+    def after_event(self, mode: Mode, event: int, *, late: bool) -> Mode:
+        """The next mode. ``late``: more than ``within_ns`` after what the clock of the mode runs from."""
+        if mode == "waiting":
+            return "quiet" if event == self.opens else "waiting"
+        if mode in ("over", "violated"):
+            return mode
+        if event == self.closes:
+            return self._closed(mode)
+        first, second = event == self.first, event == self.second
+        violated = {
+            "no": second and not late,
+            "requires": first and (mode == "quiet" or late),
+            "forbids": second and mode == "stirred" and not late,
+        }
+        if violated.get(self.kind, False):
+            return "violated"
+        if first if self.kind in ("causes", "forbids") else second and self.kind != "no":
+            return "stirred"
+        return "quiet" if second and self.kind == "causes" else mode
+
+    def restarts_clock(self, before: Mode, event: int, mode: Mode) -> bool:
+        """Whether the bound counts anew: from the opening, the oldest event unanswered, or the latest one."""
+        if before == "waiting":
+            return mode == "quiet"
+        if mode != "stirred":
+            return False
+        if self.kind == "causes":
+            return before == "quiet" or event == self.second
+        return (self.kind == "requires" and event == self.second) or (
+            self.kind == "forbids" and event == self.first
+        )
+
+    def _closed(self, mode: Mode) -> Mode:
+        if mode == _DUE.get(self.kind):
+            return "violated"
+        return "over" if self.opens is None else "waiting"
+
+    def after_deadline(self, mode: Mode) -> Mode:
+        """The next mode when the clock of the mode has run out."""
+        if self.within_ns is None:
+            return mode
+        if self.kind == "no" and mode == "quiet" and (self.opens is None or self.closes is None):
+            return "over"
+        if mode != _DUE.get(self.kind):
+            return mode
+        return _DONE[self.kind] if self.enforced else "violated"
+
+
+def verdicts(pattern: Pattern, events: int) -> dict[Mode, Categories]:
+    """The verdict of each mode: what is certain in it, whatever follows.
+
+    What is due can always still come (be published, too), unless the event that is waited for closes the scope.
+    """
+    unmet = {"violated", _DUE.get(pattern.kind, "violated")}
+    found: dict[Mode, Categories] = {}
+    for mode in MODES:
+        possible = _reachable(pattern, mode, events)
+        hopeless = pattern.closes == pattern.second and not pattern.enforced
+        certain = mode == "violated" or (mode in unmet and hopeless)
+        found[mode] = VIOLATION if certain else UNDECIDED if possible & unmet else VALIDATION
+    return found
+
+
+def _reachable(pattern: Pattern, mode: Mode, events: int) -> set[Mode]:
+    """The mode and all that events and deadlines can lead to from it."""
+    lateness = (False,) if pattern.within_ns is None else (False, True)
+    found: set[Mode] = set()
+    waiting = [mode]
+    while waiting:
+        current = waiting.pop()
+        if current in found:
+            continue
+        found.add(current)
+        waiting.append(pattern.after_deadline(current))
+        waiting += [
+            pattern.after_event(current, event, late=late) for event in range(events) for late in lateness
+        ]
+    return found
+
+
+class TimedPattern(ClockedProperty):
+    """A pattern with a time bound, as tables: a state is a mode's number.
+
+    ``expiries[mode]`` is the mode after the deadline, or None where there is none; ``at_expiry`` is told then, before
+    the verdict.
+    """
+
+    def __init__(self, source: Source, pattern: Pattern, remedy: str | None) -> None:
+        self.at_expiry = () if remedy is None else ENFORCED
+        super().__init__(source, ("violation", "validation", *self.at_expiry))
+        self.remedy = remedy
+        self.pattern = pattern
+        self.within = pattern.within_ns or 0
+        self.initial = MODES.index(pattern.initial())
+        known = verdicts(pattern, len(source.events))
+        self.verdicts = tuple(known[mode] for mode in MODES)
+        self.moves = self._moves(late=False)
+        self.late = self._moves(late=True)
+        self.expiries = tuple(
+            MODES.index(after)
+            if (after := pattern.after_deadline(mode)) != mode and not known[mode]
+            else None
+            for mode in MODES
+        )
+        self.waits = tuple(
+            None
+            if mode is None
+            else Wait(self.within, (mode, False), (*self.at_expiry, *self.verdicts[mode]))
+            for mode in self.expiries
+        )
+
+    def _moves(self, *, late: bool) -> tuple[tuple[Move, ...], ...]:
+        table = []
+        for mode in MODES:
+            row = []
+            for event in range(len(self.events)):
+                after = self.pattern.after_event(mode, event, late=late)
+                row.append((MODES.index(after), self.pattern.restarts_clock(mode, event, after)))
+            table.append(tuple(row))
+        return tuple(table)
+
+    def blocking_refused(self, category: str) -> str | None:
+        """What a deadline decides is decided when no message comes."""
+        super().blocking_refused(category)
+        kind = self.pattern.kind
+        comes_along = kind == "no" or self.pattern.enforced
+        if kind in ("requires", "forbids") or (category == "violation" and comes_along):
+            return None
+        return (
+            f"`{kind} … within` is decided by a deadline, when the message that would have to be stopped "
+            "has long been passed on"
+        )
+
+
+def compile_pattern(source: Source) -> CompiledProperty:
+    """Compile a ``pattern`` formula. Raises FormulaError."""
+    reader = TokenReader(source, (":", "(", ")"))
+    opens, closes = _read_scope(reader)
+    reader.expect(":", "`:` after the scope")
+    kind, first, second = _read_body(reader)
+    within = remedy = None
+    if reader.token.text == "within":
+        reader.take()
+        within = reader.duration("a time bound")
+    if reader.token.text == "enforced":
+        remedy = _read_remedy(reader, kind, within)
+    if reader.token.kind != "end":
+        expected = "`within` and a duration" if within is None else "`enforced by` and a function"
+        raise reader.unexpected(f"{expected}, or the end of the pattern")
+    reader.finish()
+    index = {name: number for number, name in enumerate(source.events)}
+    known = [None if token is None else index[token.text] for token in (opens, closes, first)]
+    pattern = Pattern(kind, known[0], known[1], known[2], index[second.text], within, remedy is not None)
+    return TimedPattern(source, pattern, remedy) if within is not None else _untimed(source, pattern)
+
+
+def _read_remedy(reader: TokenReader, kind: str, within: int | None) -> str:
+    word = reader.take()
+    if kind not in _DUE:
+        reader.note(
+            word,
+            f"`{kind}` leaves nothing due that could be published: what violates it comes with a message;"
+            " write `@violation { DROP; }`",
+        )
+    elif within is None:
+        reader.note(
+            word, "`enforced by` needs to know when it is due; write `within` and a duration before it"
+        )
+    if reader.token.text != "by":
+        raise reader.unexpected("`by` and the function that publishes what is due")
+    reader.take()
+    return reader.expect("name", "the function that publishes what is due").text
+
+
+def _untimed(source: Source, pattern: Pattern) -> FiniteProperty:
+    known = verdicts(pattern, len(source.events))
+    automaton = explore(
+        pattern.initial(),
+        len(source.events),
+        lambda mode, event: pattern.after_event(mode, event, late=False),
+        lambda mode: known[mode],
+    )
+    return FiniteProperty(source, ("violation", "validation"), automaton)
+
+
+def _read_scope(reader: TokenReader) -> tuple[Token | None, Token | None]:
+    word = reader.token
+    if word.text not in ("globally", "after", "until"):
+        raise reader.unexpected("a scope: `globally:`, `after a:`, `until b:` or `after a until b:`")
+    reader.take()
+    if word.text == "globally":
+        return None, None
+    event = _read_event(reader, f"the event that {'opens' if word.text == 'after' else 'closes'} the scope")
+    if word.text == "until":
+        return None, event
+    if reader.token.text != "until":
+        return event, None
+    reader.take()
+    return event, _read_event(reader, "the event that closes the scope")
+
+
+def _read_body(reader: TokenReader) -> tuple[str, Token | None, Token]:
+    word = reader.token
+    if word.text in ("no", "some") and reader.ahead(1).text not in ("causes", "requires", "forbids"):
+        reader.take()
+        return word.text, None, _read_event(reader, f"an event after `{word.text}`")
+    first = _read_event(reader, "`no`, `some` or an event")
+    verb = reader.token
+    if verb.text not in ("causes", "requires", "forbids"):
+        raise reader.unexpected("`causes`, `requires` or `forbids`")
+    reader.take()
+    return verb.text, first, _read_event(reader, f"an event after `{verb.text}`")
+
+
+def _read_event(reader: TokenReader, what: str) -> Token:
+    token = reader.expect("name", what)
+    reader.check_event(token)
+    return token

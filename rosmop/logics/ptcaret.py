@@ -1,0 +1,148 @@
+"""``ptcaret``: past-time linear temporal logic with calls and returns, as MOP's PTCaRet plugin reads it.
+
+``ptltl``, and operators about the *abstract* past, in which every call that has returned is one step that nobody looks
+into: from the event ``begin`` to the ``end`` that belongs to it, both included, nothing is seen any more once the
+``end`` is over. ``(*a) x``, ``<*a> x``, ``[*a] x`` and ``x Sa y`` look at that past. Derived from them:
+
+- ``@b x``: ``x`` held at the ``begin`` of the innermost open call; ``@c x``: at the event before it;
+- ``x Ss@b y``: ``y`` held at the ``begin`` of an open call, and ``x`` at those since; ``…s@c``, ``…s@bc`` as below;
+- ``<*s@b> x``, ``[*s@b] x``: at some, at every ``begin`` of an open call; ``…s@c``: at the event before it; ``…s@bc``:
+  at an event ``begin`` or ``call`` that is not within a call that has returned.
+
+An ``end`` to which no ``begin`` belongs begins the abstract past anew. Calls that are open are remembered, up to a
+bound beyond which a ``begin`` is a fault of the specification. (Rosu, Chen and Ball, 2008.)
+"""
+
+from itertools import zip_longest
+
+from rosmop.logics.formula import Formula, Level, Syntax, boolean_levels, nodes, read_formula
+from rosmop.logics.interface import (
+    Categories,
+    CompiledProperty,
+    Run,
+    RunFaultError,
+    Source,
+    UntimedRun,
+    twin,
+)
+from rosmop.logics.past import TOLD, VERDICTS, Folded, Program, fold
+from rosmop.logics.ptltl import SYNTAX as PTLTL
+
+MAX_DEPTH = 10_000
+"""Calls that may be open at once."""
+
+BEGIN, END, CALL = "begin", "end", "call"
+
+SYNTAX = Syntax(
+    unary={
+        **PTLTL.unary,
+        "(*a)": "abstract previously",
+        "<*a>": "abstract once",
+        "[*a]": "abstract historically",
+        "@b": "at begin",
+        "@c": "at call",
+        **{f"<*s@{where}>": f"some {where}" for where in ("b", "c", "bc")},
+        **{f"[*s@{where}]": f"every {where}" for where in ("b", "c", "bc")},
+    },
+    levels=boolean_levels(
+        [
+            Level({"S": "since", "~S": "dual since"}, "left"),
+            Level({"Sa": "abstract since"}, "left"),
+            *(Level({f"Ss@{where}": f"stack-since {where}"}, "left") for where in ("bc", "c", "b")),
+        ]
+    ),
+    refused={**PTLTL.refused, "Ss": "has no meaning here; write `Ss@b`, `Ss@c` or `Ss@bc`, without a space"},
+)
+
+
+def compile_ptcaret(source: Source) -> CompiledProperty:
+    """Compile a ``ptcaret`` formula. Raises FormulaError."""
+    formula = plain(read_formula(source, SYNTAX))
+    missing = [name for name in (BEGIN, END) if name not in source.events]
+    if missing and any(node.operator.startswith("abstract ") for node in nodes(formula)):
+        names = " and ".join(f"`{name}`" for name in missing)
+        raise source.error(
+            0, f"the abstract past needs the events `begin` and `end` of the specification; it has no {names}"
+        )
+    if CALL not in source.events and any(node.name == CALL for node in nodes(formula)):
+        raise source.error(0, "this formula needs the event `call` of the specification")
+    program = Program(formula, source.events)
+    return CaretProperty(source, fold(program, [program.result]))
+
+
+class CaretProperty(CompiledProperty):
+    """A formula with a stack: what the abstract operators remember, for each call that is open."""
+
+    def __init__(self, source: Source, folded: Folded) -> None:
+        super().__init__(source, VERDICTS)
+        self.folded = folded
+        places = [source.events.index(name) if name in source.events else -1 for name in (BEGIN, END)]
+        self.begin, self.end = places
+
+    def start(self, _time_ns: int) -> Run:
+        """A run with no open call; the time plays no part."""
+        return CaretRun(self)
+
+
+class CaretRun(UntimedRun):
+    """A run: its values, and those about the abstract past before each open call."""
+
+    __slots__ = ("_compiled", "_stack", "_values")
+    keeps = ("_stack", "_values")
+
+    def __init__(self, compiled: CaretProperty) -> None:
+        self._compiled = compiled
+        self._values = compiled.folded.start()
+        self._stack: list[tuple[bool, ...]] = []
+
+    def __copy__(self) -> "CaretRun":
+        made: CaretRun = twin(self)
+        made._values, made._stack = self._values.copy(), self._stack.copy()
+        return made
+
+    def step(self, event: int, _time_ns: int) -> Categories:
+        """Take the event; the time plays no part. Raises RunFaultError, and is unchanged then."""
+        compiled, values, stack = self._compiled, self._values, self._stack
+        abstract = compiled.folded.abstract
+        if event == compiled.begin:
+            if len(stack) >= MAX_DEPTH:
+                raise RunFaultError(f"more than {MAX_DEPTH} calls are open: an `end` is missing")
+            stack.append(tuple(values[place] for place in abstract))
+        (result,) = compiled.folded.take(values, event, 0)
+        holds = values[result]
+        if event == compiled.end:
+            for place, before in zip_longest(abstract, stack.pop() if stack else (), fillvalue=False):
+                values[place] = before
+        return TOLD[holds]
+
+
+def plain(formula: Formula) -> Formula:
+    """The formula without the derived operators."""
+    operands = tuple(plain(operand) for operand in formula.operands)
+    operator, _, where = formula.operator.partition(" ")
+    if operator == "stack-since":
+        return _stack_since(where, *operands)
+    if operator not in ("at", "some", "every"):
+        return Formula(formula.operator, operands, formula.name, formula.bounds, formula.offset)
+    inner = operands[0]
+    if where in ("c", "call"):
+        inner = Formula("previously", (inner,))
+    there = Formula("event", name=BEGIN)
+    if where == "bc":
+        there = Formula("or", (there, Formula("event", name=CALL)))
+    if operator == "every":
+        return Formula("abstract historically", (Formula("implies", (there, inner)),))
+    both = Formula("and", (there, inner))
+    if operator == "some":
+        return Formula("abstract once", (both,))
+    return Formula("abstract since", (Formula("not", (there,)), both))
+
+
+def _stack_since(where: str, left: Formula, right: Formula) -> Formula:
+    """`left Ss@where right`, as MOP's plugin writes it out."""
+    begin, call = Formula("event", name=BEGIN), Formula("event", name=CALL)
+    both = Formula("or", (begin, call))
+    guard = {"b": begin, "c": call, "bc": both}[where]
+    place = both if where == "bc" else begin
+    there = Formula("previously", (right,)) if where == "c" else right
+    return Formula("abstract since", (Formula("implies", (guard, left)), Formula("and", (place, there))))

@@ -1,0 +1,32 @@
+"""``ptltl``: past-time linear temporal logic, as MOP's PTLTL plugin reads it.
+
+The category is ``validation`` where the formula holds at this event, ``violation`` where not; it is told at
+each event. At an event that the formula does not name all its atoms are false. At the first event there is
+no previous one: ``(*) a`` is false there, ``[*] a`` is ``a``.
+"""
+
+from rosmop.logics.formula import NOT, Level, Syntax, boolean_levels, read_formula
+from rosmop.logics.interface import CompiledProperty, Source
+from rosmop.logics.past import compile_past
+
+_FUTURE = "is about the future; write `ltl:` for `ptltl:`, or a past operator: (*) <*> [*] S"
+
+SYNTAX = Syntax(
+    unary={
+        **NOT,
+        "(*)": "previously",
+        "~(*)": "dual previously",
+        "<*>": "once",
+        "[*]": "historically",
+    },
+    levels=boolean_levels([Level({"S": "since", "~S": "dual since"}, "left")]),
+    refused={
+        **dict.fromkeys(("[]", "<>", "o", "~o", "U", "~U", "R"), _FUTURE),
+        "~": "has no meaning in ptltl; write `!` for a negation",
+    },
+)
+
+
+def compile_ptltl(source: Source) -> CompiledProperty:
+    """Compile a ``ptltl`` formula. Raises FormulaError."""
+    return compile_past(source, read_formula(source, SYNTAX))

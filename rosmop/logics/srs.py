@@ -1,0 +1,169 @@
+"""``srs``: string rewriting systems, as MOP's SRS plugin reads them.
+
+``hasnext next -> #epsilon . ^ next -> #fail .``: each event is appended to a string, which is then rewritten until no
+rule matches. The rule that matches furthest to the left is applied, of several there the one that is written first.
+``^`` and ``$`` stand for the beginning and the end of the string and are never replaced. Symbols that are no events are
+the author's own. ``#fail`` and ``#succeed`` are the categories; either is for good.
+
+A run has bounds on its string and on the work of one event; what exceeds them is a fault of the specification.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rosmop.logics.interface import (
+    Categories,
+    CompiledProperty,
+    Run,
+    RunFaultError,
+    Source,
+    UntimedRun,
+    twin,
+)
+from rosmop.logics.lexer import Token, TokenReader
+
+CATEGORIES: Categories = ("fail", "succeed")
+MAX_RULES = 1_000
+MAX_STRING = 100_000
+"""Symbols that a run's string may have."""
+MAX_WORK = 200_000
+"""Rules that may be looked at for one event, and symbols that may be moved; comparing sixteen counts as moving one."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """``left -> right``; ``verdict`` instead of a right side. ``begins``, ``ends``: at the string's beginning, end."""
+
+    left: tuple[int, ...]
+    right: tuple[int, ...]
+    begins: bool
+    ends: bool
+    verdict: str = ""
+
+
+class RewritingProperty(CompiledProperty):
+    """A rewriting system. Symbols are numbers, events first."""
+
+    def __init__(self, source: Source, rules: Sequence[Rule]) -> None:
+        super().__init__(source, CATEGORIES)
+        self.rules = tuple(rules)
+        self.longest = max(len(rule.left) for rule in rules)
+        self.by_first: dict[int, tuple[Rule, ...]] = {}
+        for rule in rules:
+            self.by_first[rule.left[0]] = (*self.by_first.get(rule.left[0], ()), rule)
+
+    def start(self, _time_ns: int) -> Run:
+        """A run with an empty string; the time plays no part."""
+        return RewritingRun(self)
+
+    def categories_after(self, _event: int) -> frozenset[str]:
+        """The verdicts that are written; any event can lead to them."""
+        return frozenset(rule.verdict for rule in self.rules if rule.verdict)
+
+
+class RewritingRun(UntimedRun):
+    """A run: its string, to which no rule applies between two events, or the verdict that it came to."""
+
+    __slots__ = ("_property", "string", "verdict")
+    keeps = ("string", "verdict")
+    __copy__ = twin
+
+    def __init__(self, compiled: RewritingProperty) -> None:
+        self._property = compiled
+        self.string: list[int] = []
+        self.verdict: Categories = ()
+
+    def step(self, event: int, _time_ns: int) -> Categories:
+        """Append the event and rewrite; the time plays no part. Raises RunFaultError, and is unchanged then."""
+        if not self.verdict:
+            self.string, self.verdict = self._rewritten([*self.string, event])
+        return self.verdict
+
+    def _rewritten(self, string: list[int]) -> tuple[list[int], Categories]:
+        """Nothing matches before ``place``: that was looked at, and what has changed since is further behind."""
+        longest, work = self._property.longest, MAX_WORK
+        place = max(0, len(string) - longest)
+        while place < len(string):
+            if len(string) > MAX_STRING:
+                raise RunFaultError(f"the string has more than {MAX_STRING} symbols")
+            rule, spent = _matching(self._property.by_first.get(string[place], ()), string, place)
+            work -= spent
+            if rule is None:
+                place += 1
+            elif rule.verdict:
+                return [], (rule.verdict,)
+            else:
+                end = place + len(rule.left)
+                work -= len(string) - place
+                string[place:end] = rule.right
+                place = max(0, min(place - longest + 1, len(string) - longest))
+            if work < 0:
+                raise RunFaultError(f"rewriting takes more than {MAX_WORK} steps for one event")
+        return string, ()
+
+
+def _matching(rules: Sequence[Rule], string: list[int], place: int) -> tuple[Rule | None, int]:
+    """The first of the rules that matches at a place, and the work of finding it."""
+    work = 1
+    for rule in rules:
+        end = place + len(rule.left)
+        work += 1
+        if end <= len(string) and not (rule.begins and place) and not (rule.ends and end != len(string)):
+            work += len(rule.left) // 16
+            if tuple(string[place:end]) == rule.left:
+                return rule, work
+    return None, work
+
+
+def compile_srs(source: Source) -> RewritingProperty:
+    """Compile an ``srs`` formula. Raises FormulaError."""
+    reader = TokenReader(source, ("->", "^", "$", ".", "#"))
+    numbers = {name: number for number, name in enumerate(source.events)}
+    rules = [_read_rule(reader, numbers)]
+    while reader.token.kind != "end":
+        if len(rules) >= MAX_RULES:
+            raise source.error(reader.token.offset, f"more than {MAX_RULES} rules")
+        rules.append(_read_rule(reader, numbers))
+    made = {number for rule in rules for number in rule.right} | set(range(len(source.events)))
+    names = {number: name for name, number in numbers.items()}
+    for rule in rules:
+        for number in rule.left:
+            if number not in made:
+                raise source.error(
+                    0,
+                    f"`{names[number]}` is neither an event nor on the right side of a rule: no string has it",
+                )
+    reader.finish()
+    return RewritingProperty(source, rules)
+
+
+def _read_rule(reader: TokenReader, numbers: dict[str, int]) -> Rule:
+    begins = reader.accept("^")
+    left = _read_symbols(reader, numbers)
+    if not left:
+        raise reader.unexpected("an event or a symbol: a rule rewrites at least one")
+    ends = reader.accept("$")
+    reader.expect("->", "`->` and what the rule writes instead")
+    verdict = ""
+    right: tuple[int, ...] = ()
+    if reader.accept("#"):
+        word = reader.expect("name", "`#epsilon`, `#fail` or `#succeed`")
+        if word.text in CATEGORIES:
+            verdict = word.text
+        elif word.text != "epsilon":
+            raise reader.source.error(
+                word.offset, f"`#{word.text}` has no meaning in srs; write #epsilon, #fail or #succeed"
+            )
+    else:
+        right = _read_symbols(reader, numbers)
+        if not right:
+            raise reader.unexpected("symbols, `#epsilon`, `#fail` or `#succeed`")
+    reader.expect(".", "`.` at the end of the rule")
+    return Rule(left, right, begins, ends, verdict)
+
+
+def _read_symbols(reader: TokenReader, numbers: dict[str, int]) -> tuple[int, ...]:
+    found: list[Token] = []
+    while reader.token.kind == "name":
+        found.append(reader.take())
+    return tuple(numbers.setdefault(token.text, len(numbers)) for token in found)

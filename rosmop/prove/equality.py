@@ -1,0 +1,338 @@
+"""Whether events and the module that was written of them can differ: the question for z3, and its answer.
+
+An event and its function in the module are equal if, for every message of up to `AREA` bytes and every state, the
+function leaves the message to Python (which then judges it anew), or
+
+- the form does not fault,
+- both say the same of whether the event happened, dropped the message, changed it,
+- the bytes of the message, the variables and what is left of the budget are the same,
+- and so is what is put out and published, in its order. (An event that looks at a string or vector that is kept, or
+  changes or makes one, is not proved.)
+
+Where it leaves the message, the walk takes back what it has done: each variable that it has written stands among those
+that are taken back, and each byte in the log (`module_terms.py`).
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import z3
+
+from rosmop.fast.abi import AREA
+from rosmop.fast.batch_codegen import WrittenModule, written
+from rosmop.form import nodes
+from rosmop.form.compiled import Compiled
+from rosmop.form.components import groups
+from rosmop.prove.decoding import functions_of
+from rosmop.prove.form_terms import Meaning, wrapped
+from rosmop.prove.module_terms import Done, Execution, made_at
+from rosmop.prove.terms import (
+    DOUBLE,
+    SINGLE,
+    Beginning,
+    DiffersError,
+    Noted,
+    NotProvedError,
+    Result,
+    Term,
+    abstracted,
+    as_bits,
+    both,
+    either,
+    integer,
+    number_at,
+    opposite,
+)
+from rosmop.runtime.context import BUDGET
+from rosmop.runtime.times import MAX_TIME
+from rosmop.runtime.values import Values, is_array, struct_code, struct_size
+from rosmop.types import kinds
+from rosmop.types.kinds import Type
+
+EQUAL = "equal"
+IN_PYTHON = "no module: messages of this topic are judged in Python"
+PATIENCE = 1.0
+"""Seconds for each event."""
+
+_NOW, _REST = 16, 32  # where the time stands in the module, and how much of the message is not shown
+_HAPPENED, _DROPPED, _CHANGED, _ELSEWHERE = 1, 2, 4, 8
+_LATEST = 1 << 62
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What is known of an event on a topic, or part of a service.
+
+    `answer` is `EQUAL`, or says why it is not known to be, or what differs.
+
+    `differs`: the two are not equal, which is a defect of what writes modules.
+    """
+
+    topic: str
+    event: str
+    answer: str
+    differs: bool = False
+
+
+def findings_of(
+    compiled: Compiled, clock: Callable[[], float], patience: float = PATIENCE
+) -> Iterator[Finding]:
+    """What is known of every event of a set but timers, in their order; `patience` in seconds of the clock for each."""
+    found = list(groups(compiled.specifications))
+    values = Values(compiled.messages)
+    module = written(compiled.functions, [group.component for group in found], values)
+    validation = Validation(compiled.functions, values, module, clock, patience)
+    for group in found:
+        for (topic, events), numbers in zip(group.component.topics, group.events, strict=True):
+            for place, (code, (number, index)) in enumerate(zip(events, numbers, strict=True)):
+                specification = compiled.specifications[number]
+                name = f"{specification.name}.{specification.events[index].name}"
+                yield validation.finding(topic, name, code.function, place)
+    in_module = {numbers for group in found for events in group.events for numbers in events}
+    for number, specification in enumerate(compiled.specifications):
+        for index, event in enumerate(specification.events):
+            if event.way is not None and (number, index) not in in_module:
+                yield Finding(event.way, f"{specification.name}.{event.name}", IN_PYTHON)
+
+
+class Validation:
+    """The module of a set beside the form. Raises `UnknownInstructionError` for a module that cannot be read."""
+
+    def __init__(
+        self,
+        functions: Mapping[str, nodes.Function],
+        values: Values,
+        module: WrittenModule,
+        clock: Callable[[], float],
+        patience: float = PATIENCE,
+    ) -> None:
+        self._forms = functions
+        self._values = values
+        self._module = module
+        self._clock = clock
+        self._patience = patience
+        self.codes = functions_of(module.code)
+        kept = [at for own in module.cells for name in own.variables for at in own.texts_of(name)]
+        kept += [own.variables[name][0] for own in module.cells for name in own.vectors]
+        self._strings = [range(at, at + 8) for at in kept]
+        self._strings += [range(at, at + len(raw)) for raw, at in module.strings.items()]
+        self._strings += module.rooms
+        self._lasting = [
+            *(range(at, at + 8) for own in module.cells for at in own.known.values()),
+            *(range(at, at + 8) for at in module.publications.values()),
+            *(
+                range(at, at + own.sizes[name])
+                for own in module.cells
+                for name, (at, _) in own.records.items()
+            ),
+        ]
+
+    def finding(self, topic: str, event: str, function: str, place: int) -> Finding:
+        """What is known of the event that is at this place among those of a topic."""
+        feed = self._module.feeds.get(topic)
+        if feed is None:
+            return Finding(topic, event, IN_PYTHON)
+        try:
+            return Finding(topic, event, self._compared(function, feed.functions[place], topic))
+        except DiffersError as error:
+            return Finding(topic, event, f"not equal: {error}", differs=True)
+        except NotProvedError as error:
+            return Finding(topic, event, str(error))
+
+    def _compared(self, name: str, number: int, topic: str) -> str:
+        begin, cells, made, known = self._beginning()
+        module = self._module
+        meant = Meaning(self._forms, self._values, begin, name, module.lines, module.strings).result()
+        done = Execution(
+            self.codes, number, begin.message, begin.size, cells, self._strings, module.places, made
+        ).done()
+        self._check_undone(done, topic)
+        left = either(done.trapped, done.bits == _ELSEWHERE)
+        unknown = either(*meant.unknown.values())
+        wrong = {
+            "it looks beyond the message": done.outside,
+            "it goes on where the form faults": both(opposite(left), meant.left),
+        }
+        others = {
+            "whether it happened": _bit(done.bits, _HAPPENED) != meant.happened,
+            "whether the message is dropped": _bit(done.bits, _DROPPED) != meant.dropped,
+            "whether the message is changed": _bit(done.bits, _CHANGED) != meant.changed,
+            "the message": done.message != meant.message,
+            "no other bits": z3.UGT(done.bits, _HAPPENED | _DROPPED | _CHANGED),
+            **{
+                f"the variable at {place}": opposite(_same(done.cells[place], value))
+                for place, value in self._ends(meant)
+            },
+            **{
+                f"the message that is kept at {place}": made_at(done.slots, place, part.size() // 8) != part
+                for place, part in self._kept_ends(meant)
+            },
+            "how much is put out": done.said != meant.said,
+            **{
+                f"what is put out ({place})": both(noted.alive, opposite(_among(noted, done.lines)))
+                for place, noted in enumerate(meant.noted)
+            },
+        }
+        decided = both(opposite(left), opposite(meant.left), opposite(unknown))
+        wrong |= {text: both(decided, condition) for text, condition in others.items()}
+        answer = self._first(known, wrong)
+        if answer is not None:
+            return answer
+        begun = self._clock()
+        for what, condition in meant.unknown.items():
+            if self._asked([*known, opposite(left), opposite(meant.left), condition], begun)[0] != z3.unsat:
+                return f"uses {what}"
+        return EQUAL
+
+    def _first(self, known: Sequence[Term], wrong: Mapping[str, Term]) -> str | None:
+        """Why they are not known to be equal; None if they are. Raises `DiffersError`."""
+        begun = self._clock()
+        undecided = False
+        for text, condition in wrong.items():
+            if z3.is_false(z3.simplify(condition)):
+                continue
+            question = [*known, condition]
+            answer, guess = self._asked(abstracted(question), begun)
+            if answer != z3.unsat:
+                if guess is not None and _holds(question, guess):
+                    raise DiffersError(f"{text}, for {_example(guess)}")
+                answer, model = self._asked(question, begun)
+                if model is not None:
+                    raise DiffersError(f"{text}, for {_example(model)}")
+                undecided = undecided or answer != z3.unsat
+        return "not decided in time" if undecided else None
+
+    def _asked(self, conditions: Sequence[Term], begun: float) -> tuple[Any, Any]:
+        """Whether they can hold together, and how; `begun` is when the first question about the event was asked."""
+        rest = int(1000 * (begun + self._patience - self._clock()))
+        if rest <= 0:
+            return z3.unknown, None
+        solver = z3.Solver()
+        solver.set("timeout", rest)
+        solver.add(*conditions)
+        answer = solver.check()
+        return answer, solver.model() if answer == z3.sat else None
+
+    def _beginning(self) -> tuple[Beginning, dict[int, Term], Term, list[Term]]:
+        """What every event may begin with; the same as the module's cells and messages; and what is known of it."""
+        made = z3.Array("made", z3.BitVecSort(32), z3.BitVecSort(8))
+        now, size = z3.BitVec("now", 64), z3.BitVec("size", 32)
+        known = [now >= 0, now < _LATEST, z3.ULE(size, AREA)]
+        cells: dict[int, Term] = {_NOW: now, _REST: integer(0, 64)}
+        variables: dict[str, Any] = {}
+        for component in self._module.cells:
+            for name, (address, kind) in component.variables.items():
+                if isinstance(kind, kinds.String | kinds.Vector):
+                    continue
+                variables[name] = cells[address] = _variable(name, kind)
+                if isinstance(kind, kinds.Time | kinds.Duration):
+                    most = MAX_TIME + (1 << 32)
+                    known += [variables[name] >= -most, variables[name] <= most]
+            for name, (address, kind) in component.records.items():
+                variables[name] = tuple(
+                    number_at(made, integer(address + at, 32), size) for at, size in self._parts(kind)
+                )
+        budgets = {context: z3.BitVec(f"budget of {context}", 64) for context in self._module.budgets}
+        for context, address in self._module.budgets.items():
+            known += [budgets[context] >= 0, budgets[context] <= BUDGET]
+            cells[address] = budgets[context]
+        throttles = {key: z3.BitVec(f"output of {key}", 64) for key in self._module.throttles}
+        for key, address in self._module.throttles.items():
+            known.append(throttles[key] >= 0)
+            cells[address] = throttles[key]
+        message = z3.Array("message", z3.BitVecSort(32), z3.BitVecSort(8))
+        return Beginning(message, size, now, variables, budgets, throttles), cells, made, known
+
+    def _parts(self, kind: Type, at: int = 0) -> Iterator[tuple[int, int]]:
+        """Where each number, string and array of any length of a message that is kept stands in it, and its bytes."""
+        if is_array(kind) or not isinstance(kind, kinds.Record | kinds.Vector):
+            yield at, struct_size(struct_code(kind) or "") or 8
+            return
+        end = at
+        for field in (
+            [kind.element] * (kind.length or 0)
+            if isinstance(kind, kinds.Vector)
+            else self._values.fields(kind)
+        ):
+            for place, size in self._parts(field, at):
+                yield place, size
+                end = place + size
+            at = end
+
+    def _kept_ends(self, meant: Result) -> Iterator[tuple[int, Term]]:
+        """What must stand at the end in messages that are kept, and where."""
+        for component in self._module.cells:
+            for name, (address, kind) in component.records.items():
+                for (at, _), part in zip(self._parts(kind), meant.variables[name], strict=True):
+                    yield address + at, part
+
+    def _ends(self, meant: Result) -> Iterator[tuple[int, Term]]:
+        """What each cell must hold at the end."""
+        for component in self._module.cells:
+            for name, (address, _) in component.variables.items():
+                if name in meant.variables:
+                    yield address, meant.variables[name]
+        for context, address in self._module.budgets.items():
+            yield address, meant.budgets[context]
+
+    def _check_undone(self, done: Done, topic: str) -> None:
+        taken_back = {address for address, _ in self._module.feeds[topic].undo}
+        scratch = set(self._module.budgets.values()) | {
+            address
+            for address in done.stored
+            if any(address in place for place in self._module.places)
+            and not any(address in place for place in self._lasting)
+        }
+        words = {
+            address if address % 8 == 0 else address - address % 8: address
+            for address in done.stored - scratch
+        }
+        for address in sorted(words.keys() - taken_back):
+            raise DiffersError(f"what it writes at {address} is not taken back")
+
+
+def _holds(conditions: Sequence[Term], guess: Any) -> bool:
+    """Whether a message and a state are an example, too, with what costly operations are in truth."""
+    values = [
+        (declaration(), guess[declaration]) for declaration in guess.decls() if declaration.arity() == 0
+    ]
+    known = [
+        (declaration, value)
+        for declaration, value in values
+        if value is not None and not isinstance(value, z3.FuncInterp)
+    ]
+    return all(z3.is_true(z3.simplify(z3.substitute(condition, *known))) for condition in conditions)
+
+
+def _example(model: Any) -> str:
+    """A message and a state, as short as they are."""
+    return ", ".join(
+        f"{declaration} = {model[declaration]}" for declaration in model.decls() if declaration.arity() == 0
+    )
+
+
+def _same(held: Term, value: Term) -> Term:
+    """Whether a cell holds a value; a truth may be one by its bits."""
+    return held == (as_bits(value) if z3.is_bool(value) and not z3.is_bool(held) else value)
+
+
+def _among(noted: Noted, lines: Term) -> Term:
+    """Whether one of what may stand there does."""
+    held = number_at(lines, noted.offset, noted.allowed[0].size() // 8) if noted.allowed else None
+    return either(*(held == one for one in noted.allowed))
+
+
+def _bit(bits: Term, which: int) -> Term:
+    return bits & which != 0
+
+
+def _variable(name: str, kind: Type) -> Term:
+    """A variable of the set, with any value of its type."""
+    if isinstance(kind, kinds.Bool):
+        return z3.Bool(name)
+    if isinstance(kind, kinds.Floating):
+        return z3.FP(name, DOUBLE if kind.bits == 64 else SINGLE)
+    if isinstance(kind, kinds.Integer) and kind.bits <= 32:
+        return wrapped(z3.BitVec(name, 32), kind)
+    return z3.BitVec(name, 64)

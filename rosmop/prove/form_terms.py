@@ -1,0 +1,950 @@
+"""What the form of an event means, as terms: line by line `ir/interpreter.py`, for every message at once.
+
+- Positions and counts are 64 bits here and any number there: a function without loops adds up a few products of a
+  count below 2**32 and a size, and never comes to more. Times are 64 bits, too, and sums of two of them fit.
+- Of numbers of 32 bits the interpreter rounds the double that comes of `+ - * /`. That is the float that the operation
+  has itself: a double has more than twice as many digits, so that rounding twice is rounding once.
+- What it measures of the values that a specification holds, once in a megabyte that it says it will make, is left out.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import z3
+
+from rosmop.fast.deferred_output import BYTES, HEAD, Line, Publication
+from rosmop.form import nodes
+from rosmop.prove.terms import (
+    AT,
+    DOUBLE,
+    FRAME,
+    MIXED,
+    NEAREST,
+    SINGLE,
+    Beginning,
+    Noted,
+    NotProvedError,
+    Result,
+    State,
+    Term,
+    as_bits,
+    both,
+    choice,
+    either,
+    floating,
+    integer,
+    merged,
+    number_at,
+    opposite,
+    with_number,
+)
+from rosmop.runtime import times
+from rosmop.runtime.context import BYTES_PER_INSTRUCTION, OUTPUT_COST, UNMEASURED
+from rosmop.runtime.values import Values, struct_code, struct_size
+from rosmop.runtime.wire import MAX_EMPTY
+from rosmop.types import kinds
+from rosmop.types.kinds import Type
+
+_MESSAGE, _DROPPED, _CHANGED, _BUDGET, _SAID = "message", "dropped", "changed", "budget", "said"
+
+
+@dataclass(frozen=True)
+class _View:
+    """A string, vector or message as it stood in the bytes: from where, and how many elements."""
+
+    message: Term
+    start: Term
+    count: Term
+
+
+_Made = tuple[Term, ...]
+"""A message that is made or kept: the bits of each of its numbers, as they are sent; of a string address and length."""
+
+
+class UnknownError(Exception):
+    """What is not said here."""
+
+
+def is_signed(kind: Type) -> bool:
+    """Whether numbers of the type may be negative."""
+    return not isinstance(kind, kinds.Integer) or kind.signed
+
+
+def width(kind: Type) -> int:
+    """The bits of the vector that holds a number of this type."""
+    return 32 if isinstance(kind, kinds.Integer) and kind.bits <= 32 else 64
+
+
+def wrapped(value: Term, kind: kinds.Integer) -> Term:
+    """Only the bits of this type, as the vector holds them."""
+    if kind.bits >= 32:
+        return value
+    return (z3.SignExt if kind.signed else z3.ZeroExt)(32 - kind.bits, z3.Extract(kind.bits - 1, 0, value))
+
+
+def _text(view: _View) -> Term:
+    """Where a string of the message stands, and how long it is."""
+    return z3.Concat(z3.Extract(31, 0, view.count), AT + z3.Extract(31, 0, view.start))
+
+
+def _word(value: Term, kind: Type) -> Term:
+    """A number as it stands in a line."""
+    if isinstance(kind, kinds.Floating):
+        return z3.fpToIEEEBV(value if kind.bits == 64 else z3.fpFPToFP(NEAREST, value, DOUBLE))
+    bits = as_bits(value) if z3.is_bool(value) else value
+    return bits if bits.size() == 64 else (z3.SignExt if is_signed(kind) else z3.ZeroExt)(32, bits)
+
+
+class Meaning:
+    """One event. `functions` are those of its set, `values` the types of its messages; `lines` are what the module puts
+    out, by number, and `strings` where constants stand in it.
+    """
+
+    def __init__(  # noqa: PLR0917  as `result` names them
+        self,
+        functions: Mapping[str, nodes.Function],
+        values: Values,
+        beginning: Beginning,
+        name: str,
+        lines: Sequence[Line | Publication] = (),
+        strings: Mapping[bytes, int] = MappingProxyType({}),
+    ) -> None:
+        self._lines = lines
+        self._strings = strings
+        self._noted: list[Noted] = []
+        self._context = functions[name].context
+        self._functions = functions
+        self._values = values
+        self._beginning = beginning
+        self._function = functions[name]
+        self._left: list[Term] = []
+        self._unknown: dict[str, list[Term]] = {}
+        self._exits: list[tuple[State, Term]] = []
+        self._returned: list[tuple[State, Term]] | None = None
+        self._calls = 0
+        self._frame = 0
+        self._shared: Sequence[str] = self._function.shared
+
+    def result(self) -> Result:
+        """What it comes to. Raises `NotProvedError` for a loop."""
+        begin, no = self._beginning, z3.BoolVal(False)
+        budget = begin.budgets[self._function.context]
+        slots: dict[Any, Any] = {_MESSAGE: begin.message, _DROPPED: no, _CHANGED: no, _BUDGET: budget}
+        slots[_SAID] = integer(0, 32)
+        slots |= {("shared", name): value for name, value in begin.variables.items()}
+        state = State(z3.BoolVal(True), slots)
+        self._block(self._function.body, state)
+        self._left.append(state.alive)  # nothing comes to the end without leaving
+        happened, end = no, slots
+        for left, value in self._exits:
+            happened = choice(left.alive, value, happened)
+            end = merged(left.alive, left, State(opposite(left.alive), end))
+        unknown = {name: either(*conditions) for name, conditions in self._unknown.items()}
+        variables = {name: end["shared", name] for name in begin.variables}
+        return Result(
+            either(*self._left), unknown, happened, end[_DROPPED], end[_CHANGED], end[_MESSAGE], variables,
+            {**begin.budgets, self._function.context: end[_BUDGET]}, end[_SAID], self._noted,
+        )  # fmt: skip
+
+    # Ends
+
+    def _leave_to_python(self, state: State, condition: Term) -> None:
+        """A fault, or what no module does: the message is judged anew, by others."""
+        self._left.append(both(state.alive, condition))
+        state.require(opposite(condition))
+
+    def _ignore(self, state: State, what: str) -> None:
+        self._unknown.setdefault(what, []).append(state.alive)
+        state.alive = z3.BoolVal(False)
+
+    def _exit(self, state: State, happened: bool) -> None:
+        self._exits.append((state.where(z3.BoolVal(True)), z3.BoolVal(happened)))
+        state.alive = z3.BoolVal(False)
+
+    # Statements
+
+    def _block(self, statements: Sequence[nodes.Statement], state: State) -> None:
+        for statement in statements:
+            if z3.is_false(state.alive):
+                return
+            method = _STATEMENTS.get(type(statement))
+            try:
+                if method is None:
+                    raise UnknownError(type(statement).__name__)
+                method(self, statement, state)
+            except UnknownError as error:
+                self._ignore(state, str(error))
+
+    def _evaluate(self, node: nodes.Evaluate, state: State) -> None:
+        self._value(node.value, state)
+
+    def _if(self, node: nodes.If, state: State) -> None:
+        test = self._value(node.test, state)
+        yes, no = state.where(test), state.where(opposite(test))
+        self._block(node.yes, yes)
+        self._block(node.no, no)
+        state.join(test, yes, no)
+
+    def _repeat(self, _node: nodes.Statement | nodes.Expression, _state: State) -> None:
+        raise NotProvedError("not loop-free")
+
+    _loop = _for_each = _skip = _accumulate = _repeat
+
+    def _select(self, node: nodes.Select, state: State) -> None:
+        value = self._value(node.value, state)
+        number = integer(node.default, 32)
+        for wanted, index in reversed(node.table):
+            number = z3.If(value == integer(wanted, value.size()), integer(index, 32), number)
+        state.slots[self._frame, node.name] = number
+
+    def _return(self, node: nodes.Return, state: State) -> None:
+        if node.references or self._returned is None:
+            raise UnknownError("references")
+        value = None if node.value.type == kinds.VOID else self._value(node.value, state)
+        self._returned.append((state.where(z3.BoolVal(True)), value))
+        state.alive = z3.BoolVal(False)
+
+    def _leave(self, node: nodes.Leave, state: State) -> None:
+        self._exit(state, bool(node.happened))
+
+    def _charge(self, node: nodes.Charge, state: State) -> None:
+        self._spend(integer(node.instructions, 64), state)
+
+    def _spend(self, instructions: Term, state: State) -> None:
+        state.slots[_BUDGET] = state.slots[_BUDGET] - instructions
+        self._leave_to_python(state, state.slots[_BUDGET] < 0)
+
+    def _allocate(self, node: nodes.Allocate, state: State) -> None:
+        if node.size is not None:
+            self._make(integer(node.size, 64), state)
+            return
+        size = z3.ZeroExt(32, self._beginning.size)
+        many = size > nodes.CHARGED
+        yes, no = state.where(many), state.where(opposite(many))
+        self._make(size, yes)
+        state.join(many, yes, no)
+
+    def _make(self, size: Term, state: State) -> None:
+        self._leave_to_python(state, z3.UGT(size, UNMEASURED))
+        self._spend(z3.UDiv(size, integer(BYTES_PER_INSTRUCTION, 64)), state)
+
+    def _drop(self, _node: nodes.Drop, state: State) -> None:
+        state.slots[_DROPPED] = z3.BoolVal(True)
+
+    def _publish(self, node: nodes.Publish, state: State) -> None:
+        made = self._leaves(node.kind, node.value, state)
+        kinds_of = list(self._kinds(node.kind))
+        size = sum(leaf.size() // 8 for leaf in made)
+        cost = integer(OUTPUT_COST + size, 64)
+        for leaf, kind in zip(made, kinds_of, strict=True):
+            if isinstance(kind, kinds.String):
+                cost = cost + z3.ZeroExt(32, z3.Extract(63, 32, leaf))
+        self._put_out(node, made, cost, state)
+
+    def _log(self, node: nodes.Log, state: State) -> None:
+        """A line costs the most that it can."""
+        line = Line("", node)
+        cost, words = integer(line.cost, 64), []
+        for expression in line.values:
+            value = self._value(expression, state)
+            if isinstance(value, _View):
+                cost = cost + z3.UDiv(value.count, integer(BYTES, 64))
+                words.append(_text(value))
+            else:
+                words.append(_word(value, expression.type))
+        self._put_out(node, words, cost, state)
+
+    def _put_out(
+        self, node: nodes.Log | nodes.Publish, parts: Sequence[Term], cost: Term, state: State
+    ) -> None:
+        """Note a line or publication: its number among those of the module, the frame, and its parts."""
+        numbers = [
+            integer(number, 32)
+            for number, line in enumerate(self._lines)
+            if line.node is node and line.context == self._context
+        ]
+        self._spend(cost, state)
+        begin = state.slots[_SAID]
+        self._noted += (Noted(state.alive, begin, numbers), Noted(state.alive, begin + 4, [FRAME]))
+        offset = HEAD.size
+        for part in parts:
+            self._noted.append(Noted(state.alive, begin + offset, [part]))
+            offset += part.size() // 8
+        state.slots[_SAID] = begin + (offset + 7 & ~7)
+
+    def _pending(self, node: nodes.Pending, state: State) -> None:
+        """Only `Whole` asks for it."""
+        state.slots[self._frame, node.name] = node.writes
+
+    def _require(self, node: nodes.Require, state: State) -> None:
+        test = self._value(node.test, state)
+        self._exit(state.where(opposite(test)), False)
+        state.require(test)
+
+    def _not_past(self, node: nodes.NotPast, state: State) -> None:
+        self._leave_to_python(state, state.slots[self._frame, node.count] <= node.index)
+
+    # Fields of the message
+
+    def _position(self, at: nodes.Spot, state: State) -> Term:
+        offset = integer(at.offset, 64)
+        return offset if at.base is None else state.slots[self._frame, at.base] + offset
+
+    def _place(self, at: nodes.Spot, state: State) -> Term:
+        """The same where it is known to be within the message."""
+        offset = integer(at.offset, 32)
+        return offset if at.base is None else z3.Extract(31, 0, state.slots[self._frame, at.base]) + offset
+
+    def _within(self, at: nodes.Spot, size: int, state: State) -> None:
+        short = z3.ULT(z3.ZeroExt(32, self._beginning.size), self._position(at.plus(size), state))
+        self._leave_to_python(state, short)
+
+    def _length(self, at: nodes.Spot, state: State) -> Term:
+        self._within(at, 4, state)
+        return z3.ZeroExt(32, number_at(state.slots[_MESSAGE], self._place(at, state), 4))
+
+    def _after_text(self, node: nodes.AfterText, state: State) -> None:
+        length = self._length(node.at, state)
+        state.slots[self._frame, node.name] = self._position(node.at.plus(4), state) + length
+
+    def _count(self, node: nodes.Count, state: State) -> None:
+        state.slots[self._frame, node.name] = self._counted(node.at, node.least, state)
+
+    def _counted(self, at: nodes.Spot, least: int, state: State) -> Term:
+        count = self._length(at, state)
+        room = z3.ZeroExt(32, self._beginning.size) - self._position(at.plus(4), state)
+        many = z3.UGT(count * least, room) if least else z3.UGT(count, MAX_EMPTY)
+        self._leave_to_python(state, many)
+        return count
+
+    def _after_elements(self, node: nodes.AfterElements, state: State) -> None:
+        count = (
+            integer(node.count, 64) if isinstance(node.count, int) else state.slots[self._frame, node.count]
+        )
+        state.slots[self._frame, node.name] = self._position(node.at, state) + count * node.size
+
+    def _read_numbers(self, node: nodes.ReadNumbers, state: State) -> None:
+        self._within(node.at, max(offset + self._size(kind) for _, kind, offset in node.fields), state)
+        for name, kind, offset in node.fields:
+            place = self._place(node.at.plus(offset), state)
+            state.slots[self._frame, name] = self._number(state.slots[_MESSAGE], place, kind)
+
+    def _number(self, message: Term, place: Term, kind: Type) -> Term:
+        return self._decoded(number_at(message, place, self._size(kind)), kind)
+
+    def _decoded(self, bits: Term, kind: Type) -> Term:
+        """The number that these bytes are."""
+        if isinstance(kind, kinds.Time | kinds.Duration):
+            extend = z3.ZeroExt if kind == kinds.TIME else z3.SignExt
+            seconds, rest = (extend(32, z3.Extract(more + 31, more, bits)) for more in (0, 32))
+            return seconds * integer(times.BILLION, 64) + rest
+        if isinstance(kind, kinds.Bool):
+            return bits != 0
+        if isinstance(kind, kinds.Floating):
+            return z3.fpBVToFP(bits, DOUBLE if kind.bits == 64 else SINGLE)
+        if not isinstance(kind, kinds.Integer):
+            raise UnknownError(f"a value of type {kind}")
+        missing = width(kind) - bits.size()
+        return bits if not missing else (z3.SignExt if kind.signed else z3.ZeroExt)(missing, bits)
+
+    def _size(self, kind: Type) -> int:
+        """The bytes of every value of a type in a message."""
+        code = struct_code(kind)
+        if code is not None:
+            return struct_size(code)
+        if isinstance(kind, kinds.Record):
+            return sum(map(self._size, self._values.fields(kind)))
+        if isinstance(kind, kinds.Vector) and kind.length is not None:
+            return kind.length * self._size(kind.element)
+        raise UnknownError(f"a value of type {kind} in a vector or message")
+
+    def _read_value(self, node: nodes.ReadValue, state: State) -> None:
+        kind, start = node.type, self._position(node.at, state)
+        count, size = integer(1, 64), 1
+        if isinstance(kind, kinds.String):
+            count = self._length(node.at, state)
+            start = self._position(node.at.plus(4), state)
+            self._leave_to_python(state, z3.UGT(start + count, z3.ZeroExt(32, self._beginning.size)))
+        elif isinstance(kind, kinds.Vector) and kind.length is None:
+            size = self._size(kind.element)
+            count = self._counted(node.at, size, state)
+            start = self._position(node.at.plus(4), state)
+        else:
+            size = self._size(kind)
+            self._within(node.at, size, state)
+            if isinstance(kind, kinds.Vector):
+                count, size = integer(kind.length or 0, 64), self._size(kind.element)
+        state.slots[self._frame, node.name] = _View(state.slots[_MESSAGE], start, count)
+        state.slots[self._frame, node.end] = start + count * size
+
+    def _write_back(self, node: nodes.WriteBack, state: State) -> None:
+        dropped = state.slots[_DROPPED]
+        self._exit(state.where(dropped), True)
+        state.require(opposite(dropped))
+        puts = []
+        for write in node.writes:
+            flag = state.slots[self._frame, write.flag]
+            if write.end is not None:
+                self._ignore(state.where(flag), "a string or vector that is written")
+                state.require(opposite(flag))
+                continue
+            wanted = state.where(flag)
+            bits = self._packed(self._value(write.value, wanted), write.value.type, wanted)
+            state.alive = either(wanted.alive, state.where(opposite(flag)).alive)
+            puts.append((flag, bits, self._place(write.at, state)))
+        for flag, bits, place in puts:
+            message = state.slots[_MESSAGE]
+            differs = both(flag, number_at(message, place, bits.size() // 8) != bits)
+            state.slots[_MESSAGE] = choice(differs, with_number(message, place, bits), message)
+            state.slots[_CHANGED] = either(state.slots[_CHANGED], differs)
+
+    def _packed(self, value: Term, kind: Type, state: State) -> Term:
+        """The bytes of a number. Which bits a NaN has is for Python to say."""
+        if isinstance(kind, kinds.Floating):
+            self._leave_to_python(state, z3.fpIsNaN(value))
+            return z3.fpToIEEEBV(value)
+        if isinstance(kind, kinds.Bool):
+            return as_bits(value, 8)
+        if isinstance(kind, kinds.Integer):
+            return z3.Extract(kind.bits - 1, 0, value)
+        seconds, rest = self._parts(value)
+        least, most = (0, 1 << 32) if kind == kinds.TIME else (-(1 << 31), 1 << 31)
+        self._leave_to_python(state, either(seconds < least, seconds >= most))
+        return z3.Concat(z3.Extract(31, 0, rest), z3.Extract(31, 0, seconds))
+
+    def _parts(self, value: Term) -> tuple[Term, Term]:
+        """`divmod(value, 10**9)`: the rest has the sign of the divisor."""
+        billion = integer(times.BILLION, 64)
+        rest = z3.SRem(value, billion)
+        rest = z3.If(rest < 0, rest + billion, rest)
+        return (value - rest) / billion, rest
+
+    # Messages that are made or kept
+
+    def _kinds(self, kind: Type) -> Iterator[Type]:
+        """The types of the numbers, times and strings in a value, in order."""
+        parts: Sequence[Type] = self._values.fields(kind) if isinstance(kind, kinds.Record) else ()
+        if isinstance(kind, kinds.Vector):
+            if kind.length is None:
+                raise UnknownError("an array of any length in a message that is made")
+            parts = [kind.element] * kind.length
+        elif not isinstance(kind, kinds.Record):
+            yield kind
+        for part in parts:
+            yield from self._kinds(part)
+
+    def _leaves(self, kind: Type, node: nodes.Expression, state: State) -> _Made:
+        """A value as it stands in a message that is made."""
+        if isinstance(kind, kinds.String) and isinstance(node, nodes.Literal | nodes.Zero):
+            raw = node.value if isinstance(node, nodes.Literal) else b""
+            place = self._strings.get(raw) if isinstance(raw, bytes) else None
+            if not isinstance(raw, bytes) or place is None:
+                raise UnknownError("a constant string")
+            return (z3.Concat(integer(len(raw), 32), integer(place, 32)),)
+        value = self._value(node, state)
+        if isinstance(value, tuple):
+            return value
+        if not isinstance(value, _View):
+            return (self._packed(value, kind, state),)
+        if isinstance(kind, kinds.String):
+            return (_text(value),)
+        found, offset = [], 0
+        for leaf in self._kinds(kind):
+            number = self._part(value, offset, leaf)
+            found.append(self._packed(number, leaf, state))
+            offset += self._size(leaf)
+        return tuple(found)
+
+    def _span(self, kind: Type, number: int) -> tuple[int, int]:
+        """Where a field or element begins among the parts of a value, and ends."""
+        if isinstance(kind, kinds.Vector):
+            size = len(list(self._kinds(kind.element)))
+            return number * size, (number + 1) * size
+        assert isinstance(kind, kinds.Record)  # noqa: S101  what has parts is one of the two
+        counts = [len(list(self._kinds(field))) for field in self._values.fields(kind)]
+        begin = sum(counts[:number])
+        return begin, begin + counts[number]
+
+    def _path(self, node: nodes.Expression) -> tuple[nodes.Read, int]:
+        """The variable that a place is in, and where it begins among its parts."""
+        if isinstance(node, nodes.Item):
+            variable, begin = self._path(node.base)
+            return variable, begin + self._span(node.base.type, node.number)[0]
+        if not isinstance(node, nodes.Read):
+            raise UnknownError("an element of a message that is made")
+        return node, 0
+
+    def _change(self, node: nodes.Call, state: State) -> Any:
+        """Put a value into a field, or an element that is known."""
+        base, where, new = node.arguments
+        number = where.value if isinstance(where, nodes.Literal) else None
+        if not isinstance(number, int) or nodes.acts(new):
+            raise UnknownError("an element of a message that is made")
+        variable, begin = self._path(base)
+        whole = self._read(variable, state)
+        if not isinstance(whole, tuple):
+            raise UnknownError("a message that is changed")
+        if isinstance(base.type, kinds.Vector):
+            self._leave_to_python(state, z3.BoolVal(not 0 <= number < (base.type.length or 0)))
+        first, last = (begin + one for one in self._span(base.type, number))
+        kind = new.type if isinstance(base.type, kinds.Vector) else self._field(base.type, number)
+        put = self._leaves(kind, new, state)
+        own = (self._frame, variable.name)
+        state.slots[own if own in state.slots else ("shared", variable.name)] = (
+            *whole[:first],
+            *put,
+            *whole[last:],
+        )
+
+    def _field(self, kind: Type, number: int) -> Type:
+        assert isinstance(kind, kinds.Record)  # noqa: S101  what has slots
+        return self._values.fields(kind)[number]
+
+    def _whole(self, node: nodes.Whole, state: State) -> Any:
+        """The message at hand, with the fields that were assigned."""
+        self._make(z3.ZeroExt(32, self._beginning.size), state)
+        at, found = nodes.Spot(None, 0), []
+        for number, kind in enumerate(self._kinds(node.type)):
+            if isinstance(kind, kinds.String):
+                name = f"text {number} of {node.pending}"
+                self._read_value(nodes.ReadValue(-1, name, f"{name} end", at, kind), state)
+                found.append(_text(state.slots[self._frame, name]))
+                at = nodes.Spot(f"{name} end", 0)
+                continue
+            self._within(at, self._size(kind), state)
+            value = self._number(state.slots[_MESSAGE], self._place(at, state), kind)
+            found.append(self._packed(value, kind, state))
+            at = at.plus(self._size(kind))
+        for write in state.slots[self._frame, node.pending]:
+            flag, kind, begin = state.slots[self._frame, write.flag], node.type, 0
+            for step in write.path:
+                if not isinstance(step, int):
+                    raise UnknownError("a part of a time that was assigned")
+                begin += self._span(kind, step)[0]
+                kind = kind.element if isinstance(kind, kinds.Vector) else self._field(kind, step)
+            wanted = state.where(flag)
+            put = self._leaves(kind, write.value, wanted)
+            state.alive = either(wanted.alive, state.where(opposite(flag)).alive)
+            for place, leaf in enumerate(put, begin):
+                found[place] = choice(flag, leaf, found[place])
+        return tuple(found)
+
+    # Expressions
+
+    def _value(self, node: nodes.Expression, state: State) -> Any:
+        method = _EXPRESSIONS.get(type(node))
+        if method is None:
+            raise UnknownError(type(node).__name__)
+        return method(self, node, state)
+
+    def _literal(self, node: nodes.Literal, _state: State) -> Any:
+        if node.value is None:
+            return None
+        if isinstance(node.value, bytes | str):
+            raise UnknownError("a constant string")
+        if isinstance(node.type, kinds.Floating):
+            return floating(node.value, node.type.bits)
+        return self._whole_number(int(node.value), node.type)
+
+    def _whole_number(self, value: int, kind: Type) -> Term:
+        return z3.BoolVal(bool(value)) if isinstance(kind, kinds.Bool) else integer(value, width(kind))
+
+    def _zero(self, node: nodes.Zero, state: State) -> Any:
+        if isinstance(node.type, kinds.Record):
+            return tuple(self._nothing(kind) for kind in self._kinds(node.type))
+        if isinstance(node.type, kinds.Floating):
+            return self._literal(nodes.Literal(node.type, 0.0), state)
+        if not isinstance(node.type, kinds.Bool | kinds.Integer | kinds.Time | kinds.Duration):
+            raise UnknownError(f"a zero of type {node.type}")
+        return self._whole_number(0, node.type)
+
+    def _nothing(self, kind: Type) -> Term:
+        return integer(0, 64 if isinstance(kind, kinds.String) else 8 * self._size(kind))
+
+    def _read(self, node: nodes.Read, state: State) -> Any:
+        own, shared = (self._frame, node.name), ("shared", node.name)
+        value = state.slots.get(own if own in state.slots else shared)
+        if value is None or value is MIXED:
+            raise UnknownError(f"a variable of type {node.type}")
+        return value
+
+    def _assign(self, node: nodes.Assign, state: State) -> Any:
+        value = self._value(node.value, state)
+        if isinstance(value, tuple) and isinstance(node.value, nodes.Read | nodes.Item | nodes.Assign):
+            raise UnknownError("two names of one message")
+        where: int | str = "shared" if node.name in self._shared else self._frame
+        if isinstance(node.type, kinds.Record) and isinstance(value, _View) and where == "shared":
+            value = self._leaves(node.type, node.value, state)
+        if where == "shared" and node.name not in self._beginning.variables:
+            raise UnknownError(f"a variable of type {node.type}")
+        state.slots[where, node.name] = value
+        return value
+
+    def _convert(self, node: nodes.Convert, state: State) -> Any:
+        return self._converted(self._value(node.value, state), node.value.type, node.type)
+
+    def _converted(self, value: Term, source: Type, target: Type) -> Term:
+        if isinstance(target, kinds.Bool):
+            if isinstance(source, kinds.Floating):
+                return opposite(z3.fpIsZero(value))
+            return value if isinstance(source, kinds.Bool) else value != 0
+        if isinstance(source, kinds.Bool):
+            source, value = kinds.INT, as_bits(value)
+        if isinstance(target, kinds.Floating):
+            sort = DOUBLE if target.bits == 64 else SINGLE
+            if isinstance(source, kinds.Floating):
+                return value if source.bits == target.bits else z3.fpFPToFP(NEAREST, value, sort)
+            return (z3.fpSignedToFP if is_signed(source) else z3.fpUnsignedToFP)(NEAREST, value, sort)
+        if not isinstance(target, kinds.Integer):
+            raise UnknownError(f"a conversion to {target}")
+        if isinstance(source, kinds.Floating):
+            return self._truncated(self._converted(value, source, kinds.Floating(64)), target)
+        if width(target) > value.size():
+            value = (z3.SignExt if is_signed(source) else z3.ZeroExt)(32, value)
+        return wrapped(value if width(target) == value.size() else z3.Extract(31, 0, value), target)
+
+    def _truncated(self, value: Term, target: kinds.Integer) -> Term:
+        """Toward zero, at most the limits; of what is narrower than 32 bits within those of `int` first."""
+        whole = target if target.bits >= 32 else kinds.INT
+        bits = whole.bits
+        least, most = floating(whole.least, 64), floating(whole.most, 64)
+        cut = (z3.fpToSBV if whole.signed else z3.fpToUBV)(z3.RTZ(), value, z3.BitVecSort(bits))
+        high = z3.If(z3.fpGEQ(value, most), integer(whole.most, bits), cut)
+        low = z3.If(z3.fpLEQ(value, least), integer(whole.least, bits), high)
+        result = z3.If(z3.fpIsNaN(value), integer(0, bits), low)
+        if whole is not target:
+            result = z3.If(result < target.least, integer(target.least, 32), result)
+            result = z3.If(result > target.most, integer(target.most, 32), result)
+        return result
+
+    def _arithmetic(self, node: nodes.Arithmetic, state: State) -> Any:
+        left, right = self._value(node.left, state), self._value(node.right, state)
+        kind, operator = node.type, node.operator
+        if isinstance(kind, kinds.Floating):
+            return _OF_FLOATS[operator](NEAREST, left, right)
+        assert isinstance(kind, kinds.Integer)  # noqa: S101  numbers that are calculated with are one of the two
+        if operator in "/%":
+            self._leave_to_python(state, right == 0)
+            if operator == "/":
+                result = left / right if kind.signed else z3.UDiv(left, right)
+            else:
+                result = z3.SRem(left, right) if kind.signed else z3.URem(left, right)
+        elif operator in ("<<", ">>"):
+            missing = left.size() - right.size()
+            amount = z3.ZeroExt(32, right) if missing > 0 else z3.Extract(31, 0, right) if missing else right
+            amount = amount & (kind.bits - 1)
+            result = (
+                left << amount
+                if operator == "<<"
+                else left >> amount
+                if kind.signed
+                else z3.LShR(left, amount)
+            )
+        else:
+            result = _OF_INTEGERS[operator](left, right)
+        return wrapped(result, kind)
+
+    def _unary(self, node: nodes.Unary, state: State) -> Any:
+        value = self._value(node.value, state)
+        if isinstance(node.type, kinds.Floating):
+            return z3.fpAbs(value) if node.operator == "abs" else z3.fpNeg(value)
+        if node.operator == "~":
+            result = ~value
+        elif node.operator == "-":
+            result = -value
+        else:
+            result = z3.If(value < 0, -value, value) if is_signed(node.type) else value
+        return wrapped(result, node.type) if isinstance(node.type, kinds.Integer) else result
+
+    def _moment(self, node: nodes.Moment, state: State) -> Any:
+        left, right = self._value(node.left, state), self._value(node.right, state)
+        return self._limited(node.type, left + right if node.operator == "+" else left - right, state)
+
+    def _moment_of(self, node: nodes.MomentOf, state: State) -> Any:
+        seconds, rest = self._value(node.seconds, state), self._value(node.nanoseconds, state)
+        return self._of_parts(node.type, seconds, rest, state)
+
+    def _of_parts(self, kind: Type, seconds: Term, rest: Term, state: State) -> Term:
+        """Exact: seconds beyond 2**33 are out of range with whatever nanoseconds, of which there are few enough, and
+        within 64 bits what overflows is told from what does not by the sum in 72.
+        """
+        far = either(seconds >= 1 << 33, seconds <= -(1 << 33), rest >= 1 << 62, rest <= -(1 << 62))
+        known = state.where(far)
+        self._ignore(known, "a time of more than 2**33 seconds in parts")
+        state.require(opposite(far))
+        product = seconds * integer(times.BILLION, 64)
+        exact = z3.SignExt(8, product) + z3.SignExt(8, rest)
+        limited = self._limited(kind, exact, state)
+        return z3.Extract(63, 0, limited)
+
+    def _limited(self, kind: Type, moment: Term, state: State) -> Term:
+        limits = (0, times.MAX_TIME) if kind == kinds.TIME else (times.MIN_DURATION, times.MAX_DURATION)
+        self._leave_to_python(state, either(moment < limits[0], moment > limits[1]))
+        return moment
+
+    def _compare(self, node: nodes.Compare, state: State) -> Any:
+        kind = node.left.type
+        if isinstance(kind, kinds.Vector | kinds.Record):
+            raise UnknownError(f"a comparison of values of type {kind}")
+        left, right = self._value(node.left, state), self._value(node.right, state)
+        return _compared(node.operator, left, right, kind)
+
+    def _compare_texts(self, node: nodes.CompareTexts, state: State) -> Any:
+        given, known = (
+            (node.right, node.left) if isinstance(node.left, nodes.Literal) else (node.left, node.right)
+        )
+        text = known.value if isinstance(known, nodes.Literal) else None
+        if node.operator not in ("==", "!=") or not node.short or not isinstance(text, bytes):
+            raise UnknownError("a comparison of strings")
+        view = self._value(given, state)
+        if not isinstance(view, _View) or len(text) > nodes.SHORT:
+            raise UnknownError("a comparison of strings")
+        place = z3.Extract(31, 0, view.start)
+        letters = [number_at(view.message, place + more, 1) == letter for more, letter in enumerate(text)]
+        same = both(view.count == len(text), *letters)
+        return same if node.operator == "==" else opposite(same)
+
+    def _logical(self, node: nodes.Logical, state: State) -> Any:
+        left = self._value(node.left, state)
+        looked_at = left if node.operator == "and" else opposite(left)
+        yes, no = state.where(looked_at), state.where(opposite(looked_at))
+        right = self._value(node.right, yes)
+        state.join(looked_at, yes, no)
+        return both(left, right) if node.operator == "and" else either(left, right)
+
+    def _not(self, node: nodes.Not, state: State) -> Any:
+        return opposite(self._value(node.value, state))
+
+    def _conditional(self, node: nodes.Conditional, state: State) -> Any:
+        test = self._value(node.test, state)
+        yes, no = state.where(test), state.where(opposite(test))
+        one, other = self._value(node.yes, yes), self._value(node.no, no)
+        state.join(test, yes, no)
+        return choice(test, one, other)
+
+    def _sequence(self, node: nodes.Sequence, state: State) -> Any:
+        return [self._value(item, state) for item in node.items][node.chosen]
+
+    def _discard(self, node: nodes.Discard, state: State) -> None:
+        self._value(node.value, state)
+
+    def _now(self, _node: nodes.Now, _state: State) -> Any:
+        return self._beginning.now
+
+    def _throttle(self, node: nodes.Throttle, state: State) -> Any:
+        """Output that is due is noted, and so for Python; of what is not due nothing comes."""
+        last = self._beginning.throttles.get((self._function.context, node.site))
+        if last is None:
+            raise UnknownError("output at most so often")
+        seconds = self._converted(self._value(node.seconds, state), node.seconds.type, kinds.Floating(64))
+        more = z3.fpMul(NEAREST, seconds, floating(1e9, 64))
+        until = z3.fpAdd(NEAREST, z3.fpSignedToFP(NEAREST, last, DOUBLE), more)
+        # A whole number is below another if it is below the next whole one.
+        whole = z3.fpRoundToIntegral(z3.RTP(), until)
+        first, limit = z3.fpToSBV(z3.RTZ(), whole, z3.BitVecSort(64)), floating(2.0**63, 64)
+        now = self._beginning.now
+        before = z3.If(z3.fpGEQ(whole, limit), True, both(z3.fpGEQ(whole, z3.fpNeg(limit)), now < first))
+        self._leave_to_python(state, opposite(both(last <= now, before)))
+        return z3.BoolVal(False)
+
+    def _item(self, node: nodes.Item, state: State) -> Any:
+        view = self._value(node.base, state)
+        if isinstance(view, tuple):
+            if isinstance(node.type, kinds.String):
+                raise UnknownError("a string in a message that is made")
+            first, last = self._span(node.base.type, node.number)
+            made = isinstance(node.type, kinds.Record | kinds.Vector)
+            return view[first:last] if made else self._decoded(view[first], node.type)
+        if not isinstance(view, _View) or not isinstance(node.base.type, kinds.Record):
+            raise UnknownError("a part of a value")
+        before = self._values.fields(node.base.type)[: node.number]
+        return self._part(view, sum(map(self._size, before)), node.type)
+
+    def _part(self, view: _View, offset: Term | int, kind: Type) -> Any:
+        """What stands so many bytes behind the beginning of a value."""
+        start = view.start + offset
+        if isinstance(kind, kinds.Record):
+            return _View(view.message, start, integer(1, 64))
+        if isinstance(kind, kinds.Vector) and kind.length is not None:
+            return _View(view.message, start, integer(kind.length, 64))
+        return self._number(view.message, z3.Extract(31, 0, start), kind)
+
+    def _copy(self, node: nodes.Copy, state: State) -> Any:
+        view, kind = self._value(node.value, state), node.type
+        if isinstance(view, tuple):
+            self._pay_arrays(kind, state)
+            return view
+        if isinstance(kind, kinds.Vector) and struct_code(kind.element) is not None:
+            self._make(view.count * self._values.width(kind.element), state)
+        elif not isinstance(kind, kinds.Record) or any(
+            not struct_code(field) for field in self._values.fields(kind)
+        ):
+            raise UnknownError(f"a copy of type {kind}")
+        return view
+
+    def _pay_arrays(self, kind: Type, state: State) -> None:
+        """A copy costs what its arrays take."""
+        parts: Sequence[Type] = self._values.fields(kind) if isinstance(kind, kinds.Record) else ()
+        if isinstance(kind, kinds.Vector):
+            length = kind.length or 0
+            self._make(integer(length * self._values.width(kind.element), 64), state)
+            parts = [kind.element] * length
+        for part in parts:
+            self._pay_arrays(part, state)
+
+    def _call(self, node: nodes.Call, state: State) -> Any:
+        name, arguments = node.function, node.arguments
+        if name in ("a_part",):
+            return self._with_part(node, state)
+        if name in ("a_slot", "a_put"):
+            return self._change(node, state)
+        values = [self._value(argument, state) for argument in arguments]
+        kind = arguments[0].type if arguments else kinds.VOID
+        if name in _OF_VIEWS and isinstance(values[0], _View):
+            return _OF_VIEWS[name](values[0].count)
+        if name == "l_element" and isinstance(values[0], _View) and isinstance(kind, kinds.Vector):
+            index = values[1]
+            self._leave_to_python(state, z3.UGE(index, values[0].count))
+            return self._part(values[0], index * self._size(kind.element), node.type)
+        rounded = name.removesuffix("f") if kind == kinds.Floating(32) else name
+        if (
+            isinstance(kind, kinds.Floating)
+            and rounded in _ROUNDED
+            and (rounded != name) == (kind.bits == 32)
+        ):
+            return _ROUNDED[rounded](values[0])
+        if isinstance(kind, kinds.Floating) and name in _QUESTIONS:
+            return _QUESTIONS[name](values[0])
+        if name in ("h_min", "h_max"):
+            return self._chosen(
+                _compared("<" if name == "h_min" else ">", values[1], values[0], kind), values
+            )
+        if name in ("h_fmin", "h_fmax") and kind == kinds.Floating(64):
+            less = (z3.fpLT if name == "h_fmin" else z3.fpGT)(values[1], values[0])
+            return self._chosen(either(z3.fpIsNaN(values[0]), less), values)
+        if name in _OF_MOMENTS:
+            value = _OF_MOMENTS[name](self, values[0])
+            if isinstance(node.type, kinds.Integer) and width(node.type) == 32:
+                return z3.Extract(31, 0, value)
+            return value
+        if name in ("k_after", "k_before"):
+            return values[0] + values[1] if name == "k_after" else values[0] - values[1]
+        raise UnknownError(name.partition("_")[2])
+
+    def _chosen(self, second: Term, values: Sequence[Term]) -> Term:
+        return z3.If(second, values[1], values[0])
+
+    def _with_part(self, node: nodes.Call, state: State) -> Term:
+        moment, part, new = node.arguments
+        assert isinstance(part, nodes.Literal)  # noqa: S101  the name of a part
+        old = self._value(moment, state)
+        value = self._converted(self._value(new, state), new.type, kinds.Integer(64, True, "long"))
+        seconds, rest = self._parts(old)
+        one, other = (value, rest) if part.value == b"sec" else (seconds, value)
+        return self._of_parts(node.type, one, other, state)
+
+    def _invoke(self, node: nodes.Invoke, state: State) -> Any:
+        if node.depth is not None:
+            raise UnknownError("recursion")
+        function = self._functions[node.function]
+        values = [self._value(argument, state) for argument in node.arguments]
+        outer = self._frame, self._shared, self._returned, self._context
+        self._calls += 1
+        self._frame, self._shared, self._returned = self._calls, function.shared, []
+        self._context = function.context
+        state.slots |= {
+            (self._frame, name): value for name, value in zip(function.parameters, values, strict=False)
+        }
+        inner = state.where(z3.BoolVal(True))
+        try:
+            self._block(function.body, inner)
+            ends = [*self._returned, (inner, None)]
+        finally:
+            self._frame, self._shared, self._returned, self._context = outer
+        ends = [(end, value) for end, value in ends if not z3.is_false(end.alive)]
+        if not ends:
+            state.alive = z3.BoolVal(False)
+            return MIXED
+        end, result = ends[-1]
+        for before, value in ends[-2::-1]:
+            result = choice(before.alive, value, result)
+            end = State(either(before.alive, end.alive), merged(before.alive, before, end))
+        state.alive, state.slots = end.alive, end.slots
+        return result
+
+
+def _compared(operator: str, left: Term, right: Term, kind: Type) -> Term:
+    """A comparison of numbers, truths or times."""
+    if isinstance(kind, kinds.Bool) and operator not in ("==", "!="):
+        left, right = map(as_bits, (left, right))
+    if isinstance(kind, kinds.Floating):
+        result: Term = _COMPARED_FLOATS[operator](left, right)
+        return opposite(result) if operator == "!=" else result
+    return (_COMPARED if is_signed(kind) else _COMPARED_UNSIGNED)[operator](left, right)
+
+
+_COMPARED: Mapping[str, Callable[[Term, Term], Term]] = MappingProxyType(
+    {
+        "==": lambda left, right: left == right,
+        "!=": lambda left, right: opposite(left == right),
+        "<": lambda left, right: left < right,
+        ">": lambda left, right: left > right,
+        "<=": lambda left, right: left <= right,
+        ">=": lambda left, right: left >= right,
+    }
+)
+_COMPARED_UNSIGNED = MappingProxyType(
+    {**_COMPARED, "<": z3.ULT, ">": z3.UGT, "<=": z3.ULE, ">=": z3.UGE},
+)
+_COMPARED_FLOATS = MappingProxyType(
+    {"==": z3.fpEQ, "!=": z3.fpEQ, "<": z3.fpLT, ">": z3.fpGT, "<=": z3.fpLEQ, ">=": z3.fpGEQ}
+)
+_OF_INTEGERS: Mapping[str, Callable[[Term, Term], Term]] = MappingProxyType(
+    {
+        "+": lambda left, right: left + right,
+        "-": lambda left, right: left - right,
+        "*": lambda left, right: left * right,
+        "&": lambda left, right: left & right,
+        "|": lambda left, right: left | right,
+        "^": lambda left, right: left ^ right,
+    }
+)
+_OF_FLOATS = MappingProxyType({"+": z3.fpAdd, "-": z3.fpSub, "*": z3.fpMul, "/": z3.fpDiv})
+_OF_VIEWS: Mapping[str, Callable[[Term], Term]] = MappingProxyType(
+    {"l_len": lambda count: count, "l_empty": lambda count: count == 0, "l_last": lambda count: count - 1}
+)
+_ROUNDED: Mapping[str, Callable[[Term], Term]] = MappingProxyType(
+    {
+        "h_sqrt": lambda value: z3.fpSqrt(NEAREST, value),
+        "h_fabs": z3.fpAbs,
+        "h_floor": lambda value: z3.fpRoundToIntegral(z3.RTN(), value),
+        "h_ceil": lambda value: z3.fpRoundToIntegral(z3.RTP(), value),
+        "h_trunc": lambda value: z3.fpRoundToIntegral(z3.RTZ(), value),
+        "h_rint": lambda value: z3.fpRoundToIntegral(NEAREST, value),
+        "h_nearbyint": lambda value: z3.fpRoundToIntegral(NEAREST, value),
+    }
+)
+_QUESTIONS: Mapping[str, Callable[[Term], Term]] = MappingProxyType(
+    {
+        "h_isnan": z3.fpIsNaN,
+        "h_isinf": z3.fpIsInf,
+        "h_isfinite": lambda value: opposite(either(z3.fpIsNaN(value), z3.fpIsInf(value))),
+    }
+)
+_OF_MOMENTS: Mapping[str, Callable[[Meaning, Term], Term]] = MappingProxyType(
+    {
+        "m_is_zero": lambda _, value: value == 0,
+        "m_whole": lambda _, value: value,
+        "m_sec": lambda meaning, value: meaning._parts(value)[0],
+        "m_nsec": lambda meaning, value: meaning._parts(value)[1],
+    }
+)
+
+_STATEMENTS: Mapping[type[Any], Callable[[Meaning, Any, State], None]] = nodes.methods_of(
+    Meaning, nodes.Statement
+)
+_EXPRESSIONS: Mapping[type[Any], Callable[[Meaning, Any, State], Any]] = nodes.methods_of(
+    Meaning, nodes.Expression
+)

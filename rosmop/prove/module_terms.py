@@ -1,0 +1,553 @@
+"""What a function of a module does, as terms: its instructions, as the standard of WebAssembly defines them.
+
+Three kinds of places are known, and an address that is none of them is a difference:
+
+- cells, 8 bytes each at constant addresses: variables, budgets, times, and where the log ends (`UNDO`);
+- the message, from the address that the function is handed: everything that is read or written is within its size;
+- messages that are made, kept or published, and what says whether one may be, at constant addresses;
+- what is put out, in order;
+- the log, by which a message that is left is put back: whatever is written into the message was noted there before,
+  address, size and the bytes that stood there, and a note is never written again.
+
+Of strings that variables keep, and of constant ones, nothing is known but where they are: who looks at them is not
+proved.
+
+What the function has left (`ELSEWHERE`) and a trap are the same: the walk takes back what was begun.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+import z3
+
+from rosmop.prove.decoding import Code, Instruction
+from rosmop.prove.terms import (
+    AT,
+    DOUBLE,
+    FRAME,
+    MIXED,
+    NEAREST,
+    SINGLE,
+    DiffersError,
+    NotProvedError,
+    State,
+    Term,
+    as_bits,
+    both,
+    choice,
+    either,
+    floating,
+    integer,
+    merged,
+    number_at,
+    opposite,
+    with_number,
+)
+
+POSITION, UNDO, SAID = 0, 8, 12
+"""Where the frame, the end of the log and that of the lines stand."""
+
+_ENTRY = 16  # bytes of a note: address, size (4 bytes each), what stood there
+_MESSAGE, _NOTE, _LINES, _MADE = "message", "note", "lines", "made"
+_SORTS: Mapping[str, Any] = MappingProxyType(
+    {"i32": z3.BitVecSort(32), "i64": z3.BitVecSort(64), "f32": SINGLE, "f64": DOUBLE}
+)
+
+
+@dataclass(frozen=True)
+class Pointer:
+    """An address: so many bytes behind the beginning of the message, or of what is added to the log."""
+
+    place: str
+    offset: Term
+
+
+@dataclass(frozen=True)
+class _Note:
+    """The last note of the log, and where it was made."""
+
+    alive: Term
+    position: Term
+    size: int
+    old: Term
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a function of an event has done. `bits` are those that it returns, where it has not `trapped`; `outside`:
+    it looks at what is not the message's.
+    """
+
+    trapped: Term
+    outside: Term
+    bits: Term
+    message: Term
+    cells: Mapping[int, Term]
+    stored: frozenset[int]
+    lines: Term
+    said: Term
+    slots: Mapping[Any, Any]
+
+
+class Execution:
+    """One event's function, by its number, begun with these cells (truths are numbers, too).
+
+    `strings` are the addresses of strings, and of the cells that say where they are; `messages` those of messages that
+    are made or kept, and of what says whether one may be published; what stands there is `made`.
+    """
+
+    def __init__(  # noqa: PLR0917  as `done` names them
+        self,
+        functions: Sequence[Code],
+        number: int,
+        message: Term,
+        size: Term,
+        cells: Mapping[int, Term],
+        strings: Sequence[range] = (),
+        messages: Sequence[range] = (),
+        made: Term = None,
+    ) -> None:
+        self._functions = functions
+        self._strings = strings
+        self._messages = messages
+        self._size = size
+        self._trapped: list[Term] = []
+        self._outside: list[Term] = []
+        self._stored: set[int] = set()
+        self._frames = 0
+        self._frame = 0
+        self._returned: list[tuple[State, Term]] = []
+        slots: dict[Any, Any] = {
+            _MESSAGE: message,
+            _LINES: z3.Array("lines", z3.BitVecSort(32), z3.BitVecSort(8)),
+        }
+        slots |= {("cell", UNDO): Pointer("log", integer(0, 32))}
+        slots |= {
+            ("cell", SAID): Pointer("lines", integer(0, 32)),
+            ("cell", POSITION): FRAME,
+        }
+        slots |= {
+            (_MADE, address): z3.Select(made, integer(address, 32))
+            for message in messages
+            for address in message
+        }
+        slots |= {("cell", address): value for address, value in cells.items()}
+        self._state = State(z3.BoolVal(True), slots)
+        self._number = number
+
+    def done(self) -> Done:
+        """What it does. Raises `DiffersError` and `NotProvedError`."""
+        state = self._state
+        bits = _bits(self._call(self._number, [Pointer("message", integer(0, 32)), self._size], state))
+        cells = {
+            key[1]: value
+            for key, value in state.slots.items()
+            if isinstance(key, tuple) and key[0] == "cell" and key[1] not in (POSITION, UNDO, SAID)
+        }
+        return Done(
+            either(*self._trapped), either(*self._outside), bits, state.slots[_MESSAGE], cells,
+            frozenset(self._stored), state.slots[_LINES], state.slots["cell", SAID].offset, state.slots,
+        )  # fmt: skip
+
+    def _call(self, number: int, arguments: Sequence[Any], state: State) -> Any:
+        """The value of a function; the state goes on behind it."""
+        code = self._functions[number]
+        self._frames += 1
+        outer = self._frame, self._returned
+        self._frame, self._returned = self._frames, []
+        zeros = [integer(0, 32) if kind == "i32" else integer(0, 64) if kind == "i64" else floating(0.0, int(kind[1:]))
+                 for kind in code.made]  # fmt: skip
+        inner = state.where(z3.BoolVal(True))
+        inner.slots |= {(self._frame, place): value for place, value in enumerate([*arguments, *zeros])}
+        stack: list[Any] = []
+        self._run(code.body, inner, stack)
+        ends = [*self._returned, *([] if z3.is_false(inner.alive) else [(inner, stack[-1])])]
+        self._frame, self._returned = outer
+        if not ends:
+            state.alive = z3.BoolVal(False)
+            return integer(0, 32)
+        end, result = ends[-1]
+        for before, value in ends[-2::-1]:
+            result = choice(before.alive, value, result)
+            end = State(either(before.alive, end.alive), merged(before.alive, before, end))
+        state.alive, state.slots = end.alive, end.slots
+        return result
+
+    def _run(self, instructions: Sequence[Instruction], state: State, stack: list[Any]) -> None:
+        for instruction in instructions:
+            if z3.is_false(state.alive):
+                return
+            family, _, rest = instruction.name.partition(".")
+            if instruction.name in ("block", "loop", "br", "br_if"):
+                raise NotProvedError("not loop-free")
+            method = _CONTROL.get(instruction.name)
+            if method is not None:
+                method(self, instruction, state, stack)
+            elif rest.startswith("load"):
+                stack.append(self._load(family, rest[4:], instruction.operands[0], stack.pop(), state))
+            elif rest.startswith("store"):
+                value = stack.pop()
+                self._store(family, rest[5:], instruction.operands[0], stack.pop(), value, state)
+            else:
+                if rest.startswith(("div_", "rem_")):
+                    self._divides(rest, state, stack)
+                stack.append(_calculated(family, rest, instruction.operands, stack))
+
+    def _divides(self, name: str, state: State, stack: Sequence[Any]) -> None:
+        """A division traps by zero, and where the quotient is too large."""
+        left, right = _bits(stack[-2]), _bits(stack[-1])
+        traps = right == 0
+        if name == "div_s":
+            traps = either(traps, both(right == -1, left == 1 << left.size() - 1))
+        self._trapped.append(both(state.alive, traps))
+        state.require(opposite(traps))
+
+    # Control
+
+    def _if(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+        test = _truth(stack.pop())
+        yes, no = state.where(test), state.where(opposite(test))
+        one: list[Any] = []
+        other: list[Any] = []
+        self._run(instruction.body, yes, one)
+        self._run(instruction.otherwise, no, other)
+        state.join(test, yes, no)
+        values = [branch[-1] if branch and not z3.is_false(end.alive) else None
+                  for branch, end in ((one, yes), (other, no))]  # fmt: skip
+        if any(value is not None for value in values):
+            stack.append(choice(test, *values))
+
+    def _unreachable(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+        self._trapped.append(state.alive)
+        state.alive = z3.BoolVal(False)
+
+    def _return(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+        self._returned.append((state.where(z3.BoolVal(True)), stack[-1]))
+        state.alive = z3.BoolVal(False)
+
+    def _called(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+        number = int(instruction.operands[0])
+        count = len(self._functions[number].parameters)
+        arguments = stack[len(stack) - count :]
+        del stack[len(stack) - count :]
+        stack.append(self._call(number, arguments, state))
+
+    def _drop(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+        stack.pop()
+
+    def _select(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+        test, no, yes = _truth(stack.pop()), stack.pop(), stack.pop()
+        stack.append(choice(test, yes, no))
+
+    def _get(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+        value = state.slots[self._frame, instruction.operands[0]]
+        if value is MIXED:
+            raise NotProvedError("uses a variable for an address and a number")
+        stack.append(value)
+
+    def _set(self, instruction: Instruction, state: State, stack: list[Any]) -> None:
+        state.slots[self._frame, instruction.operands[0]] = stack.pop()
+
+    # Memory
+
+    def _load(self, family: str, how: str, offset: float, address: Any, state: State) -> Any:
+        bits = int(family[1:])
+        if isinstance(address, Pointer):
+            if address.place != "message":
+                raise DiffersError("it reads its own log")
+            size = int(how.partition("_")[0] or bits) // 8
+            value = number_at(state.slots[_MESSAGE], self._within(address, int(offset), size, state), size)
+            return _loaded(value, family, how)
+        size = int(how.partition("_")[0] or bits) // 8
+        place = self._cell(address, int(offset), size)
+        if self._is_made(place):
+            return _loaded(made_at(state.slots, place, size), family, how)
+        value = state.slots.get(("cell", place))
+        if how or value is None or not _fits(value, family):
+            raise DiffersError(
+                f"it reads {each_name(family, how)} at {place}, where nothing of that kind stands"
+            )
+        return value
+
+    def _store(  # noqa: PLR0917  as the instruction has them
+        self, family: str, how: str, offset: float, address: Any, value: Any, state: State
+    ) -> None:
+        size = int(how or family[1:]) // 8
+        if isinstance(address, Pointer) and address.place == "lines":
+            place = address.offset + integer(int(offset), 32)
+            state.slots[_LINES] = with_number(state.slots[_LINES], place, _stored(value, size))
+            return
+        if isinstance(address, Pointer):
+            (self._write if address.place == "message" else self._note)(
+                address, int(offset), size, value, state
+            )
+            return
+        place = self._cell(address, int(offset), size)
+        if self._is_made(place):
+            bits = _stored(value, size)
+            for byte in range(size):
+                state.slots[_MADE, place + byte] = z3.Extract(8 * byte + 7, 8 * byte, bits)
+            self._stored.add(place)
+            return
+        if place == UNDO and not how:
+            self._add_note(value, state)
+            return
+        before = state.slots.get(("cell", place))
+        if how or before is None or not _fits(before, family):
+            raise DiffersError(
+                f"it writes {each_name(family, how)} at {place}, where nothing of that kind stands"
+            )
+        if place == SAID and (not isinstance(value, Pointer) or value.place != "lines"):
+            raise DiffersError("what is put out is noted elsewhere")
+        state.slots["cell", place] = value
+        if place != SAID:
+            self._stored.add(place)
+
+    def _is_made(self, place: int) -> bool:
+        return any(place in message for message in self._messages)
+
+    def _cell(self, address: Any, offset: int, size: int) -> int:
+        """A constant address of what is no string; all of it is in one message, or in none."""
+        number = z3.simplify(_bits(address))
+        known = z3.is_bv_value(number)
+        place = int(number.as_long()) + offset if known else -1
+        if self._messages and not known:
+            raise NotProvedError("uses an element of a message that is made, kept or published")
+        if any((place in message) != (place + size - 1 in message) for message in self._messages):
+            raise DiffersError(f"it looks at {size} bytes at {place}, of which some are a message's")
+        if any(place in string for string in self._strings) or (self._strings and not known):
+            raise NotProvedError("uses a constant string, or a string or vector that is kept or made")
+        if not known:
+            raise DiffersError("it looks at an address that is nowhere in the message")
+        return place
+
+    def _within(self, pointer: Pointer, offset: int, size: int, state: State) -> Term:
+        end = z3.ZeroExt(32, pointer.offset) + integer(offset + size, 64)
+        self._outside.append(both(state.alive, z3.UGT(end, z3.ZeroExt(32, self._size))))
+        return pointer.offset + integer(offset, 32) if offset else pointer.offset
+
+    def _write(self, pointer: Pointer, offset: int, size: int, value: Any, state: State) -> None:
+        position = self._within(pointer, offset, size, state)
+        note, message = state.slots.get(_NOTE), state.slots[_MESSAGE]
+        old = number_at(message, position, size)
+        if (
+            note is None
+            or not note.alive.eq(state.alive)
+            or note.size != size
+            or not _same(note.position, position)
+            or not _same(note.old, old if size == 8 else z3.ZeroExt(64 - 8 * size, old))
+        ):
+            raise DiffersError("it writes bytes of the message that were not noted before")
+        state.slots[_MESSAGE] = with_number(message, position, z3.Extract(8 * size - 1, 0, _bits(value)))
+
+    def _note(self, pointer: Pointer, offset: int, size: int, value: Any, state: State) -> None:
+        """A part of the note that is added next."""
+        begin = state.slots["cell", UNDO].offset
+        part = z3.simplify(pointer.offset + offset - begin)
+        if not z3.is_bv_value(part) or (part.as_long(), size) not in ((0, 4), (4, 4), (8, 8)):
+            raise DiffersError("it writes beside the next note of the log")
+        state.slots["part", part.as_long()] = value
+
+    def _add_note(self, value: Any, state: State) -> None:
+        begin = state.slots["cell", UNDO].offset
+        address, size, old = (state.slots.get(("part", part)) for part in (0, 4, 8))
+        size = size if size is None else z3.simplify(_bits(size))
+        if (
+            not isinstance(value, Pointer)
+            or not _same(value.offset, begin + _ENTRY)
+            or not isinstance(address, Pointer)
+            or size is None
+            or not z3.is_bv_value(size)
+            or old is None
+        ):
+            raise DiffersError("the end of the log is put where no note ends")
+        state.slots[_NOTE] = _Note(state.alive, address.offset, size.as_long(), old)
+        state.slots["cell", UNDO] = value
+        for part in (0, 4, 8):
+            del state.slots["part", part]
+
+
+def made_at(slots: Mapping[Any, Any], place: int, size: int) -> Term:
+    """What so many bytes of a message are that is made or kept, as they are stored together if they were."""
+    every = [slots[_MADE, place + byte] for byte in reversed(range(size))]
+    return z3.simplify(z3.Concat(*every) if size > 1 else every[0])
+
+
+def _loaded(value: Term, family: str, how: str) -> Term:
+    """So many bytes as a number of the machine."""
+    if family in ("f32", "f64"):
+        return z3.fpBVToFP(value, _SORTS[family])
+    missing = int(family[1:]) - value.size()
+    return value if not missing else (z3.SignExt if how.endswith("_s") else z3.ZeroExt)(missing, value)
+
+
+def _stored(value: Any, size: int) -> Term:
+    """A number of the machine, or an address in the message, as so many bytes."""
+    if isinstance(value, Pointer):
+        if value.place != "message":
+            raise DiffersError("it notes an address that is nowhere in the message")
+        value = AT + value.offset
+    elif z3.is_fp(value):
+        value = z3.fpToIEEEBV(value)
+    return z3.Extract(8 * size - 1, 0, _bits(value))
+
+
+def each_name(family: str, how: str) -> str:
+    """What is read or written."""
+    return f"{how.strip('_us') or family[1:]} bits"
+
+
+def _same(one: Term, other: Term) -> bool:
+    """Whether they are plainly the same number; of two simplified terms one may be simpler."""
+    rest = z3.simplify(one - other)
+    return bool(z3.is_bv_value(rest) and rest.as_long() == 0)
+
+
+def _fits(value: Any, family: str) -> bool:
+    """Whether a cell holds values of this type."""
+    return (
+        family == "i32" if isinstance(value, Pointer) or z3.is_bool(value) else value.sort() == _SORTS[family]
+    )
+
+
+def _bits(value: Any) -> Term:
+    """A value as a number."""
+    if isinstance(value, Pointer):
+        raise DiffersError("it calculates with an address")
+    return as_bits(value) if z3.is_bool(value) else value
+
+
+def _truth(value: Any) -> Term:
+    return value if z3.is_bool(value) else opposite(_bits(value) == 0)
+
+
+def _calculated(family: str, name: str, operands: Sequence[float], stack: list[Any]) -> Any:
+    if name == "const":
+        bits = int(family[1:])
+        return integer(int(operands[0]), bits) if family[0] == "i" else floating(operands[0], bits)
+    right = stack.pop()
+    unary = _UNARY.get(f"{family}.{name}") or _UNARY.get(name)
+    if unary is not None and (family[0] == "f" or name not in _FLOATS_ALONE):
+        return unary(right)
+    left = stack.pop()
+    if family == "i32" and name == "add" and (isinstance(left, Pointer) or isinstance(right, Pointer)):
+        pointer, more = (left, right) if isinstance(left, Pointer) else (right, left)
+        return Pointer(pointer.place, pointer.offset + _bits(more))
+    if name == "gt_u" and isinstance(left, Pointer) and left.place == "lines":
+        return z3.FreshBool("full")
+    if family == "i32" and z3.is_bool(left) and z3.is_bool(right) and name in ("and", "or"):
+        return both(left, right) if name == "and" else either(left, right)
+    operation = (_OF_FLOATS if family[0] == "f" else _OF_INTEGERS).get(name)
+    if operation is None:
+        raise NotProvedError(f"uses the instruction {family}.{name}")
+    return operation(_bits(left), _bits(right))
+
+
+def _cut(value: Term, bits: int, *, signed: bool) -> Term:
+    """`trunc_sat`: toward zero; what does not fit is the nearest that does, NaN is 0."""
+    least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    whole = (z3.fpToSBV if signed else z3.fpToUBV)(z3.RTZ(), value, z3.BitVecSort(bits))
+    # Between a limit and the next whole number nothing is cut but to the limit.
+    high, low = z3.fpGEQ(value, floating(most, 64)), z3.fpLEQ(value, floating(least, 64))
+    fitting = z3.If(low, integer(least, bits), z3.If(high, integer(most, bits), whole))
+    return z3.If(z3.fpIsNaN(value), integer(0, bits), fitting)
+
+
+def _converting(to: Callable[..., Term], sort: Any) -> Callable[[Any], Term]:
+    return lambda value: to(NEAREST, _bits(value), sort)
+
+
+def _shifted(operation: Callable[[Term, Term], Term]) -> Callable[[Term, Term], Term]:
+    return lambda value, amount: operation(value, amount & (amount.size() - 1))
+
+
+_CONTROL: Mapping[str, Callable[[Execution, Instruction, State, list[Any]], None]] = MappingProxyType(
+    {
+        "if": Execution._if,
+        "unreachable": Execution._unreachable,
+        "return": Execution._return,
+        "call": Execution._called,
+        "drop": Execution._drop,
+        "select": Execution._select,
+        "local.get": Execution._get,
+        "local.set": Execution._set,
+    }
+)
+
+_FLOATS_ALONE = frozenset({"abs", "neg", "ceil", "floor", "trunc", "nearest", "sqrt"})
+_UNARY: Mapping[str, Callable[[Any], Term]] = MappingProxyType(
+    {
+        "eqz": lambda value: opposite(_truth(value)),
+        "wrap_i64": lambda value: z3.Extract(31, 0, value),
+        "extend_i32_s": lambda value: z3.SignExt(32, _bits(value)),
+        "extend_i32_u": lambda value: z3.ZeroExt(32, _bits(value)),
+        "extend8_s": lambda value: z3.SignExt(24, z3.Extract(7, 0, _bits(value))),
+        "extend16_s": lambda value: z3.SignExt(16, z3.Extract(15, 0, _bits(value))),
+        "reinterpret_f32": z3.fpToIEEEBV,
+        "reinterpret_f64": z3.fpToIEEEBV,
+        "demote_f64": lambda value: z3.fpFPToFP(NEAREST, value, SINGLE),
+        "promote_f32": lambda value: z3.fpFPToFP(NEAREST, value, DOUBLE),
+        **{
+            f"{family}.convert_{source}_{sign}": _converting(to, _SORTS[family])
+            for family in ("f32", "f64")
+            for source in ("i32", "i64")
+            for sign, to in (("s", z3.fpSignedToFP), ("u", z3.fpUnsignedToFP))
+        },
+        **{
+            f"{family}.trunc_sat_f64_{sign}": partial(_cut, bits=int(family[1:]), signed=sign == "s")
+            for family in ("i32", "i64")
+            for sign in ("s", "u")
+        },
+        "abs": z3.fpAbs,
+        "neg": z3.fpNeg,
+        "sqrt": lambda value: z3.fpSqrt(NEAREST, value),
+        "ceil": lambda value: z3.fpRoundToIntegral(z3.RTP(), value),
+        "floor": lambda value: z3.fpRoundToIntegral(z3.RTN(), value),
+        "trunc": lambda value: z3.fpRoundToIntegral(z3.RTZ(), value),
+        "nearest": lambda value: z3.fpRoundToIntegral(NEAREST, value),
+    }
+)
+_OF_INTEGERS: Mapping[str, Callable[[Term, Term], Term]] = MappingProxyType(
+    {
+        "eq": lambda left, right: left == right,
+        "ne": lambda left, right: opposite(left == right),
+        "lt_s": lambda left, right: left < right,
+        "lt_u": z3.ULT,
+        "gt_s": lambda left, right: left > right,
+        "gt_u": z3.UGT,
+        "le_s": lambda left, right: left <= right,
+        "le_u": z3.ULE,
+        "ge_s": lambda left, right: left >= right,
+        "ge_u": z3.UGE,
+        "add": lambda left, right: left + right,
+        "sub": lambda left, right: left - right,
+        "mul": lambda left, right: left * right,
+        "div_s": lambda left, right: left / right,
+        "div_u": z3.UDiv,
+        "rem_s": z3.SRem,
+        "rem_u": z3.URem,
+        "and": lambda left, right: left & right,
+        "or": lambda left, right: left | right,
+        "xor": lambda left, right: left ^ right,
+        "shl": _shifted(lambda left, right: left << right),
+        "shr_s": _shifted(lambda left, right: left >> right),
+        "shr_u": _shifted(z3.LShR),
+    }
+)
+_OF_FLOATS: Mapping[str, Callable[[Term, Term], Term]] = MappingProxyType(
+    {
+        "eq": z3.fpEQ,
+        "ne": lambda left, right: opposite(z3.fpEQ(left, right)),
+        "lt": z3.fpLT,
+        "gt": z3.fpGT,
+        "le": z3.fpLEQ,
+        "ge": z3.fpGEQ,
+        "add": lambda left, right: z3.fpAdd(NEAREST, left, right),
+        "sub": lambda left, right: z3.fpSub(NEAREST, left, right),
+        "mul": lambda left, right: z3.fpMul(NEAREST, left, right),
+        "div": lambda left, right: z3.fpDiv(NEAREST, left, right),
+    }
+)

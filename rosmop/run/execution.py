@@ -1,0 +1,580 @@
+"""What happens to one message, or at one tick or deadline: events, properties, handlers, faults. No I/O, no clock.
+
+The events of a message happen specification by specification, in source order. After the action of an event that did
+not drop the message, every property of its specification steps, and the handlers of the categories it is in run.
+What drops the message ends its way; what faults drops it, too, or with `on_fault="pass"` is passed over. Of a
+parametric specification each slice that an event belongs to takes its turn (`slices.py`).
+
+A dropped message has not happened for properties that are formulas (`CompiledProperty.suppresses`): whatever dropped
+it, all of them, of all specifications, take back the steps that they made for it. So the trace that such a property has
+seen is the trace that subscribers saw. Variables, output and the other properties keep what came of the message.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import replace
+from functools import partial
+from math import inf
+from typing import Literal
+
+from rosmop.form.positions import Position
+from rosmop.logics.interface import Categories, RunFaultError
+from rosmop.run.causes import NOBODY, Sender
+from rosmop.run.explain import Bound, of_slice
+from rosmop.run.faults import explain
+from rosmop.run.interpreter import Interpreter
+from rosmop.run.monitor import Handler, Monitor, RunningProperty, Step
+from rosmop.run.outcomes import DROPPED, Fault, Outcome, Verdict
+from rosmop.run.slices import Key, Slice, Slices
+from rosmop.runtime.context import FOLDED_NS, LogLine
+from rosmop.runtime.wire import Buffer, Message
+
+OnFault = Literal["drop", "pass"]
+Asked = Callable[[Verdict, int], bool]
+
+EXPLAINED = 3
+"""Verdicts of slices that are explained of those which one message, or one go of deadlines, brings about: each takes a
+millisecond.
+"""
+
+SLICE_SECONDS = 50e-6
+"""Processor time that a message has more for each slice that it concerns."""
+
+TICK_BUDGET = 2_000
+"""Instructions that a slice may spend on a tick that concerns several."""
+
+
+class Execution:
+    """Carries out what compiled specifications say, on the state that their monitors have."""
+
+    def __init__(self, interpreter: Interpreter, on_fault: OnFault) -> None:
+        self.on_fault: OnFault = on_fault
+        self.asked: Asked | None = None
+        """Which verdicts to explain: by themselves and the source of the message; None: all."""
+        self._interpreter = interpreter
+        self._turn = interpreter.turn
+        self._sender = NOBODY
+        self._bound: Bound | None = None
+        self._explains = True
+        self._taking_back: dict[int, Callable[[], None]] = {}
+        """What takes back the steps for the message at hand, by the run or slice that made them."""
+        self._trailed: dict[Monitor, int] = {}
+        """How many entries the message at hand has in trails."""
+        self._copies = False
+        """Whether what happens in a slice may be taken back."""
+        self._passed: int | None = None
+        """The deadline of a slice that passes now."""
+
+    def begin(self, monitors: Sequence[Monitor], time_ns: int) -> Outcome:
+        """Constants, first values, `init`: each for all before the next, as one may read another's variables."""
+        outcome = Outcome(time=time_ns)
+        self._turn.now, self._turn.until = time_ns, inf  # operators wait for it; instructions bound it
+        for monitor in monitors:
+            monitor.context.begin()
+            for running in monitor.properties:
+                running.begin(time_ns)
+        self._begin_variables(monitors, outcome)
+        for monitor in monitors:
+            if monitor.slices is not None:
+                codes = [running.code for running in monitor.properties]
+                monitor.slices.begin(codes, tuple(running.run for running in monitor.properties))
+        self.collect(outcome)
+        return outcome
+
+    def message(self, steps: Sequence[Step], buffer: Buffer, outcome: Outcome, sender: Sender) -> None:
+        """Let the events of a message happen that is received at the time of the outcome; at least one step."""
+        steps[0].monitor.come_home()
+        steps[0].monitor.touch()
+        self._turn.now = outcome.time
+        self._turn.begin()
+        self._sender = sender
+        self._taking_back.clear()
+        self._trailed.clear()
+        message = Message(buffer, outcome.time)
+        writers: tuple[tuple[Step, Sequence[int]], ...] = ()
+        for step in steps:
+            if step.first:
+                monitor = step.monitor
+                monitor.context.begin()
+                if (not monitor.seen or monitor.held) and self._first(monitor, message, outcome):
+                    outcome.dropped_by = monitor.name
+                    break
+            if (self._happen if step.key is None else self._happen_in_slices)(step, message, outcome):
+                outcome.dropped_by = step.monitor.name
+                break
+            if message.touched:
+                sites = [site for bit, site in enumerate(message.marks) if message.touched >> bit & 1]
+                message.touched = 0
+                writers = (*writers, (step, sites))
+        self._finish(message, writers, outcome)
+
+    def tick(self, step: Step, time_ns: int) -> Outcome:
+        """Let an event without a topic happen; `collect` is the caller's."""
+        self._sender = NOBODY
+        self._taking_back.clear()
+        step.monitor.come_home()
+        step.monitor.touch()
+        outcome = Outcome(time=time_ns)
+        outcome.timer = step.name
+        self._turn.now = time_ns
+        self._turn.begin()
+        step.monitor.context.begin()
+
+        def act(outcome: Outcome, message: Message | None) -> bool:
+            outcome.events = (step.name,)
+            try:
+                step.function(message)
+            except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
+                self._fault(error, step.monitor, step.event.position, outcome)
+            else:
+                self._step_properties(step, message, time_ns, outcome)
+            return False
+
+        if step.monitor.slices is None:
+            act(outcome, None)
+        else:
+            self._bound = Bound(step.index, (), (True,), time_ns, NOBODY, step.event.creates)
+            self._each(step, (True,), None, outcome, act)
+            outcome.events = (step.name,)
+        return outcome
+
+    def expire(self, monitor: Monitor, running: RunningProperty | None, *, explains: bool) -> list[Outcome]:
+        """Let the deadline of a property pass, or (None) the first one of a slice; the outcomes that are told. Where
+        not `explains`, a slice's verdict is not explained.
+        """
+        self._sender, self._bound = NOBODY, None
+        monitor.come_home()
+        monitor.touch()
+        if running is None:
+            assert monitor.slices is not None  # noqa: S101  only they have deadlines of their own
+            self._explains = explains
+            outcomes = self._expire_in_slice(monitor, monitor.slices.due)
+            self._explains = True
+            return outcomes
+        outcome = self._expiry(monitor, running.run.deadline or 0, running)
+        categories = running.history.expire(running.run)
+        self._tell(monitor, running, categories, None, outcome, in_order_told=True)
+        self.collect(outcome)
+        return [outcome]
+
+    def _expiry(self, monitor: Monitor, deadline: int, running: RunningProperty) -> Outcome:
+        """Begin what comes of the deadline of a property."""
+        word = "timeout" if running.code.property.logic == "tfsm" else "deadline"
+        outcome = Outcome(time=deadline)
+        outcome.timer = f"{monitor.name}.{word}"
+        self._turn.now = deadline
+        self._turn.begin()
+        monitor.context.begin()
+        return outcome
+
+    def _expire_in_slice(self, monitor: Monitor, slice_: Slice) -> list[Outcome]:
+        """Let the first deadline of a slice pass. Nothing is told of one that lacks a parameter."""
+        slices = monitor.slices
+        assert slices is not None  # noqa: S101  it has a slice
+        deadline = slice_.deadline or 0
+        number = next(place for place, run in enumerate(slice_.runs) if run.deadline == deadline)
+        running = monitor.properties[number]
+        outcome = self._expiry(monitor, deadline, running)
+
+        def act(outcome: Outcome, _: Message | None) -> bool:
+            self._passed = deadline
+            self._tell(monitor, running, running.run.expire(), None, outcome, in_order_told=True)
+            self._passed = None
+            return False
+
+        whole = slices.is_whole(slice_)
+        (self._in_slice if whole else self._in_seed)(monitor, slice_, outcome, None, act)()
+        self.collect(outcome)
+        return [outcome] if whole else []
+
+    def _catch_up(self, monitor: Monitor, behind: Sequence[Slice], outcome: Outcome) -> None:
+        """Let the deadlines of slices pass that are before a message, where there were too many to pass in time."""
+        turn, go_on = self._turn, monitor.context.put_off()
+        kept = turn.log, turn.published, turn.looked, self._sender, self._bound
+        turn.log, turn.published, turn.looked = [], [], {}
+        before = [*outcome.before]
+        self._sender, self._explains = NOBODY, len(behind) <= EXPLAINED
+        for slice_ in behind:
+            while not slice_.gone and (deadline := slice_.deadline) is not None and deadline < outcome.time:
+                before += self._expire_in_slice(monitor, slice_)
+        outcome.before, turn.now, self._explains = before, outcome.time, True
+        turn.log, turn.published, turn.looked, self._sender, self._bound = kept
+        go_on()
+
+    def warn(self, monitor: Monitor, text: str) -> None:
+        """A line of the monitor's log, for the next `collect`."""
+        self._turn.log.append(LogLine("WARN", text, monitor.name))
+
+    def collect(self, outcome: Outcome) -> None:
+        """Take what was put out, published and looked at since it was collected last."""
+        turn = self._turn
+        outcome.log, outcome.published, outcome.looked = turn.log, turn.published, turn.looked
+        outcome.sites = self._interpreter.sites
+        turn.log, turn.published, turn.looked = [], [], {}
+
+    # One event
+
+    def _happen(self, step: Step, message: Message, outcome: Outcome) -> bool:
+        """Give the message to an event; whether it was dropped."""
+        try:
+            has_happened = step.function(message)
+        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this action and is recorded
+            if self._interpreter.had_happened(error):
+                outcome.events = (*outcome.events, step.name)
+            self._fault(error, step.monitor, step.event.position, outcome)
+            self._block(message, outcome)
+            return message.dropped
+        if not has_happened:
+            if message.past:
+                self._past(step, message)
+            return False
+        outcome.events = (*outcome.events, step.name)
+        if message.dropped:
+            return True
+        if step.monitor.properties:
+            self._step_properties(step, message, message.time, outcome)
+            return message.dropped
+        return False
+
+    def _happen_in_slices(self, step: Step, message: Message, outcome: Outcome) -> bool:
+        """Give the message to an event of a parametric specification; whether it was dropped."""
+        assert step.key is not None  # noqa: S101  who asks has looked
+        try:
+            found = step.key(message)
+        except Exception as error:  # noqa: BLE001  the bytes are not of its type
+            self._fault(error, step.monitor, step.event.position, outcome)
+            self._block(message, outcome)
+            return message.dropped
+        if not found:
+            if message.past:
+                self._past(step, message)
+            return False
+
+        key = (True,) if found is True else tuple(found)
+        self._bound = Bound(step.index, step.event.binds, key, message.time, self._sender, step.event.creates)
+        slices = step.monitor.slices
+        assert slices is not None  # noqa: S101  who has a key has slices
+        if step.event.plain and (slice_ := slices.at(key)) is not None:
+            self._mark_slice(slices, slice_)
+        if step.event.plain and (happened := slices.step(step.index, key)) is not None:
+            if happened:
+                self._append_to_trail(step.monitor, self._bound)
+                outcome.events = (*outcome.events, step.name)
+            return False
+
+        def act(outcome: Outcome, message: Message | None) -> bool:
+            assert message is not None  # noqa: S101  each has one
+            if not step.event.plain:
+                return self._happen(step, message, outcome)
+            outcome.events = (*outcome.events, step.name)
+            self._step_properties(step, message, message.time, outcome)
+            return message.dropped
+
+        self._each(step, key, message, outcome, act)
+        return message.dropped
+
+    def _each(
+        self,
+        step: Step,
+        key: Key,
+        message: Message | None,
+        outcome: Outcome,
+        act: Callable[[Outcome, Message | None], bool],
+    ) -> None:
+        """Let an event happen in each slice that it belongs to, until one has dropped the message.
+
+        A message whose budget ends on the way has happened in no slice. At a tick each slice has a budget of its own,
+        so that none takes it from others.
+        """
+        monitor, slices, turn = step.monitor, step.monitor.slices, self._turn
+        assert slices is not None  # noqa: S101  who asks has looked
+        found = slices.targets(step.event, key, outcome.time, self._sender.source)
+        if slices.behind:
+            self._catch_up(monitor, slices.behind, outcome)
+            found = slices.targets(step.event, key, outcome.time, self._sender.source)
+        refused, why = slices.refused, slices.why
+        before, earlier, lines, published = (
+            outcome.events, (outcome.verdicts, outcome.faults), len(turn.log), len(turn.published),
+        )  # fmt: skip
+        events, verdicts, faults = before, [*outcome.verdicts], [*outcome.faults]
+        several, reached = len(found) > 1, 0
+        commits: list[Callable[[], None]] = []
+        self._copies = several and message is not None
+        turn.until += SLICE_SECONDS * len(found)
+        for slice_ in found:
+            outcome.events, outcome.verdicts, outcome.faults = before, (), ()
+            self._explains = len(verdicts) < EXPLAINED
+            if several and message is None:
+                turn.begin()
+                monitor.context.begin(TICK_BUDGET)
+            commits.append(self._in_one(step, slice_, outcome, message, act))
+            if several and message is not None and monitor.context.budget < 0:
+                del turn.log[lines:], turn.published[published:]
+                cut = outcome.faults[-1:]
+                outcome.events, (outcome.verdicts, outcome.faults) = before, earlier
+                outcome.faults = (*outcome.faults, *cut)
+                self._copies, self._explains = False, True
+                return
+            faults += outcome.faults
+            verdicts += outcome.verdicts  # many slices: a tuple would be copied with each
+            if outcome.events is not before:
+                reached += 1
+                events = outcome.events if slices.is_whole(slice_) else events
+            if message is None:
+                commits.pop()()
+            elif message.dropped:
+                break
+        self._copies = False
+        for commit in commits:
+            commit()
+        self._explains = True
+        trail = monitor.trail
+        if 0 < reached < len(found) and trail and trail[-1] is self._bound:
+            trail[-1] = self._bound._replace(everywhere=False)
+        outcome.events, outcome.verdicts, outcome.faults = events, tuple(verdicts), tuple(faults)
+        if text := slices.forgotten(outcome.time):
+            self.warn(monitor, text)
+        if refused is not None and (message is None or not message.dropped):
+            self._refuse_slice(step, refused, why, message, outcome)
+
+    def _in_one(
+        self,
+        step: Step,
+        slice_: Slice,
+        outcome: Outcome,
+        message: Message | None,
+        act: Callable[[Outcome, Message | None], bool],
+    ) -> Callable[[], None]:
+        """Let an event happen in a slice; return how the slice takes the state."""
+        slices = step.monitor.slices
+        assert slices is not None  # noqa: S101  it has a slice
+        if message is not None:
+            self._mark_slice(slices, slice_)
+        if (after := slices.quiet(step.index, slice_)) is not None:
+            outcome.events = (*outcome.events, step.name)
+            self._note(step.monitor)
+            return partial(slices.stand, slice_, after)
+        if slices.is_whole(slice_):
+            return self._in_slice(step.monitor, slice_, outcome, message, act)
+        return self._in_seed(step.monitor, slice_, outcome, message, act)
+
+    def _in_seed(
+        self,
+        monitor: Monitor,
+        slice_: Slice,
+        outcome: Outcome,
+        message: Message | None,
+        act: Callable[[Outcome, Message | None], bool],
+    ) -> Callable[[], None]:
+        """Let the event happen in a slice that lacks a parameter, to a copy of the message; leave out its output."""
+        turn, explains = self._turn, self._explains
+        lines, published, looked = len(turn.log), len(turn.published), {**turn.looked}
+        copied = None if message is None else Message(bytes(message.buffer), message.time)
+        self._explains = False
+        commit = self._in_slice(monitor, slice_, outcome, copied, act)
+        self._explains = explains
+        del turn.log[lines:], turn.published[published:]
+        turn.looked, outcome.verdicts, outcome.fatal = looked, (), None
+        return commit
+
+    def _in_slice(
+        self,
+        monitor: Monitor,
+        slice_: Slice,
+        outcome: Outcome,
+        message: Message | None,
+        act: Callable[[Outcome, Message | None], bool],
+    ) -> Callable[[], None]:
+        """Make the slice the state of the monitor and let the event happen; return how the slice takes the state."""
+        slices = monitor.slices
+        assert slices is not None  # noqa: S101  it has a slice
+        for running, run in zip(monitor.properties, slices.select(slice_), strict=True):
+            running.run = copy(run) if self._copies else run
+        before, monitor.slice = outcome.events, slice_
+        act(outcome, message)
+        runs = tuple(running.run for running in monitor.properties)
+        return partial(slices.settle, slice_, runs, slices.own(), happened=outcome.events is not before)
+
+    def _refuse_slice(
+        self,
+        step: Step,
+        binding: Mapping[str, object],
+        why: str,
+        message: Message | None,
+        outcome: Outcome,
+    ) -> None:
+        """There can be no slice of what an event binds: that is a fault."""
+        monitor = step.monitor
+        monitor.faults += 1
+        text = f"{why}: {step.name} is not monitored for this binding"
+        outcome.faults = (*outcome.faults, Fault(monitor.name, step.event.position, text, binding))
+        self._block(message, outcome)
+
+    def _finish(
+        self, message: Message, writers: tuple[tuple[Step, Sequence[int]], ...], outcome: Outcome
+    ) -> None:
+        turn = self._turn
+        if turn.log or turn.published or turn.looked:
+            self.collect(outcome)
+        if message.dropped:
+            self._take_back()
+            outcome.result = "dropped"
+            outcome.overwritten = message.overwritten
+            if outcome.fatal is not None:
+                outcome.dropped_at = outcome.fatal.position
+            elif message.cause is not None:
+                outcome.dropped_at = self._interpreter.sites[message.cause].position
+        elif message.changed:
+            outcome.result = "changed"
+            outcome.buffer = message.buffer
+            sites = self._interpreter.sites
+            outcome.changed_by = tuple([step.name for step, _ in writers])
+            outcome.changed_at = tuple([sites[site].position for _, at in writers for site in at])
+
+    def _first(self, monitor: Monitor, message: Message, outcome: Outcome) -> bool:
+        """A message for a monitor that has seen none yet, or that holds its topics; whether it was dropped."""
+        if monitor.held:
+            why = f" ({monitor.why_held})" if monitor.why_held else ""
+            outcome.reason = f"{monitor.name} holds its topics until it is resumed{why}"
+        elif monitor.broken and self.on_fault == "drop":
+            outcome.reason = f"{monitor.name} could not begin: its first values or `init` faulted"
+        if outcome.reason is not None:
+            outcome.dropped_at = monitor.code.position
+            message.dropped = True
+            return True
+        monitor.seen = True
+        for timer in monitor.timers:
+            if not timer.ticked:
+                timer.due = message.time + timer.period
+        return False
+
+    def _note(self, monitor: Monitor) -> None:
+        """Keep what the event has bound, which has happened in a slice."""
+        if self._bound is not None and (not monitor.trail or monitor.trail[-1] is not self._bound):
+            self._append_to_trail(monitor, self._bound)
+
+    def _step_properties(self, step: Step, message: Message | None, time_ns: int, outcome: Outcome) -> None:
+        if step.monitor.slices is not None:
+            self._note(step.monitor)
+        for running in step.monitor.properties:
+            try:
+                if step.monitor.slices is None:
+                    if running.code.property.suppresses and id(running.run) not in self._taking_back:
+                        self._taking_back[id(running.run)] = running.mark()
+                    categories = running.history.step(running.run, step.index, time_ns, self._sender)
+                else:
+                    categories = running.run.step(step.index, time_ns)
+            except RunFaultError as error:
+                self._fault(error, step.monitor, running.code.property.source.origin, outcome)
+                self._block(message, outcome)
+                continue
+            if categories:
+                self._tell(step.monitor, running, categories, message, outcome)
+
+    def _mark_slice(self, slices: Slices, slice_: Slice) -> None:
+        if slices.suppresses and id(slice_) not in self._taking_back:
+            self._taking_back[id(slice_)] = slices.mark(slice_)
+
+    def _append_to_trail(self, monitor: Monitor, bound: Bound) -> None:
+        monitor.trail.append(bound)
+        self._trailed[monitor] = self._trailed.get(monitor, 0) + 1
+
+    def _take_back(self) -> None:
+        """Undo what the message has done to formulas, the last step first."""
+        for take_back in reversed(self._taking_back.values()):
+            take_back()
+        for monitor, entries in self._trailed.items():
+            for place in range(max(-entries, -len(monitor.trail)), 0):
+                monitor.trail[place] = monitor.trail[place]._replace(passed=False)
+
+    def _tell(
+        self,
+        monitor: Monitor,
+        running: RunningProperty,
+        categories: Categories,
+        message: Message | None,
+        outcome: Outcome,
+        *,
+        in_order_told: bool = False,
+    ) -> None:
+        """Run the handlers of these categories, in source order (after a deadline: in the order they are told)."""
+        handlers = [(category, handler) for category, handler in running.handlers if category in categories]
+        if in_order_told:
+            handlers.sort(key=lambda pair: categories.index(pair[0]))
+        self._turn.reset = False
+        for category, handler in handlers:
+            verdict = self._verdict(monitor, running, category)
+            outcome.verdicts = (*outcome.verdicts, verdict)
+            published, dropped = len(self._turn.published), message is not None and message.dropped
+            self._handle(monitor, handler, message, running, outcome)
+            made = [*range(published, len(self._turn.published))]
+            if message is not None and message.dropped and not dropped:
+                made.append(DROPPED)
+            if made:
+                outcome.handling = {**outcome.handling, **dict.fromkeys(made, verdict)}
+        if self._turn.reset:
+            running.begin(self._turn.now)
+
+    def _verdict(self, monitor: Monitor, running: RunningProperty, category: str) -> Verdict:
+        source, index = running.code.property.source, running.index
+        slices, slice_ = monitor.slices, monitor.slice
+        binding = {} if slices is None or slice_ is None else slices.binding(slice_)
+        verdict = Verdict(monitor.name, index, source.logic, category, source, binding=binding)
+        if self.asked is not None and not self.asked(verdict, self._sender.source):
+            return verdict
+        if self._turn.late():
+            return verdict
+        if slices is None or slice_ is None:
+            return replace(verdict, why=running.history.explain(category))
+        if not self._explains:
+            return verdict
+        why = of_slice(running.code.property, monitor.trail, slices.values(slice_), category, self._passed)
+        return replace(verdict, why=why)
+
+    def _handle(
+        self,
+        monitor: Monitor,
+        handler: Handler,
+        message: Message | None,
+        running: RunningProperty,
+        outcome: Outcome,
+    ) -> None:
+        try:
+            handler(message)
+        except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of this handler and is recorded
+            self._fault(error, monitor, running.code.property.source.origin, outcome)
+            self._block(message, outcome)
+
+    def _block(self, message: Message | None, outcome: Outcome) -> None:
+        """What the last fault does to the message."""
+        if message is not None and self.on_fault == "drop":
+            message.dropped = True
+            outcome.fatal = outcome.faults[-1]
+
+    def _fault(self, error: Exception, monitor: Monitor, otherwise: Position, outcome: Outcome) -> None:
+        fault: Fault = explain(error, self._interpreter, monitor.name, otherwise)
+        monitor.faults += 1
+        outcome.faults = (*outcome.faults, fault)
+
+    def _past(self, step: Step, message: Message) -> None:
+        """Count an event that did not happen, and tell it once in a while."""
+        step.past += 1
+        now = message.time
+        if step.told is None or now - step.told >= FOLDED_NS:
+            _, index, count = message.past or (0, 0, 0)
+            times = "" if step.past == 1 else f" ({step.past} times)"
+            text = f"{step.name} did not happen: index {index} is past the end of {count} elements{times}"
+            self.warn(step.monitor, text)
+            step.told, step.past = now, 0
+        message.past = None
+
+    def _begin_variables(self, monitors: Sequence[Monitor], outcome: Outcome) -> None:
+        beginning = list(monitors)
+        for stage in range(3):
+            for monitor in tuple(beginning):
+                try:
+                    self._interpreter.function(monitor.code.start[stage])()
+                except Exception as error:  # noqa: BLE001  whatever it is, it is a fault of its beginning and is recorded
+                    self._fault(error, monitor, monitor.code.position, outcome)
+                    monitor.broken = True
+                    beginning.remove(monitor)

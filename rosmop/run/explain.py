@@ -1,0 +1,459 @@
+"""What made a verdict: of the events so far as few as give it alone, and who sent the messages that they were.
+
+Theory of operation:
+
+1. Of a property with tables (`Exits`) it is kept for each state by which event it was left last. From the initial state
+   these lead to the present one, and each is later than the one before: the events so far without all that came back
+   to where it had been. So nothing is cut, however long the trace; and since what happened before `__RESET;` is not on
+   the way, it need not be forgotten either. The module keeps the same, in the same place.
+2. Of the others (`Steps`; with a clock `ClockedSteps`, which the module keeps, too) the last events are kept, and the
+   run as it was before them. Where they give the verdict to a run that begins anew they explain it alone; where not,
+   only to the run as it was before them, and that is said (`Explanation.since`). A run about the future cannot be
+   copied; of it more events are kept, and it knows at which of them the formula is what was told: from there on they
+   are enough, unless the formula looks back, too. Where they are not, nothing explains it.
+3. Of a parametric specification the last `TRAIL` events are kept with what they bound; those of the slice explain its
+   verdict alone, or nothing does.
+4. An explanation is found by trying: what is named has given the verdict.
+"""
+
+import copy
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from rosmop.logics.automaton import Automaton
+from rosmop.logics.bounded import BoundedRun
+from rosmop.logics.interface import (
+    Categories,
+    ClockedProperty,
+    ClockedRun,
+    CompiledProperty,
+    FiniteProperty,
+    Run,
+    RunFaultError,
+)
+from rosmop.run.causes import NOBODY, Explanation, Happened, Sender
+
+TRAIL = 4096
+"""Events that are kept of a parametric specification, of all its slices together."""
+
+KEPT = 64
+"""Of so many events, and as many more at most, what happened is kept where there are no tables."""
+
+FUTURE_KEPT = 1024
+"""The same of `mtl` about the future."""
+
+ENTRY = struct.Struct("<qqI4x")
+"""How a state was left: time (ns); `Sender.source`, `Sender.kind` (from bit 24) and the event; `Sender.number`."""
+
+RUNS, RING = 4, 256
+"""Of a property with a clock: runs and steps that are kept, twice as many as are asked for. So what the module notes of
+a message that it leaves overwrites nothing that counts.
+"""
+
+_COUNT = struct.Struct("<q")
+_RUN = struct.Struct("<qqq")
+_EVENT = 0xFFFFFF
+_LONGEST = 300  # ways through an automaton that are shortened
+_MOST_STEPS = 5_000  # that are tried for one explanation: some milliseconds
+_DEADLINE = -1
+
+CLOCKED_ROOM = _COUNT.size + _RUN.size * RUNS + ENTRY.size * RING
+"""Bytes of `ClockedSteps.room`."""
+
+
+class Bound(NamedTuple):
+    """An event of a parametric specification that happened: which parameters (by number) it bound, and to what (`key`
+    has True before the values).
+
+    `creates`: a slice may begin with it. `everywhere`: it happened in each slice that it belongs to; a `when` may look
+    at what slices differ in, and what one has dropped comes to no other. `passed`: its message was not dropped.
+    """
+
+    event: int
+    binds: tuple[int, ...]
+    key: tuple[Any, ...]
+    time: int
+    sender: Sender
+    creates: bool
+    everywhere: bool = True
+    passed: bool = True
+
+
+class Exits:
+    """How each state of an automaton was left last, in `room` (`ENTRY` for each state), whose `owner` lives as long."""
+
+    def __init__(self, automaton: Automaton) -> None:
+        self._automaton = automaton
+        self._last = 0, 0, NOBODY
+        self._at = automaton.initial
+        self.room = memoryview(bytearray(ENTRY.size * len(automaton)))
+        self.owner: object = None
+
+    def step(self, run: Any, event: int, time_ns: int, sender: Sender) -> Categories:
+        """Let the run take the event."""
+        self._at = state = run.state
+        self._last = event, time_ns, sender
+        categories: Categories = run.step(event, time_ns)
+        if run.state != state:
+            source, number, kind = sender
+            who = source << 32 | kind << 24 | event
+            ENTRY.pack_into(self.room, ENTRY.size * state, time_ns, who, number & 0xFFFFFFFF)
+        return categories
+
+    def expire(self, run: Run) -> Categories:
+        """Let the deadline of the run pass."""
+        return run.expire()
+
+    def begin(self, time_ns: int) -> None:
+        """What happened before stays on no way: it need not be forgotten."""
+
+    def mark(self) -> None:
+        """Nothing: how the present state was left is on no way, so a step taken back need not be forgotten."""
+
+    def take_back(self, mark: object) -> None:
+        """As `mark`."""
+
+    def move(self, owner: object, room: memoryview) -> None:
+        """Keep it from now on where the owner has it."""
+        self.room, self.owner = room[: len(self.room)], owner
+
+    def forget(self, run: Any, _time_ns: int) -> None:
+        """The run goes on from where another process left it: nothing is known of how it got there."""
+        self._at = run.state
+        for state in range(len(self._automaton)):
+            ENTRY.pack_into(self.room, ENTRY.size * state, 0, _EVENT, 0)
+
+    def follow(self, earlier: "Exits | Steps") -> "Exits":
+        """Go on from what another has kept of the same property."""
+        assert isinstance(earlier, Exits)  # noqa: S101  it has the same tables
+        self.room[:] = bytes(earlier.room)
+        return self
+
+    def explain(self, category: str) -> Explanation | None:
+        """What made the last step's verdict."""
+        way = self._way()
+        if way is None:
+            return None
+        way.append(Happened(*self._last))
+        fewest = len(way) <= _LONGEST
+        return Explanation(self._named(_shortest(self._automaton, way, category) if fewest else way), fewest)
+
+    def _way(self) -> list[Happened] | None:
+        """From the initial state to where the last step began."""
+        found: list[Happened] = []
+        state = self._automaton.initial
+        while state != self._at:
+            time, who, number = ENTRY.unpack_from(self.room, ENTRY.size * state)
+            if (
+                who & _EVENT == _EVENT
+                or len(found) == len(self._automaton)
+                or (found and time < found[-1].time)
+            ):
+                return None
+            sender = Sender(who >> 32, number, who >> 24 & 0xFF)
+            found.append(Happened(who & 0xFFFFFF, time, sender))
+            state = self._automaton.table[state][found[-1].event]
+        return found
+
+    def _named(self, way: Sequence[Happened]) -> tuple[Happened, ...]:
+        automaton, state, found = self._automaton, self._automaton.initial, []
+        for event in way:
+            state = automaton.table[state][event.event]
+            found.append(event._replace(state=automaton.names[state]) if automaton.names else event)
+        return tuple(found)
+
+
+def _shortest(automaton: Automaton, way: Sequence[Happened], category: str) -> Sequence[Happened]:
+    """The fewest that give the category, the latest of such; with the last of the way, unless they do without it."""
+    best: dict[int, tuple[int, ...]] = {automaton.initial: ()}
+    fewest: tuple[int, ...] = ()
+    mine: tuple[int, ...] = ()
+    for number, event in enumerate(way):
+        found = dict(best)
+        mine = ()
+        for state, before in best.items():
+            target, now = automaton.table[state][event.event], (*before, number)
+            if len(now) <= len(found.get(target, now)):
+                found[target] = now
+            if category in automaton.verdicts[target]:
+                if not mine or len(now) <= len(mine):
+                    mine = now
+                if not fewest or len(now) <= len(fewest):
+                    fewest = now
+        best = found
+    state = automaton.initial
+    for number in mine[:-1]:
+        state = automaton.table[state][way[number].event]
+    chosen = fewest if mine[:-1] and category in automaton.verdicts[state] else mine
+    return [way[number] for number in chosen]
+
+
+class Steps:
+    """What happened last to a property without tables: at least `KEPT` steps, and the run before them."""
+
+    _run: Run | None = None
+
+    def __init__(self, compiled: CompiledProperty, time_ns: int) -> None:
+        self._compiled = compiled
+        self.begin(time_ns)
+
+    def begin(self, time_ns: int) -> None:
+        """Forget everything: the run has begun anew."""
+        self._started = time_ns
+        self._steps: list[Happened] = []
+        self._before: Run | None = None
+        self._following: Run | None = None
+
+    def mark(self) -> Any:
+        """Return what `take_back` needs to forget the steps from here on."""
+        return self._started, self._steps, len(self._steps), self._before, self._following
+
+    def take_back(self, mark: Any) -> None:
+        """Forget the steps since the mark."""
+        self._started, self._steps, size, self._before, self._following = mark
+        del self._steps[size:]
+
+    def step(self, run: Run, event: int, time_ns: int, sender: Sender) -> Categories:
+        """Let the run take the event. Raises `RunFaultError`."""
+        self._make_room(run)
+        categories = run.step(event, time_ns)
+        self._steps.append(Happened(event, time_ns, sender))
+        return categories
+
+    def forget(self, run: Run, time_ns: int) -> None:
+        """The run goes on from where another process left it: what happens next is explained by it as it is now."""
+        self.begin(time_ns)
+        self._before = None if isinstance(run, BoundedRun) else copy.copy(run)
+
+    def add(self, happened: Happened) -> None:
+        """It has happened."""
+        self._steps.append(happened)
+
+    def expire(self, run: Run) -> Categories:
+        """Let the deadline of the run pass."""
+        self._make_room(run)
+        self._steps.append(Happened(_DEADLINE, run.deadline or 0, NOBODY))
+        return run.expire()
+
+    def follow(self, earlier: "Exits | Steps") -> "Exits | Steps":
+        """Go on from what another has kept of the same property."""
+        return earlier
+
+    def _kept(self) -> tuple[Sequence[Happened], Run | None]:
+        """The last steps, and the run before them if they are not all."""
+        return self._steps, self._before
+
+    def _make_room(self, run: Run) -> None:
+        self._run = run
+        kept = FUTURE_KEPT if isinstance(run, BoundedRun) else KEPT
+        if len(self._steps) == 2 * kept:
+            self._steps = self._steps[kept:]
+            self._before = self._following
+        if len(self._steps) == kept:
+            self._following = None if isinstance(run, BoundedRun) else copy.copy(run)
+
+    def explain(self, category: str) -> Explanation | None:
+        """What made the last step's verdict; None where that cannot be said."""
+        steps, earlier = self._kept()
+        if not steps:
+            return None
+        ended = steps[-1].time if steps[-1].event == _DEADLINE else None
+        events = [step for step in steps if step.event != _DEADLINE]
+        last = events[-1:] if ended is None else []
+        tries: list[tuple[Run | None, list[Happened]]] = [(None, events)]
+        if earlier is not None:
+            tries.append((earlier, events))
+        if isinstance(self._run, BoundedRun):
+            first = len(events) - 1 - (self._run.place - self._run.about(category))
+            if 0 <= first < len(events) - len(last):
+                tries = [(None, [events[first], *last]), (None, events[first:]), *tries]
+        for before, some in tries:
+            tried = _Trial(self._compiled, before, self._started, category, ended)
+            if tried.gives(some):
+                since = steps[0].time if before is not None else None
+                return Explanation(*tried.fewest(some), since=since)
+        return None
+
+
+class ClockedSteps(Steps):
+    """The same of an automaton with a clock, in `room`, where the module notes it, too: how many steps there were
+    (i64), the runs before each `KEPT` of them (state, `since` and `now`; the last `RUNS`), and the last `RING` steps.
+    """
+
+    _compiled: ClockedProperty
+
+    def __init__(self, compiled: ClockedProperty, time_ns: int) -> None:
+        self.room = memoryview(bytearray(CLOCKED_ROOM))
+        self.owner: object = None
+        super().__init__(compiled, time_ns)
+
+    def begin(self, time_ns: int) -> None:
+        """Forget everything: the run has begun anew."""
+        self._started = time_ns
+        _COUNT.pack_into(self.room, 0, 0)
+
+    def mark(self) -> tuple[int, bytes]:
+        """All of it."""
+        return self._started, bytes(self.room)
+
+    def take_back(self, mark: tuple[int, bytes]) -> None:
+        """Return to it."""
+        self._started, self.room[:] = mark
+
+    def step(self, run: Run, event: int, time_ns: int, sender: Sender) -> Categories:
+        """Let the run take the event."""
+        self._note(run, event, time_ns, sender)
+        return run.step(event, time_ns)
+
+    def forget(self, run: Run, time_ns: int) -> None:
+        """The run goes on from where another process left it."""
+        del run
+        self.begin(time_ns)
+
+    def expire(self, run: Run) -> Categories:
+        """Let the deadline of the run pass."""
+        self._note(run, _DEADLINE & _EVENT, run.deadline or 0, NOBODY)
+        return run.expire()
+
+    def move(self, owner: object, room: memoryview) -> None:
+        """Keep it from now on where the owner has it."""
+        self.room, self.owner = room[:CLOCKED_ROOM], owner
+
+    def follow(self, earlier: Exits | Steps) -> "ClockedSteps":
+        """Go on from what another has kept of the same property."""
+        assert isinstance(earlier, ClockedSteps)  # noqa: S101  it has the same tables
+        self._started = earlier._started
+        self.room[:] = bytes(earlier.room)
+        return self
+
+    def _note(self, run: Any, event: int, time_ns: int, sender: Sender) -> None:
+        (count,) = _COUNT.unpack_from(self.room)
+        if not count % KEPT:
+            _RUN.pack_into(self.room, _run_at(count // KEPT), run.state, run.since, run.now)
+        source, number, kind = sender
+        who = source << 32 | kind << 24 | event
+        ENTRY.pack_into(self.room, _step_at(count), time_ns, who, number & 0xFFFFFFFF)
+        _COUNT.pack_into(self.room, 0, count + 1)
+
+    def _kept(self) -> tuple[Sequence[Happened], Run | None]:
+        (count,) = _COUNT.unpack_from(self.room)
+        first = max((count - 1) // KEPT - 1, 0)
+        steps = []
+        for number in range(first * KEPT, count):
+            time, who, of_sender = ENTRY.unpack_from(self.room, _step_at(number))
+            event = _DEADLINE if who & _EVENT == _EVENT else who & _EVENT
+            steps.append(Happened(event, time, Sender(who >> 32, of_sender, who >> 24 & 0xFF)))
+        if not first:
+            return steps, None
+        run = ClockedRun(self._compiled, 0)
+        run.state, run.since, run.now = _RUN.unpack_from(self.room, _run_at(first))
+        return steps, run
+
+
+def _run_at(number: int) -> int:
+    return _COUNT.size + _RUN.size * (number % RUNS)
+
+
+def _step_at(number: int) -> int:
+    return _COUNT.size + _RUN.size * RUNS + ENTRY.size * (number % RING)
+
+
+class _Trial:
+    """Whether events give a category: told with the last of them, or by a deadline when it has `ended`."""
+
+    def __init__(
+        self, compiled: CompiledProperty, before: Run | None, started: int, category: str, ended: int | None
+    ) -> None:
+        self._start: Callable[[], Run] = lambda: (
+            compiled.start(started) if before is None else copy.copy(before)
+        )
+        self._category = category
+        self._ended = ended
+        self._left = _MOST_STEPS
+
+    def gives(self, events: Sequence[Happened]) -> bool:
+        """Whether these do, and nothing else that happened."""
+        self._left -= 1 + len(events)
+        run = self._start()
+        told: Categories = ()
+        try:
+            for event in events:
+                self._expire(run, event.time)
+                told = run.step(event.event, event.time)
+        except RunFaultError:
+            return False
+        return self._category in (told if self._ended is None else self._expire(run, self._ended + 1))
+
+    def _expire(self, run: Run, time_ns: int) -> Categories:
+        """Let the deadlines before a time pass; what is told by those right before it."""
+        told: Categories = ()
+        while (deadline := run.deadline) is not None and deadline < time_ns:
+            categories = run.expire()
+            told += categories if deadline == time_ns - 1 else ()
+        return told
+
+    def fewest(self, events: list[Happened]) -> tuple[tuple[Happened, ...], bool]:
+        """As few of these as will do, and whether none of them can be left out; the last is left out last."""
+        last = events[-1:] if self._ended is None else []
+        some = self._fewer(events[: len(events) - len(last)], last)
+        if last and some and self._left > 0 and self.gives(some):
+            some, last = self._fewer(some, []), []
+        return (*some, *last), self._left > 0
+
+    def _fewer(self, some: list[Happened], last: list[Happened]) -> list[Happened]:
+        size = max(1, len(some) // 2)
+        while some and self._left > 0:
+            place, before = 0, len(some)
+            while place < len(some) and self._left > 0:
+                fewer = some[:place] + some[place + size :]
+                if self.gives([*fewer, *last]):
+                    some = fewer
+                else:
+                    place += size
+            if size == 1 and len(some) == before:
+                break
+            size = max(1, size // 2)
+        return some
+
+
+def of_slice(
+    compiled: CompiledProperty,
+    trail: Iterable[Bound],
+    values: Mapping[int, Any],
+    category: str,
+    passed: int | None = None,
+) -> Explanation | None:
+    """What made the verdict in the slice of a binding (parameters by number): it is the last that happened, or the
+    deadline that has `passed`.
+
+    None where it takes an event of which it is not known whether it happened in this slice.
+    """
+    own: dict[Happened, bool] = {}
+    happened: list[Happened] = []
+    for bound in trail:
+        if not bound.passed and compiled.suppresses:
+            continue
+        if all(map(_same, map(values.get, bound.binds), bound.key[1:])) and (own or bound.creates):
+            happened.append(Happened(bound.event, bound.time, bound.sender))
+            own[happened[-1]] = bound.everywhere
+    if not happened:
+        return None
+    found = Steps(compiled, happened[0].time)
+    for event in happened:
+        found.add(event)
+    if passed is not None:
+        found.add(Happened(_DEADLINE, passed, NOBODY))
+    why = found.explain(category)
+    return why if why is not None and all(own[event] for event in why.events) else None
+
+
+def _same(one: Any, other: Any) -> bool:
+    return bool(one == other or (one != one and other != other))  # noqa: PLR0124  NaN
+
+
+def history_of(compiled: CompiledProperty, time_ns: int) -> Exits | Steps:
+    """What is kept of a run that begins."""
+    if isinstance(compiled, ClockedProperty):
+        return ClockedSteps(compiled, time_ns)
+    return Exits(compiled.automaton) if isinstance(compiled, FiniteProperty) else Steps(compiled, time_ns)

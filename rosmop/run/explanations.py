@@ -1,0 +1,110 @@
+"""What came of a message, a tick or a deadline, as data for a record, for the CLI and for REST: what led to it.
+
+Bounded, and in the words of the specification. `who` names the source of a message.
+"""
+
+import datetime
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from appliance import late
+from rosmop.run.causes import SEQ, Happened
+from rosmop.run.outcomes import DROPPED, Fault, Outcome, Verdict, named
+
+_EACH_END = 5
+"""So many of the first and of the last events are told; how many there are between them is said."""
+
+Who = Callable[[int], Mapping[str, Any]]
+
+
+def of_drop(outcome: Outcome, who: Who) -> dict[str, Any]:
+    """What led to the drop of the message, and where that is written."""
+    return {
+        **({"at": [str(outcome.dropped_at)]} if outcome.dropped_at is not None else {}),
+        **({"values": dict(outcome.fatal.values)} if outcome.fatal is not None else {}),
+        **_led(outcome, who, outcome.handling.get(DROPPED)),
+    }
+
+
+def of_change(outcome: Outcome, who: Who) -> dict[str, Any]:
+    """What led to the change of the message, and where the events are written that made it."""
+    return {
+        "changed_by": list(outcome.changed_by),
+        "at": [str(position) for position in outcome.changed_at],
+        **_led(outcome, who),
+    }
+
+
+def of_published(outcome: Outcome, number: int, who: Who) -> dict[str, Any]:
+    """What led to one of the messages that were published, and where that is written."""
+    message = outcome.published[number]
+    position = outcome.sites[message.site].position
+    return {"type": message.type, "at": [str(position)], **_led(outcome, who, outcome.handling.get(number))}
+
+
+def of_fault(outcome: Outcome, fault: Fault, who: Who) -> dict[str, Any]:
+    """What led to the fault, where it is, and the values of the variables there."""
+    where = fault.position
+    return {
+        "file": where.file,
+        "line": where.line,
+        "column": where.column,
+        "text": fault.text,
+        "values": dict(fault.values),
+        "at": [str(where)],
+        **_led(outcome, who),
+    }
+
+
+def of_verdict(outcome: Outcome, verdict: Verdict, who: Who) -> dict[str, Any]:
+    """What led to the verdict, and where its property is written."""
+    return {
+        "property": verdict.property,
+        "logic": verdict.logic,
+        "category": verdict.category,
+        **({"binding": dict(verdict.binding)} if verdict.binding else {}),
+        "at": [str(verdict.source.origin)],
+        **_led(outcome, who),
+        **why_of(verdict, who),
+    }
+
+
+def _led(outcome: Outcome, who: Who, handled: Verdict | None = None) -> dict[str, Any]:
+    """Events, or the timer; conditions that were met, with what they compared; the verdict in whose handler it is."""
+    return {
+        "events": list(outcome.events),
+        **({"timer": outcome.timer} if outcome.timer is not None else {}),
+        **({"conditions": outcome.conditions} if outcome.looked else {}),
+        **({"handler": named(handled), **why_of(handled, who)} if handled is not None else {}),
+    }
+
+
+def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
+    """`why` of a verdict; nothing where it was not asked or is not known."""
+    why = verdict.why
+    if why is None:
+        return {}
+    events = [_event(verdict, event, who) for event in why.events]
+    between = len(events) - 2 * _EACH_END
+    said: dict[str, Any] = {"events": events}
+    if between > 0:
+        said = {"events": [*events[:_EACH_END], *events[-_EACH_END:]], "left_out": between}
+    said["fewest"] = why.fewest
+    if why.since is not None:
+        said["since"] = moment(why.since)
+    decided = late.load("rosmop.run.subformulas").deciding(verdict.source, why)
+    if decided:
+        said["decided"] = decided
+    return {"why": said}
+
+
+def moment(time_ns: int) -> str:
+    """A time in UTC, with microseconds."""
+    return datetime.datetime.fromtimestamp(time_ns / 1e9, datetime.UTC).isoformat(timespec="microseconds")
+
+
+def _event(verdict: Verdict, happened: Happened, who: Who) -> dict[str, Any]:
+    event: dict[str, Any] = {"event": verdict.source.events[happened.event], "time": moment(happened.time)}
+    event |= {"state": happened.state} if happened.state else {}
+    event |= who(happened.sender.source) if happened.sender.source else {}
+    return event | ({"seq": happened.sender.number} if happened.sender.kind == SEQ else {})

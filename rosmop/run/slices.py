@@ -1,0 +1,727 @@
+"""The slices of a running parametric specification (Chen and Roşu, "Parametric trace slicing and monitoring", 2012).
+
+A *binding* gives some or all of the parameters a value. The *slice* of a binding are the events that bind nothing else
+than it does, from the first on that is a `creation event` (where there is none: from the first on). Each slice whose
+events bind all parameters is monitored, as if the specification stood there for it alone.
+
+Theory of operation:
+
+1. `targets` returns the slices that an event belongs to: those whose bindings agree with what it binds, joined with it.
+   A slice that is not there yet begins with the state of the largest known binding in it; there is one such, because
+   with two known bindings that agree their union is known, too. Slices that lack a parameter (`seeds`) are kept for
+   that, and the output of their actions and handlers is left out.
+2. The engine makes each of them in turn the state of the monitor (`select`), steps it as any other, and takes the state
+   back (`settle`): the tables, functions and handlers are the ones of specifications without parameters. Where an
+   event only moves automata to other states, `step` and `quiet` do that.
+3. Each slice has its own clocks. `deadline` is the first deadline of all slices (a heap), `due` the slice that it
+   belongs to. A slice has one entry in the heap that counts (`Slice.due`), which may be too early, never too late.
+4. A slice ends when nothing of it can act any more: no event and no deadline leads to a handler, and no action, of
+   messages or of ticks, does more than to change its variables. Its binding is remembered, so that none begins anew
+   with it. A slice that is as at its beginning, and would begin with any event that matters to it, is forgotten at
+   once: nothing differs then.
+5. There are never more than `limit` slices, and each host (*holder*) has no more than are left for all others
+   (`quota.py`). A host that is at its bound pays itself: where the specification only observes, its own oldest slice is
+   forgotten; where it acts on messages or publishes, its new binding is `refused`, so that no host can have an
+   obligation of its own forgotten. No slice is removed for another host's. Bindings that have ended are
+   remembered under the same rule. No binding has more than `MAX_BINDING` bytes.
+6. What one message costs is bounded by these numbers. Where an event does not bind all parameters it may concern all
+   slices, and there are at most `TOGETHER_LIMIT`.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, field
+from heapq import heapify, heappop, heappush
+from itertools import count, repeat
+from operator import contains, getitem
+from typing import Any, cast
+
+from rosmop.form.compiled import EventCode, PropertyCode, SpecificationCode
+from rosmop.form.sites import showing
+from rosmop.logics.bounded import MOST_OPEN_IN_SLICE, BoundedProperty
+from rosmop.logics.interface import (
+    Categories,
+    ClockedProperty,
+    CompiledProperty,
+    FiniteProperty,
+    FormulaRun,
+    Run,
+)
+from rosmop.run.slice_quota import Holder, Quota
+from rosmop.runtime.context import FOLDED_NS
+from rosmop.types import kinds
+
+LIMIT = 100_000
+"""Slices of one specification, unless it is set otherwise."""
+
+GROWING_LIMIT = 1_000
+"""The same where a run is more than the state of an automaton (`cfg`, `srs`, `ptcaret`, `mtl` about the future)."""
+
+TOGETHER_LIMIT = 1_000
+"""The same where an event, or a tick, may concern all slices at once."""
+
+MAX_BINDING = 256
+"""Bytes of the strings in a binding."""
+
+Key = tuple[Any, ...]
+"""A binding: True, and the values of the parameters that it has, in their order."""
+
+Binding = tuple[int, Key]
+"""The parameters that are bound, as a set of bits, and their values."""
+
+_NAN = float("nan")  # one is found again, though it is not equal to itself
+
+
+@dataclass(eq=False, slots=True)
+class Slice:
+    """One slice: which parameters its binding has (a set of bits), their values, its state, and who has made it.
+
+    It is `kept` once an event has happened in it, and `gone` once it has ended or was forgotten.
+    """
+
+    domain: int
+    key: Key
+    runs: tuple[Run, ...]
+    values: tuple[Any, ...]
+    holder: Holder = None
+    kept: bool = False
+    gone: bool = False
+    due: int | None = None
+    """The time of its entry in the heap of deadlines that counts."""
+    turn: int = 0
+    """The number of that entry: of several at one time the least comes first."""
+
+    @property
+    def deadline(self) -> int | None:
+        """The first deadline of its properties."""
+        times = [time for run in self.runs if (time := run.deadline) is not None]
+        return min(times, default=None)
+
+    def stand(self, states: Sequence[int]) -> None:
+        """Its automata are in these states."""
+        for run, state in zip(self.runs, states, strict=True):
+            run.state = state  # type: ignore[attr-defined]  # of tables
+
+
+@dataclass(eq=False, slots=True)
+class _Known:
+    """The slices whose bindings have the same parameters; None for one that has ended.
+
+    `parts` has the keys again by the values of some of the parameters, for each set of parameters that is asked for.
+    """
+
+    slices: dict[Key, Slice | None] = field(default_factory=dict)
+    parts: dict[int, dict[Key, dict[Key, None]]] = field(default_factory=dict)
+
+
+class Slices:
+    """All slices of one specification."""
+
+    def __init__(self, code: SpecificationCode, namespace: dict[str, Any], limit: int) -> None:
+        assert code.slicing is not None  # noqa: S101  who asks has looked
+        properties = [declared.property for declared in code.properties]
+        self._all = (1 << len(code.slicing.parameters)) - 1
+        self.limit = limit
+        for one in properties:
+            if isinstance(one, BoundedProperty):
+                one.most = MOST_OPEN_IN_SLICE
+        if any(not isinstance(one, FiniteProperty | ClockedProperty) for one in properties):
+            self.limit = min(self.limit, GROWING_LIMIT)
+        if any(_domain(event) != self._all for event in code.events):
+            self.limit = min(self.limit, TOGETHER_LIMIT)
+        self.holder_of: Callable[[int], Holder] = lambda _source: None
+        """Who is charged for the slices that the messages of a source make (`Sender.source`)."""
+        self.refused: Mapping[str, object] | None = None
+        """The binding of the last event of which there can be no slice."""
+        self.why = ""
+        """Why not."""
+        self.changed: dict[Binding, Holder] | None = None
+        """The bindings whose state has changed since it was last kept, with their hosts; None if it is not kept."""
+        self.behind: list[Slice] = []
+        """The slices that matter to the last event and have deadlines before it that have not passed yet."""
+        self._code = code
+        self._namespace = namespace
+        self._parameters = code.slicing.parameters
+        self._own = code.slicing.own
+        self._forgets = not code.slicing.enforces
+        self._timed = any(one.timed for one in properties)
+        self._floating = any(isinstance(kind, kinds.Floating) for _, _, kind in self._parameters)
+        self._first: Slice
+        self._holder: Holder = None
+        self._now = 0
+        self._known = {domain: _Known() for domain in _joined(_domain(event) for event in code.events)}
+        self._live: Quota[tuple[int, Key]] = Quota(self.limit)
+        self._ended: Quota[tuple[int, Key]] = Quota(self.limit)
+        self._forgotten = 0
+        self._told: int | None = None
+        self._deadlines: list[tuple[int, int, Slice]] = []
+        self._order = count()
+        self._whole = self._known[self._all].slices
+        self._formulas = [declared.property.suppresses for declared in code.properties]
+        self.suppresses = any(self._formulas)
+        """Whether a dropped message is taken back in some of its properties."""
+        self._look_at(code.properties)
+        for wanted in {_domain(event) for event in code.events}:
+            for domain, known in self._known.items():
+                if wanted & domain not in (0, domain):
+                    known.parts.setdefault(wanted & domain, {})
+
+    @property
+    def live(self) -> int:
+        """How many slices there are, with those that lack a parameter."""
+        return self._live.total
+
+    def _look_at(self, properties: Sequence[PropertyCode]) -> None:
+        """Find out in which states of automata a slice is over, as if there were none, or nothing but a state."""
+        self._properties, events = properties, self._code.events
+        finite = [declared for declared in properties if isinstance(declared.property, FiniteProperty)]
+        every = len(finite) == len(properties)
+        tables = all(
+            isinstance(declared.property, FiniteProperty | ClockedProperty) for declared in properties
+        )
+        ends = tables and bool(properties) and not any(event.acts for event in events)
+        self._lost = [_lost(declared) for declared in properties] if ends else []
+        self._renews = bool(properties) and _renews(events, properties, self._all)
+        lost = self._lost or [frozenset()] * len(finite)
+        self._calm = [
+            [*map(_calm, finite, repeat(number), lost, repeat(self._renews))]
+            if every and event.plain
+            else None
+            for number, event in enumerate(events)
+        ]
+
+    def begin(self, properties: Sequence[PropertyCode], runs: tuple[Run, ...]) -> None:
+        """The specification begins: there are no slices, and the next ones begin as it has."""
+        self._look_at(properties)
+        zero = tuple(self._namespace[code] for _, code, _ in self._parameters)
+        values = self.own()
+        self._first = Slice(0, (True, *zero), runs, values)
+        self._live.clear()
+        self._ended.clear()
+        self._deadlines.clear()
+        for known in self._known.values():
+            known.slices.clear()
+            for part in known.parts.values():
+                part.clear()
+
+    def take_over(self, before: "Slices") -> None:
+        """Go on with those of the same specification before it was loaded again."""
+        self._first, self._known = before._first, before._known
+        self._live.take_over(before._live)
+        self._ended.take_over(before._ended)
+        self._deadlines, self._order = before._deadlines, before._order
+        self._whole = before._whole
+
+    # What an event belongs to
+
+    def step(self, event: int, key: Key) -> bool | None:
+        """Step the one slice that an event binds all parameters of, if nothing comes of it but states.
+
+        Whether it has happened (not where the slice is over); None: there is more to do, and nothing is done.
+        """
+        if key not in self._whole:
+            return None
+        slice_, calm = self._whole[key], self._calm[event]
+        if slice_ is None or calm is None:
+            return False if slice_ is None else None
+        if len(calm) == 1:  # as below, for most
+            run: Any = slice_.runs[0]
+            state = calm[0][run.state]
+            if state < 0:
+                return None
+            run.state = state
+            self._note(slice_)
+            return True
+        after = [*map(getitem, calm, _states(slice_.runs))]
+        if min(after, default=0) >= 0:
+            slice_.stand(after)
+            self._note(slice_)
+            return True
+        return None
+
+    def at(self, key: Key) -> Slice | None:
+        """The slice of all parameters with this key, if there is one."""
+        return self._whole.get(key)
+
+    def quiet(self, event: int, slice_: Slice) -> Sequence[int] | None:
+        """The states of a slice after an event, if nothing comes of it but those."""
+        calm = self._calm[event]
+        if calm is None or not slice_.kept:
+            return None
+        after = [*map(getitem, calm, _states(slice_.runs))]
+        return after if min(after, default=0) >= 0 else None
+
+    def stand(self, slice_: Slice, states: Sequence[int]) -> None:
+        """The automata of a slice are in these states."""
+        slice_.stand(states)
+        self._note(slice_)
+
+    def targets(self, event: EventCode, key: Key, time_ns: int, source: int) -> Sequence[Slice]:
+        """The slices that an event belongs to: first those with all parameters, in the order in which they began.
+
+        A slice that begins begins now, and its host is that of the `source`. `refused` says afterwards whether there
+        would be more of them.
+        """
+        self.refused = None
+        self.behind = []
+        self._now = time_ns
+        if self._floating:
+            key = of_nan(key)
+        domain = _domain(event)
+        if domain == self._all:
+            known = self._known[domain].slices
+            if key in known:
+                found = known[key]
+                return () if found is None else (self._looked_at(found),)
+        size = sum(len(value) for value in key if isinstance(value, bytes))
+        if size > MAX_BINDING:
+            self._refuse(domain, key, f"a binding of {size} bytes; it may have {MAX_BINDING}")
+            return ()
+        self._holder = self.holder_of(source)
+        whole: list[Slice] = []
+        seeds: list[Slice] = []
+        for slice_ in (*self._agreeing(domain, key), *self._fresh(event, domain, key)):
+            (whole if slice_.domain == self._all else seeds).append(slice_)
+        return [*whole, *seeds]
+
+    def _agreeing(self, domain: int, key: Key) -> Iterator[Slice]:
+        """The slices that bind what the event binds, with the same values."""
+        for other, known in self._known.items():
+            if other & domain == domain:
+                for known_key in self._with(other, domain, key):
+                    found = known.slices[known_key]
+                    if found is not None:
+                        yield self._looked_at(found)
+
+    def _looked_at(self, slice_: Slice) -> Slice:
+        if slice_.due is not None and slice_.due < self._now:
+            self.behind.append(slice_)
+        return slice_
+
+    def _with(self, domain: int, part: int, key: Key) -> Sequence[Key]:
+        """The keys of this domain that have these values of the parameters in `part`."""
+        known = self._known[domain]
+        if part == domain:
+            return (key,) if key in known.slices else ()
+        return [*known.slices] if not part else [*known.parts[part].get(key, ())]
+
+    def _fresh(self, event: EventCode, domain: int, key: Key) -> list[Slice]:
+        """Those that begin with this event."""
+        own = dict(zip(event.binds, key[1:], strict=True))
+        wanted = {(domain, key)} if event.creates and key not in self._known[domain].slices else set()
+        order = [*wanted]
+        for other in self._known:
+            if other & domain == domain:
+                continue
+            shared = domain & other
+            for known_key in self._with(other, shared, _key(own, shared)):
+                both = own | dict(zip(_members(other), known_key[1:], strict=True))
+                joined = (domain | other, _key(both, domain | other))
+                if joined not in wanted and joined[1] not in self._known[joined[0]].slices:
+                    wanted.add(joined)
+                    order.append(joined)
+        found = (self._derived(into, values, len(order)) for into, values in order)
+        return [slice_ for slice_ in found if slice_ is not None]
+
+    def _derived(self, domain: int, key: Key, most: int) -> Slice | None:
+        """A slice with the state of the largest binding in this one that is known; None if that has ended."""
+        values = dict(zip(_members(domain), key[1:], strict=True))
+        parent: Slice | None = self._first
+        for other in sorted(self._known, key=int.bit_count, reverse=True):
+            if other & ~domain or other == domain:
+                continue
+            part = _key(values, other)
+            if part in self._known[other].slices:
+                parent = self._known[other].slices[part]
+                break
+        if parent is None:
+            self._remember(domain, key, self._holder)
+            return None
+        if not self._has_room(most):
+            self._refuse(domain, key, self._full())
+            return None
+        if parent is self._first:
+            runs = tuple(
+                declared.property.start(self._now) if declared.property.timed else copy(run)
+                for declared, run in zip(self._properties, parent.runs, strict=True)
+            )
+        else:
+            runs = tuple(map(copy, self._looked_at(parent).runs))
+        return Slice(domain, key, runs, parent.values, self._holder)
+
+    def _full(self) -> str:
+        """Why the host can have no slice more."""
+        if self._holder is None:
+            return f"more than {self.limit} slices"
+        held = self._live.held(self._holder)
+        return f"its host has {held} of {self.limit} slices, which is as many as are left for all others"
+
+    def _has_room(self, most: int) -> bool:
+        """Whether the host may have so many slices more, or has some of its own to forget for them."""
+        return self._live.fits(self._holder, most) or (self._forgets and self._live.held(self._holder) > 0)
+
+    def _refuse(self, domain: int, key: Key, why: str) -> None:
+        self.refused, self.why = self._shown(domain, key), why
+
+    # The state of the monitor
+
+    def select(self, slice_: Slice) -> tuple[Run, ...]:
+        """Give the variables the values that they have in this slice; its runs, for the properties."""
+        namespace = self._namespace
+        if slice_.domain == self._all:
+            for (_, code, _), value in zip(self._parameters, slice_.key[1:], strict=True):
+                namespace[code] = value
+        else:
+            bound = dict(zip(_members(slice_.domain), slice_.key[1:], strict=True))
+            for number, (_, code, _) in enumerate(self._parameters):
+                namespace[code] = bound.get(number, self._first.key[number + 1])
+        if self._own:
+            namespace.update(zip(self._own, slice_.values, strict=True))
+        return slice_.runs
+
+    def own(self) -> tuple[Any, ...]:
+        """The values of the variables that each slice has of its own."""
+        return tuple(self._namespace[name] for name in self._own)
+
+    def settle(
+        self, slice_: Slice, runs: tuple[Run, ...], values: tuple[Any, ...], *, happened: bool
+    ) -> None:
+        """Take the state back; a slice that has begun with this event stays only if it `happened`."""
+        slice_.runs, slice_.values = runs, values
+        if slice_.gone:
+            return
+        self._note(slice_)
+        if not slice_.kept:
+            if not happened:
+                return
+            self._keep(slice_)
+        if self._lost and all(map(contains, self._lost, _states(runs))):
+            self._leave(slice_)
+            self._remember(slice_.domain, slice_.key, slice_.holder)
+        elif self._renews and slice_.values == self._first.values and all(run.as_new for run in slice_.runs):
+            self._leave(slice_)
+            self._forget(slice_.domain, slice_.key)
+        elif self._timed:
+            self._await(slice_)
+
+    def forgotten(self, time_ns: int) -> str:
+        """How many slices were forgotten for others of their host, in words; once in a while, else empty."""
+        number = self._forgotten
+        if not number or (self._told is not None and time_ns - self._told < FOLDED_NS):
+            return ""
+        self._forgotten, self._told = 0, time_ns
+        return (
+            f"{number} of its oldest slices are forgotten to make room for new ones of the same host; "
+            f"there may be {self.limit} slices"
+        )
+
+    # Deadlines
+
+    @property
+    def deadline(self) -> int | None:
+        """The first deadline of all slices; None if none waits."""
+        while self._deadlines:
+            time, _, slice_ = self._deadlines[0]
+            if time == slice_.due and not slice_.gone:
+                if slice_.deadline == time:
+                    return time
+                slice_.due = None
+                heappop(self._deadlines)
+                self._await(slice_)
+            elif len(self._deadlines) > 2 * self.live + 64:
+                self._tidy()
+            else:
+                heappop(self._deadlines)
+        return None
+
+    @property
+    def due(self) -> Slice:
+        """The slice whose deadline that is."""
+        return self._deadlines[0][2]
+
+    def _await(self, slice_: Slice) -> None:
+        """See that the deadline of a slice is in the heap, or an earlier time."""
+        deadline = slice_.deadline
+        if deadline is None or (slice_.due is not None and slice_.due <= deadline):
+            return
+        slice_.due, slice_.turn = deadline, next(self._order)
+        self._note(slice_)
+        heappush(self._deadlines, (deadline, slice_.turn, slice_))
+        if len(self._deadlines) > 2 * self.live + 64:
+            self._tidy()
+
+    def _tidy(self) -> None:
+        """Take out the entries that count no more: most of them."""
+        self._deadlines = [one for one in self._deadlines if one[0] == one[2].due and not one[2].gone]
+        heapify(self._deadlines)
+
+    def restart(self, time_ns: int) -> None:
+        """Let the properties with time begin anew in each slice."""
+        self._deadlines.clear()
+        for known in self._known.values():
+            for slice_ in known.slices.values():
+                if slice_ is not None:
+                    slice_.due = None
+                    self._note(slice_)
+                    slice_.runs = tuple(
+                        declared.property.start(time_ns) if declared.property.timed else run
+                        for declared, run in zip(self._properties, slice_.runs, strict=True)
+                    )
+                    self._await(slice_)
+
+    # What is kept
+
+    def keep(self) -> None:
+        """Note from now on which bindings change; those that there are now, at once."""
+        self.changed = {
+            (domain, key): None if slice_ is None else slice_.holder
+            for domain, known in self._known.items()
+            for key, slice_ in known.slices.items()
+        }
+        for holder, binding in self._ended.all():
+            self.changed[binding] = holder
+
+    def _note(self, slice_: Slice) -> None:
+        if self.changed is not None:
+            self.changed[slice_.domain, slice_.key] = slice_.holder
+
+    @property
+    def first(self) -> Slice:
+        """What the first slices begin as."""
+        return self._first
+
+    def state(self, binding: Binding) -> Slice | None:
+        """The slice of a binding; None for one that has ended. Raises `KeyError` for one that is not known."""
+        domain, key = binding
+        return self._known[domain].slices[key]
+
+    def restore(
+        self,
+        zero: Sequence[Any],
+        values: Sequence[Any],
+        live: Sequence[Slice],
+        ended: Sequence[tuple[Binding, Holder]],
+    ) -> None:
+        """Go on with the slices that another process had, in the order in which they began or ended (keys: `of_nan`).
+
+        Raises `KeyError` for a binding that there cannot be.
+        """
+        for code, value in zip(self._parameters, zero, strict=True):
+            self._namespace[code[1]] = value
+        self._namespace.update(zip(self._own, values, strict=True))
+        self.begin(self._properties, tuple(declared.property.start(0) for declared in self._properties))
+        for slice_ in live:
+            slice_.kept = True
+            self._put(slice_.domain, slice_.key, slice_)
+            self._live.take(slice_.holder, (slice_.domain, slice_.key))
+            if slice_.due is not None:
+                self._deadlines.append((slice_.due, slice_.turn, slice_))
+        heapify(self._deadlines)
+        self._order = count(max((slice_.turn for slice_ in live), default=-1) + 1)
+        for (domain, key), holder in ended:
+            self._put(domain, key, None)
+            self._ended.take(holder, (domain, key))
+
+    # What is known
+
+    def is_whole(self, slice_: Slice) -> bool:
+        """Whether a slice has all parameters."""
+        return slice_.domain == self._all
+
+    def mark(self, slice_: Slice) -> Callable[[], None]:
+        """Return what takes back all that comes to the formulas of a slice from here on, but time; one that begins
+        with the message at hand has not begun, if there are only formulas.
+        """
+        runs = slice_.runs
+        begun = not slice_.kept and all(self._formulas)
+        formulas = [
+            cast("FormulaRun", run) for run, formula in zip(runs, self._formulas, strict=True) if formula
+        ]
+        marks = [(run, run.mark()) for run in formulas]
+
+        def take_back() -> None:
+            for run, mark in marks:
+                run.take_back(mark)
+            both = zip(runs, slice_.runs, self._formulas, strict=True)
+            slice_.runs = tuple(before if formula else now for before, now, formula in both)
+            self._note(slice_)
+            if begun and slice_.kept:
+                self._undo_end(slice_)
+                self._leave(slice_)
+                self._forget(slice_.domain, slice_.key)
+            elif slice_.kept:
+                self._undo_end(slice_)
+                self._await(slice_)
+
+        return take_back
+
+    def _undo_end(self, slice_: Slice) -> None:
+        """Make a slice that has ended or was forgotten live again."""
+        if not slice_.gone:
+            return
+        binding = (slice_.domain, slice_.key)
+        known = self._known[slice_.domain].slices
+        if known.get(slice_.key) is not None:
+            return  # another has begun since
+        if slice_.key in known:
+            self._ended.give_back(slice_.holder, binding)
+        slice_.gone = False
+        self._live.take(slice_.holder, binding)
+        self._put(*binding, slice_)
+
+    def values(self, slice_: Slice) -> Mapping[int, Any]:
+        """The values of the parameters, by their numbers."""
+        return dict(zip(_members(slice_.domain), slice_.key[1:], strict=True))
+
+    def binding(self, slice_: Slice) -> Mapping[str, object]:
+        """The values of the parameters, as they are told."""
+        return self._shown(slice_.domain, slice_.key)
+
+    def _shown(self, domain: int, key: Key) -> Mapping[str, object]:
+        told = {}
+        for number, value in zip(_members(domain), key[1:], strict=True):
+            name, _, kind = self._parameters[number]
+            told[name] = showing(kind)(value)
+        return told
+
+    def _keep(self, slice_: Slice) -> None:
+        while not self._live.fits(slice_.holder, 1):
+            domain, key = self._live.oldest(slice_.holder)
+            oldest = self._known[domain].slices[key]
+            assert oldest is not None  # noqa: S101  it is live
+            self._leave(oldest)
+            self._forget(domain, key)
+            self._forgotten += 1
+        slice_.kept = True
+        self._live.take(slice_.holder, (slice_.domain, slice_.key))
+        self._put(slice_.domain, slice_.key, slice_)
+
+    def _leave(self, slice_: Slice) -> None:
+        """A slice is live no more."""
+        slice_.gone = True
+        self._live.give_back(slice_.holder, (slice_.domain, slice_.key))
+
+    def _put(self, domain: int, key: Key, slice_: Slice | None) -> None:
+        known = self._known[domain]
+        if key not in known.slices:
+            values = dict(zip(_members(domain), key[1:], strict=True))
+            for part, keys in known.parts.items():
+                keys.setdefault(_key(values, part), {})[key] = None
+        known.slices[key] = slice_
+        if slice_ is not None:
+            self._note(slice_)
+
+    def _remember(self, domain: int, key: Key, holder: Holder) -> None:
+        """No slice begins with this binding, until the host has so many of them that it is forgotten."""
+        while not self._ended.fits(holder, 1):
+            if not self._ended.held(holder):
+                if key in self._known[domain].slices:
+                    self._forget(domain, key)
+                return
+            oldest = self._ended.oldest(holder)
+            self._ended.give_back(holder, oldest)
+            self._forget(*oldest)
+        self._put(domain, key, None)
+        self._ended.take(holder, (domain, key))
+        if self.changed is not None:
+            self.changed[domain, key] = holder
+
+    def _forget(self, domain: int, key: Key) -> None:
+        known = self._known[domain]
+        del known.slices[key]
+        if self.changed is not None:
+            self.changed[domain, key] = None
+        values = dict(zip(_members(domain), key[1:], strict=True))
+        for part, keys in known.parts.items():
+            same = keys[_key(values, part)]
+            del same[key]
+            if not same:
+                del keys[_key(values, part)]
+
+
+def of_nan(key: Key) -> Key:
+    """The key with the one NaN that is found again."""
+    return tuple(_NAN if value != value else value for value in key)  # noqa: PLR0124  NaN
+
+
+def _states(runs: Sequence[Run]) -> list[int]:
+    """Those of automata."""
+    return [run.state for run in runs]  # type: ignore[attr-defined]  # of tables
+
+
+def _domain(event: EventCode) -> int:
+    return sum(1 << number for number in event.binds)
+
+
+def _members(domain: int) -> list[int]:
+    return [number for number in range(domain.bit_length()) if domain >> number & 1]
+
+
+def _key(values: Mapping[int, Any], domain: int) -> Key:
+    return (True, *(values[number] for number in _members(domain)))
+
+
+def _joined(domains: Iterator[int]) -> list[int]:
+    """What bindings can have: the parameters of one event, or of several together."""
+    found: set[int] = set()
+    for domain in domains:
+        found |= {domain, *(domain | other for other in found)}
+    return sorted(found)
+
+
+def _calm(code: PropertyCode, event: int, lost: frozenset[int], renews: bool) -> list[int]:
+    """The state after an event for each state; -1 where a handler runs, or the slice may be over or forgotten."""
+    assert isinstance(code.property, FiniteProperty)  # noqa: S101  who asks has looked
+    automaton, handled = code.property.automaton, {*code.order}
+    return [
+        -1
+        if row[event] in lost
+        or (renews and row[event] == automaton.initial)
+        or {*automaton.verdicts[row[event]]} & handled
+        else row[event]
+        for row in automaton.table
+    ]
+
+
+def _lost(code: PropertyCode) -> frozenset[int]:
+    """The states from which no event and no deadline leads to a handler any more, now or later."""
+    steps = _steps(code.property)
+    handled = {*code.order}
+    hopeful: set[int] = set()
+    while True:
+        more = {
+            state
+            for state, ways in enumerate(steps)
+            if state not in hopeful and any(handled & {*told} or target in hopeful for target, told in ways)
+        }
+        if not more:
+            return frozenset(range(len(steps))) - hopeful
+        hopeful |= more
+
+
+def _steps(compiled: CompiledProperty) -> list[list[tuple[int, Categories]]]:
+    """For each state where an event or a deadline leads, and what is told then."""
+    if isinstance(compiled, FiniteProperty):
+        automaton = compiled.automaton
+        return [[(target, automaton.verdicts[target]) for target in row] for row in automaton.table]
+    assert isinstance(compiled, ClockedProperty)  # noqa: S101  who asks has looked
+    verdicts = compiled.verdicts
+    found = []
+    for early, late, wait in zip(compiled.moves, compiled.late, compiled.waits, strict=True):
+        ways = [(target, verdicts[target]) for target, _ in (*early, *late)]
+        found.append(ways if wait is None else [*ways, (wait.move[0], wait.told)])
+    return found
+
+
+def _renews(events: Sequence[EventCode], properties: Sequence[PropertyCode], everything: int) -> bool:
+    """Whether a slice that is as at its beginning may be forgotten: each event begins one, or changes nothing in it."""
+    return all(
+        _domain(event) == everything
+        and (event.creates or (event.plain and all(_stays(one, number) for one in properties)))
+        for number, event in enumerate(events)
+    )
+
+
+def _stays(code: PropertyCode, event: int) -> bool:
+    run = code.property.start(0)
+    return run.as_new and {*code.order}.isdisjoint(run.step(event, 0)) and run.as_new

@@ -1,0 +1,182 @@
+"""Runs of properties as plain data that outlives a process, and back.
+
+A run names the attributes that change (`keeps`). Their values become numbers, strings and arrays that MessagePack has:
+a container is `[tag, item, …]`, an object that may be referred to twice `["o", number]`, and its fields are the entry
+of that number in a table. Only the classes below are made again, and no code is run but theirs.
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+from rosmop.logics.bounded import PARTS, BoundedRun, Cell
+from rosmop.logics.cfg import GrammarProperty
+from rosmop.logics.interface import ClockedRun, CompiledProperty, FiniteRun, Run
+from rosmop.logics.parsing import Frame, Shape
+
+MOST_PARTS = 5_000
+"""Objects of one run: more than a hundred times what a usual run has."""
+
+_CONTAINERS: Mapping[str, Callable[[list[Any]], Any]] = MappingProxyType(
+    {"l": list, "t": tuple, "d": deque, "s": set}
+)
+_TAGS = MappingProxyType({made: tag for tag, made in _CONTAINERS.items()})
+_PARTS: Mapping[str, type[Any]] = MappingProxyType({**PARTS, "frame": Frame})
+_NAMES = MappingProxyType({part: name for name, part in _PARTS.items()})
+_SMALL = 1 << 63
+
+
+class StateTooLargeError(Exception):
+    """A state has more parts, or bytes, than are kept."""
+
+
+def kept(run: Any) -> list[Any]:
+    """The state of a `Run` as plain data. Raises `StateTooLargeError`."""
+    if isinstance(run, FiniteRun | ClockedRun):
+        return [[getattr(run, name) for name in run.keeps], []]
+    return _Writer(run).written()
+
+
+def run_of(compiled: CompiledProperty, data: Any, time_ns: int) -> Run:
+    """The run of a property whose state is `data`. Raises `ValueError` for data that no such run has."""
+    run = compiled.start(time_ns)
+    try:
+        _Reader(compiled, run, data).read()
+        _ = run.deadline
+    except (ArithmeticError, AttributeError, LookupError, TypeError, RecursionError) as error:
+        raise ValueError(f"the state of a property cannot be read: {error!r:.100}") from error
+    return run
+
+
+class _Writer:
+    """Writes the parts of one run, each once."""
+
+    def __init__(self, run: Any) -> None:
+        self._run = run
+        self._numbers: dict[int, int] = {}
+        self._parts: list[Any] = []
+        self._operators: dict[int, int] = (
+            {id(operator): number for number, operator in run.operators.items()}
+            if isinstance(run, BoundedRun)
+            else {}
+        )
+
+    def written(self) -> list[Any]:
+        fields = [
+            self._operators_of(self._run) if name == "operators" else self._value(getattr(self._run, name))
+            for name in self._run.keeps
+        ]
+        parts: list[Any] = []
+        for part in self._parts:  # which grows while parts refer to others
+            if len(parts) >= MOST_PARTS:
+                raise StateTooLargeError(f"a property has more than {MOST_PARTS} parts")
+            parts.append(self._part(part))
+        return [fields, parts]
+
+    def _operators_of(self, run: Any) -> list[Any]:
+        return [
+            [number, *(self._value(getattr(operator, name)) for name in operator.keeps)]
+            for number, operator in run.operators.items()
+        ]
+
+    def _part(self, part: Any) -> list[Any]:
+        if isinstance(part, Shape):
+            return ["shape", *map(self._value, (part.items, part.done, part.width))]
+        return [_NAMES[type(part)], *(self._value(getattr(part, name)) for name in part.keeps)]
+
+    def _value(self, value: Any) -> Any:
+        if value is None or isinstance(value, bool | float | str):
+            return value
+        if isinstance(value, int):
+            return value if -_SMALL <= value < _SMALL else ["i", str(value)]
+        tag = _TAGS.get(type(value))
+        if tag is not None:
+            return [tag, *map(self._value, value)]
+        if isinstance(value, dict):
+            return ["m", *(self._value(one) for pair in value.items() for one in pair)]
+        if id(value) in self._operators:
+            return ["p", self._operators[id(value)]]
+        number = self._numbers.setdefault(id(value), len(self._numbers))
+        if number == len(self._parts):
+            self._parts.append(value)
+        return ["o", number]
+
+
+class _Reader:
+    """Gives a run that has just begun the state that was written."""
+
+    def __init__(self, compiled: CompiledProperty, run: Any, data: Any) -> None:
+        self._compiled = compiled
+        self._run = run
+        self._fields, self._entries = data
+        if len(self._entries) > MOST_PARTS:
+            raise ValueError(f"a property has more than {MOST_PARTS} parts")
+        self._parts: list[Any] = []
+
+    def read(self) -> None:
+        self._parts = [self._made(entry) for entry in self._entries]
+        for part, (name, *fields) in zip(self._parts, self._entries, strict=True):
+            if name != "shape":
+                self._fill(part, part.keeps, fields)
+        run = self._run
+        if isinstance(run, FiniteRun | ClockedRun):
+            self._fill(run, run.keeps, self._fields)
+            self._check(run)
+        elif isinstance(run, BoundedRun):
+            self._fill_run(run.keeps[:-1], self._fields[:-1])
+            self._fill_operators(run, self._fields[-1])
+        else:
+            self._fill_run(run.keeps, self._fields)
+
+    def _check(self, run: Any) -> None:
+        compiled: Any = self._compiled
+        states = len(compiled.automaton) if isinstance(run, FiniteRun) else len(compiled.moves)
+        if not all(isinstance(getattr(run, name), int) for name in run.keeps) or not 0 <= run.state < states:
+            raise ValueError("the property has no such state")
+
+    def _made(self, entry: list[Any]) -> Any:
+        if entry[0] != "shape":
+            made = object.__new__(_PARTS[entry[0]])
+            if isinstance(made, Cell):
+                made.journal = self._run.journal
+            return made
+        if not isinstance(self._compiled, GrammarProperty):
+            raise ValueError("only a grammar has shapes")
+        items, done, width = map(self._value, entry[1:])
+        return self._compiled.recogniser.shape(items, done, width)
+
+    def _fill_operators(self, run: BoundedRun, entries: list[Any]) -> None:
+        if [number for number, *_ in entries] != [*run.operators]:
+            raise ValueError("the property has other operators")
+        for number, *fields in entries:
+            self._fill(run.operators[number], run.operators[number].keeps, fields)
+
+    def _fill_run(self, names: tuple[str, ...], fields: list[Any]) -> None:
+        """Fill the run itself: its attributes stay what they were at its beginning (a grammar's frame may be gone)."""
+        kinds = [type(getattr(self._run, name)) for name in names]
+        self._fill(self._run, names, fields)
+        for name, kind in zip(names, kinds, strict=True):
+            if not isinstance(getattr(self._run, name), kind if kind is not Frame else Frame | None):
+                raise ValueError(f"a property has no such {name}")
+
+    def _fill(self, target: Any, names: tuple[str, ...], fields: list[Any]) -> None:
+        for name, field in zip(names, fields, strict=True):
+            setattr(target, name, self._value(field))
+
+    def _value(self, value: Any) -> Any:
+        if not isinstance(value, list):
+            return value
+        tag, *items = value
+        if tag in _CONTAINERS:
+            return _CONTAINERS[tag]([self._value(item) for item in items])
+        if tag == "m":
+            found = [self._value(item) for item in items]
+            return dict(zip(found[::2], found[1::2], strict=True))
+        if tag == "o":
+            return self._parts[items[0]]
+        if tag == "p":
+            return self._run.operators[items[0]]
+        if tag == "i":
+            return int(items[0][:40])
+        raise ValueError(f"there is no part {tag!r:.20}")

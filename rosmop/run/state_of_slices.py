@@ -1,0 +1,146 @@
+"""The slices of a running parametric specification as data: what a message changes is written, and no more.
+
+The slices are in `BUCKETS` parts by their bindings, each of which is written as a whole when one of its slices has
+changed. So a message costs what a part has, a hundredth of all slices, and a part is as it was before or after.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import msgspec
+
+from rosmop.form.compiled import SpecificationCode
+from rosmop.run.slices import Binding, Slice, Slices, of_nan
+from rosmop.run.state_of_runs import StateTooLargeError, kept, run_of
+from rosmop.types.kinds import Type
+
+BUCKETS = 128
+
+
+class KeptSlice(msgspec.Struct, frozen=True, array_like=True):
+    """A slice: which parameters its binding has (a set of bits), their values, who is charged for it, its state.
+
+    `number` counts in the order in which they began, or ended. One that has `ended` has no state.
+    """
+
+    number: int
+    domain: int
+    key: list[Any]
+    holder: str | None
+    ended: bool
+    runs: list[Any] = []
+    values: list[Any] = []
+    due: int | None = None
+    turn: int = 0
+
+
+class KeptPart(msgspec.Struct, frozen=True, tag=True):
+    """A part of the slices of a specification."""
+
+    slices: list[KeptSlice]
+
+
+class _Written(msgspec.Struct, frozen=True, tag="KeptPart"):
+    slices: list[msgspec.Raw]
+
+
+class SliceParts:
+    """The parts of one specification as they were written last."""
+
+    def __init__(self, slices: Slices) -> None:
+        self._slices = slices
+        self._parts: list[dict[Binding, tuple[int, bool, msgspec.Raw]]] = [{} for _ in range(BUCKETS)]
+        self._number = 0
+        self._failed = ""
+        slices.keep()
+
+    def changed(self) -> dict[int, bytes]:
+        """The parts that have changed since this was asked, by their number; why none is kept where one cannot be."""
+        bindings, dirty = self._slices.changed or {}, set()
+        self._slices.changed = {}
+        for binding, holder in bindings.items():
+            number = hash(binding) % BUCKETS
+            dirty.add(number)
+            try:
+                self._take(self._parts[number], binding, None if holder is None else str(holder))
+            except StateTooLargeError as error:
+                self._failed = str(error)
+        return {number: self._encoded(number) for number in dirty}
+
+    def all(self) -> list[bytes]:
+        """All parts."""
+        self.changed()
+        return [self._encoded(number) for number in range(BUCKETS)]
+
+    def _take(
+        self, part: dict[Binding, tuple[int, bool, msgspec.Raw]], binding: Binding, holder: str | None
+    ) -> None:
+        try:
+            slice_ = self._slices.state(binding)
+        except KeyError:
+            part.pop(binding, None)
+            return
+        ended = slice_ is None
+        number, was_ended, _ = part.get(binding, (-1, False, None))
+        if number < 0 or was_ended is not ended:
+            number, self._number = self._number, self._number + 1
+        domain, key = binding
+        state: tuple[Any, ...] = ()
+        if slice_ is not None:
+            state = [*map(kept, slice_.runs)], [*slice_.values], slice_.due, slice_.turn
+        record = KeptSlice(number, domain, [*key[1:]], holder, ended, *state)
+        part[binding] = number, ended, msgspec.Raw(msgspec.msgpack.encode(record))
+
+    def _encoded(self, number: int) -> bytes:
+        if self._failed:
+            return msgspec.msgpack.encode(self._failed)
+        return msgspec.msgpack.encode(_Written([record for _, _, record in self._parts[number].values()]))
+
+
+def restore_slices(
+    slices: Slices,
+    code: SpecificationCode,
+    first: tuple[Sequence[Any], Sequence[Any]],
+    records: Sequence[KeptSlice],
+    *,
+    types: Mapping[str, Type],
+    fits: Callable[[Type, Any], bool],
+    time_ns: int,
+) -> None:
+    """Give a specification that has just been made these slices; `first`: the values of parameters and of its own
+    variables as slices begin. Raises `ValueError`.
+    """
+    assert code.slicing is not None  # noqa: S101  it is parametric
+    parameters = [kind for _, _, kind in code.slicing.parameters]
+    own = [types[name] for name in code.slicing.own]
+
+    def check(kinds: Sequence[Type], values: Sequence[Any]) -> None:
+        if len(kinds) != len(values) or not all(map(fits, kinds, values)):
+            raise ValueError("a slice has other values than its specification")
+
+    check(parameters, first[0])
+    check(own, first[1])
+    live: list[Slice] = []
+    ended: list[tuple[Binding, str | None]] = []
+    for record in sorted(records, key=lambda record: record.number):
+        if not 0 <= record.domain < 1 << len(parameters):
+            raise ValueError("a slice has a parameter that its specification has not")
+        check([kind for place, kind in enumerate(parameters) if record.domain >> place & 1], record.key)
+        key = of_nan((True, *record.key))
+        if record.ended:
+            ended.append(((record.domain, key), record.holder))
+            continue
+        if len(record.runs) != len(code.properties):
+            raise ValueError("a slice has other properties than its specification")
+        check(own, record.values)
+        runs = [
+            run_of(declared.property, data, time_ns)
+            for declared, data in zip(code.properties, record.runs, strict=True)
+        ]
+        slice_ = Slice(record.domain, key, tuple(runs), tuple(record.values), record.holder)
+        slice_.due, slice_.turn = record.due, record.turn
+        live.append(slice_)
+    try:
+        slices.restore(first[0], first[1], live, ended)
+    except KeyError as error:
+        raise ValueError("a slice has a binding that there cannot be") from error

@@ -1,0 +1,149 @@
+"""What time brings about: ticks (`every`) and deadlines, in the order of their times.
+
+Time is what the caller says, in nanoseconds. Ticks up to and including a time happen, and deadlines before it. Ticks
+that take longer than the caller's `patience` allows are left out, and that is logged; deadlines wait for the next time.
+
+Slices of parametric specifications have deadlines of their own. Whoever makes up bindings chooses how many of them pass
+at one moment, so `advance` lets at most `most` of them pass; the others are due at once again. A slice takes no message
+before its own deadlines have passed (`Execution`).
+"""
+
+from collections.abc import Callable, Sequence
+
+from rosmop.run.execution import EXPLAINED, Execution
+from rosmop.run.monitor import Monitor, RunningProperty, Timer
+from rosmop.run.outcomes import Outcome
+
+Patience = Callable[[], Callable[[], bool]]
+
+MAX_TICKS = 100_000
+"""Ticks of one timer between two messages; a clock that jumps further leaves the rest out, and says so."""
+
+
+class Agenda:
+    """The timers and deadlines of monitors."""
+
+    def __init__(
+        self, monitors: Sequence[Monitor], execution: Execution, patience: Patience, most: int
+    ) -> None:
+        """`patience()` is asked when something is due: what says whether that has taken too long."""
+        self.due: int | None = None
+        """When the next tick is due or the next deadline has passed; None if nothing is waited for."""
+        self._monitors = monitors
+        self._execution = execution
+        self._patience = patience
+        self._most = most
+        self._timed = any(
+            monitor.timers or any(running.code.property.timed for running in monitor.properties)
+            for monitor in monitors
+        )
+
+    def let_go(self) -> None:
+        """The set is gone: its monitors have no part any more that has them."""
+        for monitor in self._monitors:
+            monitor.steps, monitor.timers, monitor.home, monitor.group = (), (), None, None
+        self._monitors = ()
+
+    def has_come(self, time_ns: int) -> bool:
+        """Whether something is due at this time."""
+        return self.due is not None and self.due <= time_ns
+
+    def schedule(self) -> None:
+        """Work out when something is due next. A deadline has passed only after its last nanosecond."""
+        if not self._timed:
+            return
+        timer, deadline = self._next_timer(), self._next_deadline()
+        times = [timer.due] if timer is not None and timer.due is not None else []
+        if deadline is not None:
+            times.append(deadline[0] + 1)
+        self.due = min(times, default=None)
+
+    def when_due(self, *, anew: bool) -> int | None:
+        """When something is due; worked out `anew` where walks may have moved deadlines on."""
+        if anew:
+            self.schedule()
+        return self.due
+
+    def advance(self, time_ns: int) -> list[Outcome]:
+        """Let the ticks up to this time and the deadlines before it happen, in the order of their times."""
+        outcomes: list[Outcome] = []
+        ticks: dict[int, int] = {}
+        left = self._most
+        over = self._patience()
+        self.schedule()  # walks may have moved deadlines on
+        while self.has_come(time_ns):
+            timer = self._next_timer()
+            deadline = self._next_deadline(slices=left > 0)
+            if timer is not None and timer.due is not None and (deadline is None or timer.due <= deadline[0]):
+                if timer.due > time_ns:
+                    break
+                outcomes.append(self._tick(timer, time_ns, ticks))
+            elif deadline is not None and deadline[0] < time_ns:
+                _, monitor, running = deadline
+                left -= running is None
+                explains = self._most - left <= EXPLAINED
+                outcomes += self._execution.expire(monitor, running, explains=explains)
+            else:
+                break
+            self.schedule()
+            if self.has_come(time_ns) and over():
+                outcomes.append(self._leave_out(time_ns))
+                self.schedule()
+                break
+        return outcomes
+
+    def _tick(self, timer: Timer, time_ns: int, ticks: dict[int, int]) -> Outcome:
+        due = timer.due or 0
+        timer.ticked = True
+        timer.due = due + timer.period
+        outcome = self._execution.tick(timer.step, due)
+        ticks[id(timer)] = ticks.get(id(timer), 0) + 1
+        if ticks[id(timer)] >= MAX_TICKS and timer.due <= time_ns:
+            self._skip(timer, time_ns, "the time has made a leap")
+        self._execution.collect(outcome)
+        return outcome
+
+    def _leave_out(self, time_ns: int) -> Outcome:
+        """No tick up to this time happens any more."""
+        outcome = Outcome(time=time_ns)
+        for monitor in self._monitors:
+            for timer in monitor.timers:
+                if monitor.enabled and timer.due is not None and timer.due <= time_ns:
+                    self._skip(timer, time_ns, "they take too long")
+        self._execution.collect(outcome)
+        return outcome
+
+    def _skip(self, timer: Timer, time_ns: int, reason: str) -> None:
+        due = timer.due or 0
+        left_out = (time_ns - due) // timer.period + 1
+        timer.due = due + left_out * timer.period
+        timer.step.monitor.touch()
+        text = f"{left_out} ticks of {timer.step.name} are left out: {reason}"
+        self._execution.warn(timer.step.monitor, text)
+
+    def _next_timer(self) -> Timer | None:
+        timers = [
+            timer
+            for monitor in self._monitors
+            if monitor.enabled
+            for timer in monitor.timers
+            if timer.due is not None
+        ]
+        return min(timers, key=lambda timer: timer.due or 0, default=None)
+
+    def _next_deadline(self, *, slices: bool = True) -> tuple[int, Monitor, RunningProperty | None] | None:
+        """The next deadline, and of which property it is; None there: of a slice (only with `slices`)."""
+        found: tuple[int, Monitor, RunningProperty | None] | None = None
+        for monitor in self._monitors:
+            if monitor.enabled and monitor.slices is not None:
+                deadline = monitor.slices.deadline if slices else None
+                if deadline is not None and (found is None or deadline < found[0]):
+                    found = (deadline, monitor, None)
+            elif monitor.enabled:
+                for running in monitor.properties:
+                    if running.code.property.timed:
+                        monitor.come_home()
+                    deadline = running.run.deadline
+                    if deadline is not None and (found is None or deadline < found[0]):
+                        found = (deadline, monitor, running)
+        return found

@@ -1,0 +1,235 @@
+"""Strings: bytes, as in C++. They never change; a change of one character makes a new string."""
+
+import math
+import re
+
+from rosmop.runtime.context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
+from rosmop.runtime.numbers import f32
+
+NOT_FOUND = (1 << 64) - 1
+"""`std::string::npos`."""
+
+_LONG = 64  # bytes; shorter strings are not charged
+_INTEGERS = {
+    2: re.compile(rb"\s*([+-]?[01]+)"),
+    8: re.compile(rb"\s*([+-]?[0-7]+)"),
+    10: re.compile(rb"\s*([+-]?[0-9]+)"),
+    16: re.compile(rb"\s*([+-]?)(?:0[xX](?=[0-9a-fA-F]))?([0-9a-fA-F]+)"),
+}
+_FLOATING = re.compile(
+    rb"\s*([+-]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|inf(?:inity)?|nan))", re.IGNORECASE
+)
+
+
+def join(context: Context, left: bytes, right: bytes, site: int) -> bytes:
+    """`left + right`."""
+    size = len(left) + len(right)
+    if size > _LONG:
+        context.allocate(size, site)
+    return left + right
+
+
+def extend(context: Context, text: bytes, added: bytes, site: int) -> bytes:
+    """`text` after `text += added`."""
+    size = len(text) + len(added)
+    if size > _LONG:
+        context.allocate(size, site, len(text))
+    return text + added
+
+
+def repeat(context: Context, count: int, character: int, site: int) -> bytes:
+    """`std::string(count, character)`."""
+    context.allocate(count, site)
+    return bytes((character & 0xFF,)) * count
+
+
+def character(text: bytes, index: int, site: int) -> int:
+    """`text[index]`, a signed char. The one after the last is 0."""
+    if 0 <= index < len(text):
+        value = text[index]
+        return value - 256 if value > 127 else value
+    if index == len(text):
+        return 0
+    raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
+
+
+def member(text: bytes, index: int, site: int) -> int:
+    """`text.at(index)`, `front` and `back`: like `character`, but the one after the last is a fault."""
+    if index == len(text):
+        raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
+    return character(text, index, site)
+
+
+def with_character(context: Context, text: bytes, index: int, value: int, site: int) -> bytes:
+    """`text` after `text[index] = value`."""
+    if not 0 <= index < len(text):
+        raise FaultError(site, f"index {index} is past the end of a string of {len(text)} characters")
+    if len(text) > _LONG:
+        context.allocate(len(text), site, len(text))
+    return text[:index] + bytes((value & 0xFF,)) + text[index + 1 :]
+
+
+def substring(context: Context, text: bytes, start: int, count: int, site: int) -> bytes:
+    """`text.substr(start, count)`."""
+    if start > len(text):
+        raise FaultError(site, f"substr from {start}, past the end of a string of {len(text)} characters")
+    result = text[start : start + count]
+    if len(result) > _LONG:
+        context.allocate(len(result), site)
+    return result
+
+
+def find(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
+    """`text.find(wanted, start)`."""
+    context.spend(len(text) // 16, site)
+    found = text.find(wanted, start) if start <= len(text) else -1
+    return NOT_FOUND if found < 0 else found
+
+
+def find_last(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
+    """`text.rfind(wanted, start)`."""
+    context.spend(len(text) // 16, site)
+    found = text.rfind(wanted, 0, min(start, len(text)) + len(wanted))
+    return NOT_FOUND if found < 0 else found
+
+
+def find_any(context: Context, text: bytes, wanted: bytes, start: int, site: int) -> int:
+    """`text.find_first_of(wanted, start)`."""
+    context.spend(len(text), site)
+    for first in range(start, len(text), PART):
+        context.turn.check()
+        for index in range(first, min(first + PART, len(text))):
+            if text[index] in wanted:
+                return index
+    return NOT_FOUND
+
+
+def charged(context: Context, text: bytes, site: int) -> bytes:
+    """The text, all bytes of which are about to be looked at or copied."""
+    if len(text) > _LONG:
+        context.spend(len(text) // BYTES_PER_INSTRUCTION, site)
+    return text
+
+
+def compare(left: bytes, right: bytes) -> int:
+    """`left.compare(right)`, `strcmp`."""
+    return (left > right) - (left < right)
+
+
+def resize(context: Context, text: bytes, size: int, value: int, site: int) -> bytes:
+    """`text` after `text.resize(size, value)`."""
+    context.allocate(size, site, len(text))
+    return text[:size].ljust(size, bytes((value & 0xFF,)))
+
+
+def erase(context: Context, text: bytes, start: int, count: int, site: int) -> bytes:
+    """`text` after `text.erase(start, count)`."""
+    if start > len(text):
+        raise FaultError(site, f"erase from {start}, past the end of a string of {len(text)} characters")
+    context.allocate(len(text), site, len(text))
+    return text[:start] + text[start + count :]
+
+
+def insert(context: Context, text: bytes, start: int, added: bytes, site: int) -> bytes:
+    """`text` after `text.insert(start, added)`."""
+    if start > len(text):
+        raise FaultError(site, f"insert at {start}, past the end of a string of {len(text)} characters")
+    context.allocate(len(text) + len(added), site, len(text))
+    return text[:start] + added + text[start:]
+
+
+def replace(context: Context, text: bytes, start: int, count: int, added: bytes, site: int) -> bytes:  # noqa: PLR0917  the arguments are C++'s
+    """`text` after `text.replace(start, count, added)`."""
+    if start > len(text):
+        raise FaultError(site, f"replace at {start}, past the end of a string of {len(text)} characters")
+    context.allocate(len(text) + len(added), site, len(text))
+    return text[:start] + added + text[start + count :]
+
+
+def shorten(context: Context, text: bytes, site: int) -> bytes:
+    """`text` after `text.pop_back()`."""
+    if not text:
+        raise FaultError(site, "pop_back of an empty string")
+    return charged(context, text, site)[:-1]
+
+
+def filled(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
+    """A `char` buffer after `strcpy(buffer, text)`."""
+    _allocate(context, buffer, site)
+    copied = _cut(text) + b"\0"
+    if len(copied) > len(buffer):
+        raise FaultError(site, f"strcpy of {len(copied)} characters into a buffer of {len(buffer)}")
+    return copied + buffer[len(copied) :]
+
+
+def filled_at_most(context: Context, buffer: bytes, text: bytes, count: int, site: int) -> bytes:
+    """A `char` buffer after `strncpy(buffer, text, count)`."""
+    _allocate(context, buffer, site)
+    if count > len(buffer):
+        raise FaultError(site, f"strncpy of {count} characters into a buffer of {len(buffer)}")
+    copied = _cut(text)[:count]
+    return copied + b"\0" * (count - len(copied)) + buffer[count:]
+
+
+def printed(context: Context, buffer: bytes, text: bytes, limit: int, site: int) -> bytes:
+    """A `char` buffer after `snprintf(buffer, limit, "%s", text)`."""
+    return filled(context, buffer, text[: limit - 1], site) if limit else buffer
+
+
+def extended(context: Context, buffer: bytes, text: bytes, site: int) -> bytes:
+    """A `char` buffer after `strcat(buffer, text)`."""
+    _allocate(context, buffer, site)
+    return filled(context, buffer, _cut(buffer) + _cut(text), site)
+
+
+def terminated(context: Context, buffer: bytes, site: int) -> bytes:
+    """The string in a `char` buffer: up to the first zero."""
+    return _cut(charged(context, buffer, site))
+
+
+def _cut(buffer: bytes) -> bytes:
+    end = buffer.find(0)
+    return buffer if end < 0 else buffer[:end]
+
+
+def _allocate(context: Context, buffer: bytes, site: int) -> None:
+    """A buffer is about to be made anew."""
+    if len(buffer) > _LONG:
+        context.allocate(len(buffer), site, len(buffer))
+
+
+def parse_integer(text: bytes, base: int, least: int, most: int, site: int) -> int:
+    """`std::stoi` and its like; a fault where C++ throws."""
+    found = _INTEGERS[base].match(text[:1000])
+    if found is None:
+        raise FaultError(site, "the string does not begin with a number")
+    value = int(b"".join(found.groups()), base)
+    if not least and -most <= value < 0:
+        return value + most + 1  # C++ wraps a negative number where an unsigned one is wanted
+    if not least <= value <= most:
+        raise FaultError(site, f"the number does not fit; it must be from {least} to {most}")
+    return value
+
+
+def parse_floating(text: bytes, bits: int, site: int) -> float:
+    """`std::stod`, `std::stof`; a fault where C++ throws."""
+    found = _FLOATING.match(text[:1000])
+    if found is None:
+        raise FaultError(site, "the string does not begin with a number")
+    value = float(found[1]) if bits == 64 else f32(float(found[1]))
+    digits = re.split(rb"[eE]", found[1])[0]
+    if digits[-1:] in b"0123456789." and (math.isinf(value) or (not value and digits.strip(b"+-0."))):
+        raise FaultError(site, f"the number does not fit into {'a double' if bits == 64 else 'a float'}")
+    return value
+
+
+def lenient_integer(text: bytes) -> int:
+    """`atoi`: 0 for what is no number."""
+    found = re.match(rb"\s*[+-]?[0-9]{1,18}", text[:1000])
+    return int(found[0]) if found else 0
+
+
+def lenient_floating(text: bytes) -> float:
+    """`atof`: 0 for what is no number."""
+    found = _FLOATING.match(text[:1000])
+    return float(found[1]) if found else 0.0

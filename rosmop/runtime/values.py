@@ -1,0 +1,293 @@
+"""Values by their types: the bytes they take, zeros, copies, and how they stand in a message.
+
+A message is the list of its fields.
+"""
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import groupby
+from typing import Any
+
+from rosmop.runtime import vectors, wire
+from rosmop.runtime.context import Context
+from rosmop.types import kinds
+from rosmop.types.kinds import Type
+from rosmop.types.messages import Messages
+
+_CODES = {
+    (True, 8): "b",
+    (False, 8): "B",
+    (True, 16): "h",
+    (False, 16): "H",
+    (True, 32): "i",
+    (False, 32): "I",
+    (True, 64): "q",
+    (False, 64): "Q",
+}
+_MOMENTS: dict[Type, str] = {kinds.TIME: "II", kinds.DURATION: "ii"}
+BILLION = 1_000_000_000
+
+
+def struct_code(kind: Type) -> str | None:
+    """The `struct` code of a type of fixed size (of times two: seconds and nanoseconds), None for others."""
+    if isinstance(kind, kinds.Bool):
+        return "?"
+    if isinstance(kind, kinds.Integer):
+        return _CODES[kind.signed, kind.bits]
+    if isinstance(kind, kinds.Floating):
+        return "f" if kind.bits == 32 else "d"
+    return _MOMENTS.get(kind)
+
+
+def struct_size(codes: str) -> int:
+    """The bytes of values with these `struct` codes."""
+    return sum({"?": 1, "b": 1, "h": 2, "i": 4, "q": 8, "f": 4, "d": 8}[code.lower()] for code in codes)
+
+
+def is_array(kind: Type) -> bool:
+    """Whether it is an array of any length of numbers, truths or times."""
+    return isinstance(kind, kinds.Vector) and kind.length is None and struct_code(kind.element) is not None
+
+
+class Values:
+    """The values of the types of a set of message definitions. What deals with those of a type is made once."""
+
+    def __init__(self, messages: Messages, check: Callable[[], None] = lambda: None) -> None:
+        """`check` is called now and then while many elements are decoded; it may raise what stops that."""
+        self._messages = messages
+        self._check = check
+        self._made: dict[tuple[Callable[[Values, Any], Any], Type], Callable[..., Any]] = {}
+
+    def _once(self, make: Callable[["Values", Any], Callable[..., Any]], kind: Type) -> Callable[..., Any]:
+        if (make, kind) not in self._made:
+            self._made[make, kind] = make(self, kind)
+        return self._made[make, kind]
+
+    def fields(self, kind: kinds.Record) -> list[Type]:
+        """The types of a message's fields, in order."""
+        return [slot.type for slot in self._messages.slots(kind.name).values()]
+
+    # Sizes
+
+    def width(self, kind: Type) -> int:
+        """The bytes that C++ takes for a value (without what a string or vector in it points to)."""
+        if isinstance(kind, kinds.Integer | kinds.Floating):
+            return kind.bits // 8
+        if isinstance(kind, kinds.Record):
+            return sum(map(self.width, self.fields(kind))) or 1
+        if isinstance(kind, kinds.Vector) and kind.length is not None:
+            return kind.length * self.width(kind.element)
+        return 1 if isinstance(kind, kinds.Bool) else 8 if kind in (kinds.TIME, kinds.DURATION) else 32
+
+    def least(self, kind: Type) -> int:
+        """The bytes of the shortest value in a message."""
+        code = struct_code(kind)
+        if code is not None:
+            return struct_size(code)
+        if isinstance(kind, kinds.Record):
+            return self._messages.definitions.layout(kind.name).minimum
+        if isinstance(kind, kinds.Vector) and kind.length is not None:
+            return kind.length * self.least(kind.element)
+        return 4
+
+    def measure(self, kind: Type) -> Callable[[Any], int]:
+        """A function that says how many bytes a value holds."""
+        return self._once(Values._measure, kind)
+
+    def _measure(self, kind: Type) -> Callable[[Any], int]:
+        if isinstance(kind, kinds.String | kinds.Characters):
+            return len
+        if isinstance(kind, kinds.Vector):
+            width, inner = self.width(kind.element), self.measure(kind.element)
+            if struct_code(kind.element):
+                return lambda values: len(values) * width
+            return lambda values: len(values) * width + sum(map(inner, values))
+        if isinstance(kind, kinds.Record):
+            large = [
+                (index, self.measure(field))
+                for index, field in enumerate(self.fields(kind))
+                if not struct_code(field)
+            ]
+            own = self.width(kind)
+            return lambda record: own + sum(measure(record[index]) for index, measure in large)
+        return lambda _: 8
+
+    # Zeros and copies
+
+    def maker(self, kind: Type) -> Callable[[], Any]:
+        """A function that makes a zero value (of void: None)."""
+        return self._once(Values._maker, kind)
+
+    def _maker(self, kind: Type) -> Callable[[], Any]:
+        if isinstance(kind, kinds.Vector):
+            make, length, element = self.maker(kind.element), kind.length or 0, zero_of(kind.element)
+            return lambda: [make() for _ in range(length)] if element is None else [element] * length
+        if isinstance(kind, kinds.Record):
+            makers = [self.maker(field) for field in self.fields(kind)]
+            return lambda: [make() for make in makers]
+        zero = zero_of(kind)
+        return lambda: zero
+
+    def copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
+        """A function that copies a value with all that is in it, charged: from context, value and site."""
+        return self._once(Values._copier, kind)
+
+    def _copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
+        if isinstance(kind, kinds.Record):
+            copies = [None if kinds.is_scalar(field) else self.copier(field) for field in self.fields(kind)]
+            return lambda context, record, site: [
+                part if copy is None else copy(context, part, site)
+                for copy, part in zip(copies, record, strict=True)
+            ]
+        if not isinstance(kind, kinds.Vector):
+            return lambda _context, value, _site: value
+        width, element = self.width(kind.element), self.copier(kind.element)
+        if kinds.is_scalar(kind.element):
+            return lambda context, values, site: vectors.copied(context, values, width, site)
+        return lambda context, values, site: vectors.copied_deep(context, values, width, element, site)
+
+    # In a message
+
+    def decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
+        """A function that finds the value at a position, and where it ends."""
+        return wire.text if isinstance(kind, kinds.String) else self._once(Values._decoder, kind)
+
+    def _decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
+        if isinstance(kind, kinds.Vector):
+            return self._decoder_of_vectors(kind)
+        if not isinstance(kind, kinds.Record):
+            numbers = unpacker([struct_code(kind) or ""])
+
+            def number(buffer: wire.Buffer, start: int) -> tuple[Any, int]:
+                (value,), end = numbers(buffer, start)
+                return value, end
+
+            return number
+        parts = [
+            (True, unpacker([struct_code(field) or "" for field in run]))
+            if fixed
+            else (False, self.decoder(run[0]))
+            for fixed, run in self._runs(kind)
+        ]
+
+        def record(buffer: wire.Buffer, start: int) -> tuple[list[Any], int]:
+            values: list[Any] = []
+            for several, decode in parts:
+                found, start = decode(buffer, start)
+                if several:
+                    values += found
+                else:
+                    values.append(found)
+            return values, start
+
+        return record
+
+    def _decoder_of_vectors(self, kind: kinds.Vector) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
+        code, least, element = struct_code(kind.element), self.least(kind.element), kind.element
+        decode: Callable[[wire.Buffer, int, int], tuple[Any, int]]
+        if code is None:
+            decode = partial(wire.elements, decode=self.decoder(element), check=self._check)
+        elif len(code) == 2:
+            decode = partial(wire.moments, code=code[0])
+        else:
+            decode = partial(wire.numbers, code=code, size=least)
+        length = kind.length
+        if length is not None:
+            return lambda buffer, start: decode(buffer, start, length)
+        return lambda buffer, start: decode(buffer, start + 4, wire.count(buffer, start, least))
+
+    def encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
+        """A function that appends the bytes of a value."""
+        return wire.put_text if isinstance(kind, kinds.String) else self._once(Values._encoder, kind)
+
+    def _encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
+        if isinstance(kind, kinds.Vector):
+            return self._encoder_of_vectors(kind)
+        if not isinstance(kind, kinds.Record):
+            pack_one = packer([struct_code(kind) or ""])
+            return lambda value, out: out.extend(pack_one((value,)))
+        parts: list[tuple[int, int, Any, Any]] = []
+        at = 0
+        for fixed, run in self._runs(kind):
+            pack = packer([struct_code(field) or "" for field in run]) if fixed else None
+            parts.append((at, at + len(run), pack, None if fixed else self.encoder(run[0])))
+            at += len(run)
+
+        def record(value: Any, out: bytearray) -> None:
+            for first, end, pack, encode in parts:
+                if pack is not None:
+                    out += pack(value[first:end])
+                else:
+                    encode(value[first], out)
+
+        return record
+
+    def _encoder_of_vectors(self, kind: kinds.Vector) -> Callable[[Any, bytearray], None]:
+        code, length = struct_code(kind.element) or "", kind.length
+        encode = None if code else self.encoder(kind.element)
+
+        def vector(values: Any, out: bytearray) -> None:
+            if length is None:
+                out += struct.pack("<I", len(values))
+            else:
+                vectors.fixed(values, length, -1)
+            if encode is not None:
+                for value in values:
+                    encode(value, out)
+            elif len(code) == 2:
+                wire.put_moments(values, code[0], out)
+            else:
+                wire.put_numbers(values, code, out)
+
+        return vector
+
+    def _runs(self, kind: kinds.Record) -> Iterator[tuple[bool, list[Type]]]:
+        """The fields in groups: numbers that follow each other, or one field of another kind."""
+        for fixed, run in groupby(self.fields(kind), lambda field: struct_code(field) is not None):
+            if fixed:
+                yield True, list(run)
+            else:
+                yield from ((False, [field]) for field in run)
+
+
+def zero_of(kind: Type) -> bool | float | bytes | None:
+    """The zero of a type whose values do not change; None of void."""
+    if isinstance(kind, kinds.Bool):
+        return False
+    if isinstance(kind, kinds.Floating):
+        return 0.0
+    if isinstance(kind, kinds.Integer | kinds.Time | kinds.Duration):
+        return 0
+    return b"" if isinstance(kind, kinds.String | kinds.Characters) else None
+
+
+def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[Any], int]]:
+    """Finds numbers with these `struct` codes, one after the other, and where they end; of two parts, nanoseconds."""
+    plain = struct.Struct("<" + "".join(codes))
+    unpack, size = plain.unpack_from, plain.size
+    if all(len(code) == 1 for code in codes):
+        return lambda buffer, start: (unpack(buffer, start), start + size)
+
+    def numbers(buffer: wire.Buffer, start: int) -> tuple[Sequence[Any], int]:
+        parts = iter(unpack(buffer, start))
+        return [
+            next(parts) * BILLION + next(parts) if len(code) == 2 else next(parts) for code in codes
+        ], start + size
+
+    return numbers
+
+
+def packer(codes: Sequence[str]) -> Callable[[Sequence[Any]], bytes]:
+    """The bytes of such numbers."""
+    pack = struct.Struct("<" + "".join(codes)).pack
+    if all(len(code) == 1 for code in codes):
+        return lambda values: pack(*values)
+
+    def packed(values: Sequence[Any]) -> bytes:
+        parts: list[Any] = []
+        for code, value in zip(codes, values, strict=True):
+            parts += divmod(value, BILLION) if len(code) == 2 else (value,)
+        return pack(*parts)
+
+    return packed

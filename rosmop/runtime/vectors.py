@@ -1,0 +1,219 @@
+"""Vectors: Python lists. Functions that make something long charge for it first.
+
+`width` is the bytes that C++ takes for an element; it is what counts for the limit on memory.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from rosmop.runtime.context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
+
+Values = list[Any]
+
+LARGE = 1024  # bytes; what holds less is not charged when it is looked at
+
+
+def element(values: Values, index: int, site: int) -> Any:
+    """`values[index]`."""
+    if 0 <= index < len(values):
+        return values[index]
+    raise FaultError(site, f"index {index} is past the end of a vector of {len(values)}")
+
+
+def put(values: Values, index: int, value: Any, site: int) -> Any:
+    """`values[index] = value`; the value."""
+    if 0 <= index < len(values):
+        values[index] = value
+        return value
+    raise FaultError(site, f"index {index} is past the end of a vector of {len(values)}")
+
+
+def put_slot(record: Values, slot: int, value: Any) -> Any:
+    """Set a field of a message; the value."""
+    record[slot] = value
+    return value
+
+
+def append(context: Context, values: Values, value: Any, width: int, site: int) -> None:
+    """`values.push_back(value)`."""
+    context.allocate(width, site)
+    values.append(value)
+
+
+def append_text(context: Context, values: Values, value: bytes, width: int, site: int) -> None:
+    """`values.push_back(text)`."""
+    context.allocate(width + len(value), site)
+    values.append(value)
+
+
+def weighed(context: Context, values: Values, measure: Callable[[Values], int], site: int) -> Values:
+    """The vector or message, all of which is about to be looked at; `measure` says how many bytes it holds."""
+    size = measure(values)
+    if size > LARGE:
+        context.spend(size // BYTES_PER_INSTRUCTION, site)
+    return values
+
+
+def same(left: Any, right: Any) -> bool:
+    """Whether two vectors or messages hold the same. A NaN is like nothing, also not like itself."""
+    return left == right and _numbers(left)
+
+
+def _numbers(value: Any) -> bool:
+    return all(map(_numbers, value)) if isinstance(value, list) else value == value  # noqa: PLR0124  NaN
+
+
+def pop(values: Values, site: int) -> None:
+    """`values.pop_back()`."""
+    if not values:
+        raise FaultError(site, "pop_back of an empty vector")
+    values.pop()
+
+
+def copied(context: Context, values: Values, width: int, site: int) -> Values:
+    """A copy of a vector of numbers, strings or times."""
+    context.allocate(len(values) * width, site)
+    return values.copy()
+
+
+def copied_deep(context: Context, values: Values, width: int, copy: Callable[..., Any], site: int) -> Values:
+    """A copy of a vector of vectors or messages; `copy` copies an element."""
+    context.allocate(len(values) * width, site)
+    return [copy(context, value, site) for value in values]
+
+
+def recast(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
+    """A vector of bytes as one of bytes of another kind."""
+    context.allocate(len(values), site)
+    return convert(values)
+
+
+def recast_each(context: Context, values: Values, convert: Callable[[Values], Values], site: int) -> Values:
+    """The same for the vectors in a vector."""
+    context.allocate(len(values), site)
+    return [convert(value) for value in values]
+
+
+def signed(values: Values) -> Values:
+    """`uint8_t` or `bool` as `int8_t`."""
+    return memoryview(bytes(values)).cast("b").tolist()
+
+
+def unsigned(values: Values) -> Values:
+    """`int8_t` or `bool` as `uint8_t`."""
+    return [value & 0xFF for value in values]
+
+
+def truths(values: Values) -> Values:
+    """Bytes as `bool`."""
+    return list(map(bool, values))
+
+
+def filled(context: Context, count: int, make: Callable[[], Any], width: int, site: int) -> Values:
+    """`count` new elements."""
+    context.allocate(count * width, site)
+    context.spend(count // 4, site)
+    return _made(context, count, make)
+
+
+def _made(context: Context, count: int, make: Callable[[], Any]) -> Values:
+    values: Values = []
+    for first in range(0, count, PART):
+        context.turn.check()
+        values += [make() for _ in range(min(PART, count - first))]
+    return values
+
+
+def resized(  # noqa: PLR0917  the arguments are C++'s
+    context: Context, values: Values, count: int, make: Callable[[], Any], width: int, site: int
+) -> None:
+    """`values.resize(count)`."""
+    more = count - len(values)
+    if more <= 0:
+        del values[count:]
+        return
+    values += filled(context, more, make, width, site)
+
+
+def assigned(values: Values, others: Values) -> Values:
+    """Put other elements in the place of all of a vector's."""
+    values[:] = others
+    return values
+
+
+def filled_with(  # noqa: PLR0917  the arguments are C++'s
+    context: Context,
+    count: int,
+    value: Any,
+    copy: Callable[[Any], Any],
+    measure: Callable[[Any], int],
+    site: int,
+) -> Values:
+    """`std::vector<T>(count, value)`; `measure` says how many bytes a value holds."""
+    context.allocate(count * max(measure(value), 1), site)
+    context.spend(count // 4, site)
+    return _made(context, count, lambda: copy(value))
+
+
+def fixed(values: Values, count: int, site: int) -> Values:
+    """The elements for an array of fixed length: exactly so many."""
+    if len(values) != count:
+        raise FaultError(site, f"{len(values)} elements for an array of exactly {count}")
+    return values
+
+
+def _check_span(values: Values, first: int, last: int, site: int) -> None:
+    if not 0 <= first <= last <= len(values):
+        raise FaultError(site, f"from {first} to {last} is not within a vector of {len(values)}")
+
+
+def erase(context: Context, values: Values, first: int, last: int | None, site: int) -> None:
+    """`values.erase(first)`, `values.erase(first, last)`."""
+    last = first + 1 if last is None else last
+    _check_span(values, first, last, site)
+    context.spend((len(values) - first) // 64, site)
+    del values[first:last]
+
+
+def insert(context: Context, values: Values, at: int, value: Any, width: int, site: int) -> None:  # noqa: PLR0917  the arguments are C++'s
+    """`values.insert(at, value)`."""
+    _check_span(values, at, len(values), site)
+    context.allocate(width, site)
+    context.spend(len(values) // 64, site)
+    values.insert(at, value)
+
+
+def sort(context: Context, values: Values, first: int, last: int, site: int) -> None:
+    """`std::sort`: ascending."""
+    _check_span(values, first, last, site)
+    steps = (last - first).bit_length()
+    context.spend((last - first) * steps, site)
+    if values and isinstance(values[0], bytes):
+        context.spend(sum(map(len, values[first:last])) // BYTES_PER_INSTRUCTION * steps, site)
+    values[first:last] = sorted(values[first:last])
+
+
+def reverse(context: Context, values: Values, first: int, last: int, site: int) -> None:
+    """`std::reverse`."""
+    _check_span(values, first, last, site)
+    context.spend((last - first) // 4, site)
+    values[first:last] = values[first:last][::-1]
+
+
+def accumulate(  # noqa: PLR0917  the arguments are C++'s, and how to add
+    context: Context,
+    values: Values,
+    first: int,
+    last: int,
+    site: int,
+    start: Any,
+    add: Callable[[Any, Any], Any],
+) -> Any:
+    """`std::accumulate`."""
+    _check_span(values, first, last, site)
+    context.spend(last - first, site)
+    for index in range(first, last):
+        if not index % PART:
+            context.turn.check()
+        start = add(start, values[index])
+    return start

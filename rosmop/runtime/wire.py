@@ -1,0 +1,246 @@
+"""The bytes of messages: pieces of decoding and encoding.
+
+`buffer` is anything with the buffer interface that indexes bytes (bytes, bytearray, memoryview); positions count
+from its start. Reading past the end raises `MalformedError` or `struct.error`.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rosmop.runtime.context import PART, Context, MalformedError
+from rosmop.runtime.times import with_part
+
+Buffer = bytes | bytearray | memoryview
+
+_LENGTH = struct.Struct("<I")
+MAX_EMPTY = 1_000_000
+"""Elements without bytes that one array may have."""
+
+_MAX_DECODED = 1_000_000  # elements that are decoded one by one
+FEW = 64  # elements that cost less than an instruction's worth of counting them
+
+
+def text(buffer: Buffer, start: int) -> tuple[bytes, int]:
+    """The string at `start`, and where it ends."""
+    first = start + 4
+    end = first + _LENGTH.unpack_from(buffer, start)[0]
+    if end > len(buffer):
+        raise MalformedError(f"a string ends at byte {end} of a message of {len(buffer)}")
+    return bytes(buffer[first:end]), end
+
+
+def text_end(buffer: Buffer, start: int) -> int:
+    """Where the string at `start` ends."""
+    return int(start + 4 + _LENGTH.unpack_from(buffer, start)[0])
+
+
+def count(buffer: Buffer, start: int, least: int) -> int:
+    """How many elements the array at `start` has; each takes at least so many bytes."""
+    number: int = _LENGTH.unpack_from(buffer, start)[0]
+    if number * least > len(buffer) - start - 4 or (not least and number > MAX_EMPTY):
+        raise MalformedError(f"an array of {number} elements in a message of {len(buffer)} bytes")
+    return number
+
+
+def numbers(buffer: Buffer, start: int, number: int, code: str, size: int) -> tuple[list[Any], int]:
+    """`number` values of one `struct` code, and where they end."""
+    end = start + number * size
+    if end > len(buffer):
+        raise MalformedError(f"an array ends at byte {end} of a message of {len(buffer)}")
+    if code == "B":
+        return list(bytes(buffer[start:end])), end
+    return list(struct.unpack_from(f"<{number}{code}", buffer, start)), end
+
+
+def moments(buffer: Buffer, start: int, number: int, code: str) -> tuple[list[int], int]:
+    """`number` times (code `I`) or durations (`i`) as nanoseconds, and where they end."""
+    pairs, end = numbers(buffer, start, 2 * number, code, 4)
+    return [pairs[i] * 1_000_000_000 + pairs[i + 1] for i in range(0, len(pairs), 2)], end
+
+
+def elements(
+    buffer: Buffer,
+    start: int,
+    number: int,
+    decode: Callable[[Buffer, int], tuple[Any, int]],
+    check: Callable[[], None],
+) -> tuple[list[Any], int]:
+    """Return `number` values, each by `decode`, and where they end; `check` is called now and then."""
+    if number > _MAX_DECODED:
+        raise MalformedError(
+            f"an array of {number} elements; at most {_MAX_DECODED} that are no numbers are read"
+        )
+    values = []
+    for index in range(number):
+        if not index % PART:
+            check()
+        value, start = decode(buffer, start)
+        values.append(value)
+    return values, start
+
+
+def skip(buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context) -> int:
+    """Where `number` elements end, each of which ends where `end` says. Many are charged before they are walked."""
+    if number > FEW:
+        context.walk(number)
+    return _skipped(buffer, start, number, end, context)
+
+
+def skip_inner(
+    buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context
+) -> int:
+    """As `skip`, within an element that is skipped: a few are charged, too, since there may be many such elements."""
+    context.walk(number + 1)
+    return _skipped(buffer, start, number, end, context)
+
+
+def _skipped(
+    buffer: Buffer, start: int, number: int, end: Callable[[Buffer, int], int], context: Context
+) -> int:
+    for first in range(0, number, PART):
+        if first:
+            context.turn.check()
+        for _ in range(min(PART, number - first)):
+            start = end(buffer, start)
+    return start
+
+
+def put_text(value: bytes, out: bytearray) -> None:
+    """Append a string."""
+    out += len(value).to_bytes(4, "little")
+    out += value
+
+
+def put_numbers(values: list[Any], code: str, out: bytearray) -> None:
+    """Append values of one `struct` code."""
+    out += struct.pack(f"<{len(values)}{code}", *values)
+
+
+def put_moments(values: list[int], code: str, out: bytearray) -> None:
+    """Append times (code `I`) or durations (`i`)."""
+    out += struct.pack(
+        f"<{2 * len(values)}{code}", *(part for v in values for part in divmod(v, 1_000_000_000))
+    )
+
+
+class Message:
+    """The message that events look at: its bytes as changed so far, and what has become of it.
+
+    Numbers are written where they stand, and only the bytes that were there are kept: a picture of a camera is not
+    copied for a changed stamp. `touched` has bits of every write of other bytes than were there; cleared after each
+    event, it says whether the event wrote, and by which of its statements at the sites `marks`. `cause` is the site of
+    the statement that dropped it.
+    """
+
+    __slots__ = (
+        "_replaced",
+        "buffer",
+        "cause",
+        "dropped",
+        "marks",
+        "past",
+        "time",
+        "touched",
+        "written",
+    )  # fmt: skip
+
+    def __init__(self, buffer: Buffer, time: int) -> None:
+        self.buffer = buffer
+        self.time = time
+        self.written: list[tuple[int, bytes]] | None = None  # where bytes were others, and which, in order
+        self._replaced: bytes | None = None  # the bytes as received, once the buffer is another
+        self.dropped = False
+        self.cause: int | None = None
+        self.touched = 0
+        self.marks: Sequence[int] = ()
+        self.past: tuple[int, int, int] | None = None  # an index was past the end: site, index, elements
+
+    @property
+    def changed(self) -> bool:
+        """Whether the bytes differ from those received."""
+        if self._replaced is not None:
+            return bytes(self.buffer) != self._replaced
+        if self.written is None:
+            return False
+        ends = -1
+        for start, old in sorted(self.written):
+            if start < ends:  # written twice: it may be as it was
+                return bytes(self.buffer) != self._original()
+            ends = start + len(old)
+        return True  # `patch` has compared them
+
+    @property
+    def overwritten(self) -> Sequence[tuple[int, bytes]]:
+        """Where the buffer that came in had other bytes, and which, in order."""
+        return self.written or ()
+
+    def patch(self, start: int, new: bytes, by: int = 1) -> None:
+        """Put bytes in the place of as many; `by` are the bits that `touched` gets if they are others."""
+        end = start + len(new)
+        old = self.buffer[start:end]
+        if old == new:
+            return
+        self.touched |= by
+        if self._replaced is None:
+            if self.written is None:
+                self.written = []
+                if isinstance(self.buffer, bytes) or (
+                    isinstance(self.buffer, memoryview) and self.buffer.readonly
+                ):
+                    self.buffer = bytearray(self.buffer)
+            self.written.append((start, bytes(old)))
+        self.buffer[start:end] = new  # type: ignore[index]  # it is a bytearray or a writable memoryview
+
+    def splice(self, edits: list[tuple[int, int, bytes, int]]) -> None:
+        """Put bytes in the place of those from the first to before the second number, for every edit; see `patch`."""
+        if all(len(new) == end - start for start, end, new, _ in edits):
+            for start, _, new, by in edits:
+                self.patch(start, new, by)
+            return
+        if self._replaced is None:
+            self._replaced = self._original()
+        pieces = []
+        last = 0
+        for start, end, new, by in sorted(edits):
+            self.touched |= by if self.buffer[start:end] != new else 0
+            pieces += [bytes(self.buffer[last:start]), new]
+            last = end
+        pieces.append(bytes(self.buffer[last:]))
+        self.buffer = bytearray(b"".join(pieces))
+
+    def _original(self) -> bytes:
+        """The bytes as received, while the buffer is as long."""
+        if not self.written:
+            return bytes(self.buffer)
+        original = bytearray(self.buffer)
+        for start, old in reversed(self.written):
+            original[start : start + len(old)] = old
+        return bytes(original)
+
+
+def whole(
+    message: Message,
+    context: Context,
+    decode: Callable[[Buffer, int], tuple[Any, int]],
+    pending: tuple[tuple[bool, tuple[int | str, ...], Any], ...],
+    site: int,
+) -> list[Any]:
+    """All of a message, with the fields that the running action has assigned: (whether it has, path, value)."""
+    context.allocate(len(message.buffer), site)
+    value: list[Any] = decode(message.buffer, 0)[0]
+    for assigned, path, new in pending:
+        if assigned:
+            _set(value, path, new, site)
+    return value
+
+
+def _set(value: list[Any], path: tuple[int | str, ...], new: Any, site: int) -> None:
+    *above, last = path
+    for index in above[:-1] if isinstance(last, str) else above:
+        value = value[index]  # type: ignore[index]  # only the last is the part of a time
+    if isinstance(last, str):
+        place = above[-1]
+        value[place] = with_part(value[place], last.encode(), new, site)  # type: ignore[index]  # as above
+    else:
+        value[last] = new

@@ -1,0 +1,127 @@
+"""Small specifications and messages for tests: an action in, what comes of it out."""
+
+import functools
+from collections.abc import Mapping
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
+
+from rosmop.form.positions import Finding
+from rosmop.run.engine import MonitorSet
+from rosmop.run.execution import OnFault
+from rosmop.run.outcomes import Outcome
+from rosmop.run.timers import Patience
+from rosmop.runtime.context import BUDGET
+from rosmop.text.errors import SpecificationError
+from roswire.definitions import Definitions
+from roswire.standard import standard_definitions
+
+STORE: Any = get_typestore(Stores.ROS1_NOETIC)
+PAINTBALL = "uint8 NONE=0\nuint8 SINGLE_SHOT=1\nHeader header\nuint8 trigger\n"
+
+
+@functools.cache
+def definitions() -> Definitions:
+    """ROS's own definitions, and those of the LandShark."""
+    return standard_definitions().extended(
+        Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": PAINTBALL})
+    )
+
+
+def message(kind: str, **fields: object) -> bytes:
+    """A message by another library's encoder; fields that are not given are zero. `a__b` is the path `a.b`."""
+    return bytes(STORE.serialize_ros1(_value(_long(kind), _tree(fields)), _long(kind)))
+
+
+def fields(kind: str, data: bytes) -> Any:
+    """A message by another library's decoder."""
+    return STORE.deserialize_ros1(data, _long(kind))
+
+
+def _tree(flat: Mapping[str, object]) -> dict[str, object]:
+    nested: dict[str, object] = {}
+    for path, value in flat.items():
+        at = nested
+        *above, last = path.split("__")
+        for step in above:
+            at = at.setdefault(step, {})  # type: ignore[assignment]  # the dicts are nested
+        at[last] = value
+    return nested
+
+
+def _long(kind: str) -> str:
+    package, _, name = kind.partition("/")
+    return f"{package}/msg/{name}"
+
+
+def _value(kind: str, given: object) -> Any:
+    """An object of the other library with the given fields, the rest zero."""
+    if not isinstance(given, dict):
+        return given
+    import numpy as np  # noqa: PLC0415  only for the other library's arrays
+
+    parts = {}
+    for name, (node, detail) in STORE.fielddefs[kind][1]:
+        value = given.get(name)
+        if node == Nodetype.BASE:
+            parts[name] = value if value is not None else {"string": "", "bool": False}.get(detail[0], 0)
+        elif node == Nodetype.NAME:
+            parts[name] = (
+                value if value is not None and not isinstance(value, dict) else _value(detail, value or {})
+            )
+        else:
+            inner, length = detail
+            items = value if value is not None else [0] * length
+            if inner[0] == Nodetype.NAME:
+                parts[name] = [_value(inner[1], item) for item in items]
+            elif inner[1][0] == "string":
+                parts[name] = list(items)
+            else:
+                parts[name] = np.array(items, dtype=np.dtype(inner[1][0]))
+    return STORE.types[kind](**parts)
+
+
+def load(
+    text: str, on_fault: OnFault = "drop", patience: Patience = lambda: lambda: False, **others: str
+) -> MonitorSet:
+    """The monitors of a text (and of other files by name), started at time 0."""
+    monitors = MonitorSet.load({"x.rv": text, **{f"{name}.rv": other for name, other in others.items()}},
+                               definitions(), on_fault, patience)  # fmt: skip
+    monitors.start(0)
+    return monitors
+
+
+def act(body: str, *, before: str = "", data: int = 0, most: int = BUDGET) -> Outcome:
+    """What comes of an action on `/t`, `std_msgs/Int32` bound to `x`; `before` are declarations and functions.
+
+    `most` are the instructions that a message may take.
+    """
+    text = f"s() {{ {before} event e(int x) /t std_msgs/Int32 '{{data:x}}' {{ {body} }} }}"
+    told = message("std_msgs/Int32", data=data)
+    monitors = load(text)
+    monitors.monitor("s").context.most = most
+    return monitors.process("/t", told, 1_500_000_000)
+
+
+def shown(expression: str, *, conversion: str = "%s", before: str = "", data: int = 0) -> str:
+    """What an expression prints; a fault's text if there is one."""
+    outcome = act(f'ROS_INFO("{conversion}", {expression});', before=before, data=data)
+    if outcome.faults:
+        return f"fault: {outcome.faults[0].text}"
+    return outcome.log[0].text
+
+
+def refused(text: str) -> list[Finding]:
+    """The errors of a specification; fails if there is none."""
+    try:
+        MonitorSet.load({"x.rv": text}, definitions())
+    except SpecificationError as error:
+        return [finding for finding in error.findings if finding.severity == "error"]
+    raise AssertionError("the specification was accepted")
+
+
+def refused_action(body: str, *, before: str = "") -> list[Finding]:
+    """The errors of an action on `/t`, `std_msgs/Int32` bound to `x`; columns count from the action."""
+    text = f"s() {{ {before}\nevent e(int x) /t std_msgs/Int32 '{{data:x}}' {{\n{body}\n}} }}"
+    return refused(text)

@@ -1,0 +1,307 @@
+"""The certifier proves what the compilers make, and refuses what a broken compiler would make."""
+
+import ast
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+
+import pytest
+from rosmop.tests.examples import examples
+
+import rosmop.certify
+from appliance.specifications.files import Sources, SpecificationsRefusedError, check
+from rosmop.certify.check import MOST_STEPS, Tables, certify
+from rosmop.certify.properties import certificate_of
+from rosmop.form.positions import Position
+from rosmop.logics import catalogue
+from rosmop.logics.automaton import Automaton
+from rosmop.logics.catalogue import compile_property
+from rosmop.logics.interface import CompiledProperty, FiniteProperty, FormulaError, Source
+from rosmop.logics.tfsm import TimedMachine
+
+EVENTS = ["a", "b", "c", "d"]
+ORIGIN = Position("x.rv", 1, 1)
+Draw = Callable[[Random, int, Sequence[str]], str]
+
+
+def drawn(unary: Sequence[str], binary: Sequence[str], leaves: Sequence[str]) -> Draw:
+    """What draws a formula over these operators."""
+
+    def draw(random: Random, depth: int, events: Sequence[str]) -> str:
+        if depth == 0 or random.random() < 0.15:
+            return random.choice([*events, *events, *leaves])
+        operator = random.choice([*unary, *binary])
+        if operator in unary:
+            return f"{operator} ({draw(random, depth - 1, events)})"
+        return f"({draw(random, depth - 1, events)}) {operator} ({draw(random, depth - 1, events)})"
+
+    return draw
+
+
+def expression(random: Random, depth: int, events: Sequence[str]) -> str:
+    """A regular expression."""
+    if depth == 0 or random.random() < 0.15:
+        return random.choice([*events, *events, "epsilon", "empty"])
+    inner = f"({expression(random, depth - 1, events)})"
+    other = f"({expression(random, depth - 1, events)})"
+    return random.choice([f"{inner}*", f"{inner}+", f"{inner}^{random.randint(0, 3)}", f"~{inner}",
+                          f"{inner} | {other}", f"{inner} & {other}", f"{inner} {other}"])  # fmt: skip
+
+
+def pattern(random: Random, _depth: int, events: Sequence[str]) -> str:
+    """A pattern without a bound of time; no event both opens and closes its scope."""
+    a, b, c, d = (random.choice(events) for _ in range(4))
+    scopes = ["globally", f"after {a}", f"until {b}"] + [f"after {a} until {b}"] * (a != b)
+    bodies = [f"no {c}", f"some {c}", *(f"{c} {verb} {d}" for verb in ("causes", "requires", "forbids"))]
+    return f"{random.choice(scopes)}: {random.choice(bodies)}"
+
+
+def machine(random: Random, _depth: int, events: Sequence[str]) -> str:
+    """A state machine."""
+    states = [f"s{number}" for number in range(random.randint(1, 5))]
+    text = ""
+    for state in states:
+        moves = [
+            f"{event} -> {random.choice([*states, 'fail'])}" for event in events if random.random() < 0.6
+        ]
+        if random.random() < 0.5:
+            moves.append(f"default {random.choice(states)}")
+        text += f"{state} [ {random.choice([', ', ' ']).join(moves)} ] "
+    return text + f"alias x = {', '.join(random.sample([*states, 'fail'], 2))}"
+
+
+def timed_machine(random: Random, depth: int, events: Sequence[str]) -> str:
+    """A state machine of which some states are left after a time."""
+    states = machine(random, depth, events).split("] ")
+    limits = ["timeout 2s -> s0", "timeout 0.5 ms -> fail", "timeout 3 -> s0"]
+    return "] ".join(
+        f"{state} {random.choice(limits)}" if random.random() < 0.5 else state for state in states[:-1]
+    ) + ("] " + states[-1])
+
+
+LOGICS: dict[str, Draw] = {
+    "ere": expression,
+    "fsm": machine,
+    "ltl": drawn(
+        ["!", "o", "[]", "<>"], ["U", "R", "~U", "and", "or", "xor", "=>", "<=>"], ["true", "false"]
+    ),
+    "ltl with past": drawn(
+        ["!", "o", "[]", "<>", "(*)", "<*>", "[*]", "~(*)"],
+        ["U", "R", "S", "~S", "and", "or", "=>"],
+        ["true"],
+    ),
+    "mtl": drawn(
+        ["!", "previously", "once", "once[0,inf]", "historically"],
+        ["since", "since [0 ms, inf]", "and", "or", "xor", "=>", "<=>"],
+        ["true", "false"],
+    ),
+    "pattern": pattern,
+    "ptltl": drawn(
+        ["!", "(*)", "~(*)", "<*>", "[*]"], ["S", "~S", "and", "or", "xor", "=>", "<=>"], ["true", "false"]
+    ),
+    "tfsm": timed_machine,
+}
+
+
+def properties(logic: str, seed: int, count: int) -> list[CompiledProperty]:
+    """Random properties that the compiler takes."""
+    random = Random(seed)  # noqa: S311  no secret
+    found: list[CompiledProperty] = []
+    while len(found) < count:
+        events = EVENTS[: random.randint(1, 4)]
+        formula = LOGICS[logic](random, random.randint(1, 4), events)
+        if random.random() < 0.4:
+            events.append("unnamed")
+        try:
+            found.append(compile_property(logic.removesuffix(" with past"), formula, events, ORIGIN))
+        except FormulaError:
+            continue  # too large, only about the past, the machine with no second member for its alias, for instance
+    return found
+
+
+@pytest.mark.parametrize("logic", LOGICS)
+def test_what_the_compilers_make_is_proved(logic: str) -> None:
+    """Two readings of the definitions, on random formulas."""
+    for compiled in properties(logic, 1, 150):
+        certificate = certificate_of(compiled)
+        assert certificate.proved, (compiled.formula, compiled.events, certificate.text)
+
+
+def tables_of(compiled: CompiledProperty) -> Tables:
+    """What was made of a formula."""
+    assert isinstance(compiled, FiniteProperty | TimedMachine)
+    made = compiled.automaton
+    timeouts = compiled.timeouts if isinstance(compiled, TimedMachine) else ()
+    return Tables(made.initial, made.table, made.verdicts, timeouts)
+
+
+def same_verdicts(one: Tables, other: Tables) -> bool:
+    """Whether two automata say the same after every trace, and after the same times."""
+    seen = {(one.initial, other.initial)}
+    waiting = list(seen)
+    for left, right in waiting:
+        targets = list(zip(one.table[left], other.table[right], strict=True))
+        if one.timeouts and (one.timeouts[left] or other.timeouts[right]):
+            first, second = one.timeouts[left], other.timeouts[right]
+            if first is None or second is None or first[0] != second[0]:
+                return False
+            targets.append((first[1], second[1]))
+        for pair in targets:
+            if one.verdicts[pair[0]] != other.verdicts[pair[1]]:
+                return False
+            if pair not in seen:
+                seen.add(pair)
+                waiting.append(pair)
+    return True
+
+
+def broken(random: Random, tables: Tables) -> Tables:
+    """With one fault of a compiler: a wrong way on, two states that became one, a verdict that is not right."""
+    table, verdicts = [list(row) for row in tables.table], list(tables.verdicts)
+    state, other = random.randrange(len(table)), random.randrange(len(table))
+    timeouts = list(tables.timeouts)
+    match random.choice(("way", "way", "merged", "verdict", "limit")):
+        case "way":
+            table[state][random.randrange(len(table[state]))] = other
+        case "merged":
+            table = [[other if target == state else target for target in row] for row in table]
+        case "verdict":
+            verdicts[state] = verdicts[other]
+        case _ if timeouts:
+            timeouts[state] = timeouts[other]
+        case _:
+            verdicts[state] = ()
+    return Tables(tables.initial, table, verdicts, timeouts)
+
+
+@pytest.mark.parametrize("logic", LOGICS)
+def test_what_is_no_automaton_is_refused(logic: str) -> None:
+    """Python takes a negative state for one from the end; the module of the relay would look beside its table."""
+    compiled = next(iter(properties(logic, 5, 5)))
+    made = tables_of(compiled)
+    states = len(made.table)
+    others = [
+        replace(made, initial=made.initial - states),
+        replace(made, initial=states),
+        replace(made, table=[[target - states for target in row] for row in made.table]),
+        replace(made, table=[*made.table[:-1], [states] * len(made.table[0])]),
+        replace(made, table=[[*row, 0] for row in made.table]),
+        replace(made, verdicts=[*made.verdicts, ()]),
+        replace(made, timeouts=[*([None] * states), (1, 0)]),
+        replace(made, timeouts=[(1, states if logic == "tfsm" else 0)] * states),
+    ]
+    for other in others:
+        assert certify(compiled.logic, compiled.formula, compiled.events, other).wrong, other
+
+
+@pytest.mark.parametrize("logic", LOGICS)
+def test_a_thousand_faults_of_compilers_are_refused(logic: str) -> None:
+    """Two hundred for each logic with all examples, each with a trace; a change that changes no verdict is none."""
+    random = Random(2)  # noqa: S311  no secret
+    refused = 0
+    for compiled in properties(logic, 3, 1000):
+        tables = tables_of(compiled)
+        wrong = broken(random, tables)
+        certificate = certify(compiled.logic, compiled.formula, compiled.events, wrong)
+        if same_verdicts(tables, wrong):
+            assert certificate.proved, (compiled.formula, certificate.text)
+        else:
+            assert certificate.wrong, (compiled.formula, wrong)
+            refused += 1
+        if refused == examples(200):
+            return
+    pytest.fail(f"only {refused} changes were faults")
+
+
+def test_a_fault_is_shown_by_a_trace() -> None:
+    """As short as there is one."""
+    wrong = Tables(0, [[0, 1], [1, 1]], [(), ("violation",)])
+    certificate = certify("ltl", "[](a => o (!b U a))", ["a", "b"], wrong)
+    assert certificate.wrong
+    assert certificate.text == "after b the automaton says violation, the definition nothing"
+
+
+@pytest.mark.parametrize(
+    ("logic", "formula", "why"),
+    [
+        ("cfg", "S -> a S b | epsilon", "grammars are not followed"),
+        ("mtl", "once[0,1s] a", "it has bounds of time"),
+        ("pattern", "globally: a causes b within 1s", "it has a bound of time"),
+        ("pattern", "after a until a: some b", "one event opens and closes the scope"),
+    ],
+)
+def test_what_is_not_proved_is_said(logic: str, formula: str, why: str) -> None:
+    """With the reason, and never as if it were."""
+    certificate = certificate_of(compile_property(logic, formula, ["a", "b"], ORIGIN))
+    assert not certificate.proved
+    assert not certificate.wrong
+    assert why in certificate.text
+    assert certificate.text.endswith("tested, not proved")
+
+
+def test_what_is_too_large_is_not_proved() -> None:
+    """A machine with more ways on than are followed."""
+    events = [f"e{number}" for number in range(200)]
+    states = MOST_STEPS // len(events) + 10
+    formula = " ".join(f"s{number} [ default s{(number + 1) % states} ]" for number in range(states))
+    certificate = certificate_of(compile_property("fsm", formula, events, ORIGIN))
+    assert (certificate.proved, certificate.wrong) == (False, False)
+    assert certificate.text == "there is too much to look at: tested, not proved"
+
+
+def test_an_expression_that_is_too_large_is_not_proved() -> None:
+    """Its automaton has one state too few, at the very end: that is not reached."""
+    certificate = certify("ere", "(a|b)* a (a|b)^30 c", ["a", "b", "c"], Tables(0, [[0, 0, 0]], [()]))
+    assert (certificate.proved, certificate.wrong) == (False, False)
+    assert certificate.text == "there is too much to look at: tested, not proved"
+
+
+SPECIFICATION = """
+guard() {
+    event a() /x std_msgs/Bool '{}' { }
+    event b() /y std_msgs/Bool '{}' { }
+    ltl: [](a => o (!a U b))
+    @violation { ROS_WARN("no"); }
+    mtl: once[0,1s] a
+    @violation { ROS_WARN("no"); }
+}
+"""
+
+
+def test_the_load_says_what_was_proved() -> None:
+    """Of each property, in the order of the text."""
+    checked = check(Sources({"guard.rv": SPECIFICATION}), ())
+    proved, tested = checked.certificates["guard"]
+    assert proved.startswith("ltl: proved: ")
+    assert tested == "mtl: it has bounds of time: tested, not proved"
+
+
+def test_a_compiler_that_is_wrong_loads_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The finding has the place of the formula, a trace, and whose defect it is."""
+
+    def compile_wrong(source: Source) -> FiniteProperty:
+        return FiniteProperty(source, ("violation", "validation"), Automaton(0, ((0, 0),), ((),)))
+
+    monkeypatch.setattr(catalogue, "LOGICS", {**catalogue.LOGICS, "ltl": compile_wrong})
+    with pytest.raises(SpecificationsRefusedError) as refused:
+        check(Sources({"guard.rv": SPECIFICATION}), ())
+    assert refused.value.findings == [
+        "guard.rv:5:10: error: the automaton of this property is not what is written: after a a the automaton says"
+        " nothing, the definition violation; this is a defect of the appliance: nothing is loaded with it; report it"
+        " with the specification"
+    ]
+
+
+def test_the_certifier_shares_no_code_with_the_compilers() -> None:
+    """Only `properties.py`, where their results come in, knows that they are there."""
+    folder = Path(rosmop.certify.__file__).parent
+    for file in folder.glob("*.py"):
+        imported = {
+            node.module or ""
+            for node in ast.walk(ast.parse(file.read_text()))
+            if isinstance(node, ast.ImportFrom)
+        }
+        ours = {module for module in imported if module.startswith("appliance")}
+        if file.name != "properties.py":
+            assert all(module.startswith("rosmop.certify") for module in ours), file

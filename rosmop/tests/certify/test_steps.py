@@ -1,0 +1,162 @@
+"""The steps of a finished module are run in every state, and modules that are wrong in one place are rejected."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import chain, islice
+from typing import Any
+
+import msgspec
+import pytest
+from rosmop.tests.examples import examples
+
+from appliance.channel.messages import PartNames
+from appliance.specifications.checking import parts
+from appliance.specifications.files import SpecificationsRefusedError
+from rosmop.certify.steps import StepDiffersError, check_steps
+from rosmop.fast import batch_codegen, wasm_build
+from rosmop.fast.batch_codegen import WrittenModule, written
+from rosmop.fast.serialization import encoded
+from rosmop.fast.wasm_instance import MachineError
+from rosmop.form import components, nodes
+from rosmop.form.compiled import Compiled
+from rosmop.form.components import groups
+from rosmop.run.engine import MonitorSet
+from rosmop.runtime.values import Values
+from rosmop.tests.random_specifications import Specifications, definitions
+from tests.support.step_mutants import tables, walks
+
+GUARD = """s() { int n = 0;
+    event a(int x) /plain own/Plain '{kind:0, count:x}' { if (x > 8) { return; } }
+    event b(int x) /plain own/Plain '{kind:1, count:x}' { n = x; }
+    ptltl: b => <*> a @violation { DROP; }
+    fsm: idle [a -> moved, b -> idle] moved [b -> lock, a -> moved] lock [a -> lock, b -> idle]
+    @lock { n = 1; DROP; __RESET; } @fail { n = 2; }
+    pattern: globally: a forbids b within 5s @validation { }
+}"""
+
+
+def compiled(*texts: str) -> Compiled:
+    """Specifications as one set."""
+    return MonitorSet.load({f"{place}.rv": text for place, text in enumerate(texts)}, definitions()).compiled
+
+
+def module(of: Compiled) -> WrittenModule:
+    """Their module, before it is translated."""
+    return written(of.functions, [each.component for each in groups(of.specifications)], Values(of.messages))
+
+
+def test_the_modules_of_random_specifications_pass() -> None:
+    """What is written now does in every state what the automata say."""
+    steps = 0
+    for seed in range(examples(60)):
+        texts = Specifications(seed).texts()
+        try:
+            of = compiled(*texts)
+        except Exception:  # noqa: BLE001, S112  not every one of them is right
+            continue
+        steps += check_steps(of, module(of))
+    assert steps > examples(6000)
+
+
+def test_a_large_table_is_run_in_all_of_its_states() -> None:
+    """Cells are not sampled."""
+    states = " ".join(f"q{n} [a -> q{(n + 1) % 900}, b -> q{n * 7 % 900}]" for n in range(900))
+    of = compiled(f"{GUARD.split('ptltl', maxsplit=1)[0]} fsm: {states} @q5 {{ DROP; }} }}")
+    assert check_steps(of, module(of)) > 900 * 2
+    wrong = list(islice(tables(module(of)), 0, None, 331))
+    assert len(wrong) > 5
+    for _, where, one in wrong:
+        with pytest.raises(StepDiffersError):
+            check_steps(of, one)
+            raise AssertionError(where)
+
+
+def test_mutants_of_walks_and_tables_are_rejected() -> None:
+    """Hundreds of faults: cells, indexes, states that are written, verdicts, drops, order, what begins again.
+
+    The others change nothing but explanations, budgets, places that are written twice, or cannot come up here.
+    """
+    of = compiled(GUARD)
+    whole, came = module(of), Counter[str]()
+    every = 6 // examples(6)
+    for kind, _, one in islice(chain(tables(whole), walks(whole)), 0, None, every):
+        try:
+            check_steps(of, one)
+        except StepDiffersError:
+            came[kind] += 1
+        except MachineError:
+            came["no module"] += 1
+        else:
+            came["passes"] += 1
+    rejected = sum(
+        came[kind] for kind in ("table", "operation", "constant", "local", "address", "branch", "call")
+    )
+    assert rejected > 900 // every
+    assert rejected > came["passes"]
+
+
+def _changed(change: Callable[[nodes.Advance], nodes.Advance]) -> Callable[..., nodes.Event]:
+    event = components._event
+
+    def changed(*arguments: Any) -> nodes.Event:
+        made = event(*arguments)
+        return msgspec.structs.replace(made, advances=tuple(map(change, made.advances)))
+
+    return changed
+
+
+def _advance(**fields: Callable[[nodes.Advance], object]) -> Callable[..., nodes.Event]:
+    return _changed(
+        lambda one: msgspec.structs.replace(one, **{name: value(one) for name, value in fields.items()})
+    )
+
+
+FAULTS: dict[str, tuple[object, str, object]] = {
+    "another column of the table": (program, "_event", _advance(table=lambda one: one.table[1:] + one.table[:1])),
+    "another initial state": (program, "_event", _advance(initial=lambda one: one.initial + 1)),
+    "no handler runs": (program, "_event", _advance(handlers=lambda _: ())),
+    "a handler in another state": (program, "_event", _advance(
+        handlers=lambda one: tuple(
+            msgspec.structs.replace(each, states=frozenset({0})) for each in one.handlers
+        )
+    )),
+    "handlers in another order": (program, "_event", _advance(handlers=lambda one: one.handlers[::-1])),
+    "formulas keep dropped messages": (program, "_event", _advance(suppresses=lambda _: False)),
+    "machines forget dropped messages": (program, "_event", _advance(suppresses=lambda _: True)),
+    "properties in another order": (program, "_event", _advance(property=lambda one: 1 - (one.property or 0))),
+    "a drop has no effect": (batch_codegen._Walk, "_drop", lambda *_: b""),
+    "handlers are not called": (batch_codegen._Walk, "_handle", lambda *_: b""),
+    "properties do not step": (batch_codegen._Walk, "_advance", lambda *_: b""),
+    "states are not written": (batch_codegen._Walk, "_done", lambda self: batch_codegen._set(batch_codegen._AT, batch_codegen._get(batch_codegen._NEXT))),
+}  # fmt: skip
+
+TWO = """s() { event a(int x) /plain own/Plain '{kind:0, count:x}' { if (x > 8) { return; } }
+    event b() /plain own/Plain '{kind:1}' { } event c() /plain own/Plain '{kind:2}' { }
+    ptltl: b => <*> a @violation { DROP; } @validation { }
+    fsm: idle [a -> moved, b -> idle, c -> idle] moved [b -> lock, a -> moved, c -> idle]
+         lock [a -> lock, b -> idle, c -> moved]
+    alias any = lock, idle
+    @lock { DROP; __RESET; } @any { } @fail { } }"""
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_of_one_line_are_rejected_at_load(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The compiler's process refuses the specification: no relay gets such a module."""
+    of = compiled(TWO)
+    sent = encoded(of)
+    assert parts(sent, [PartNames(("s",))])
+    monkeypatch.setattr(*FAULTS[fault])
+    with pytest.raises(StepDiffersError):
+        wasm_build.part_of(of, ["s"], [])
+    with pytest.raises(SpecificationsRefusedError, match="this is a defect of the appliance"):
+        parts(sent, [PartNames(("s",))])
+
+
+def test_functions_in_another_order_are_rejected() -> None:
+    """What is called for an event is the event's own function, and the first comes first."""
+    of = compiled(GUARD)
+    whole = module(of)
+    walk = whole.feeds["/plain"]
+    with pytest.raises(StepDiffersError, match="which functions it calls"):
+        check_steps(of, replace(whole, feeds={"/plain": replace(walk, functions=walk.functions[::-1])}))

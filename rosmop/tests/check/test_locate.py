@@ -1,0 +1,87 @@
+"""Fields are found where they are: a bound parameter is what decoding the whole message gives, and a change of it
+is what encoding the whole changed message gives.
+"""
+
+from collections.abc import Iterator
+from random import Random
+
+import pytest
+
+from rosmop.tests.acting import definitions, load, message
+from rosmop.types import kinds
+from rosmop.types.messages import Messages
+
+KINDS = (
+    "nav_msgs/Odometry", "sensor_msgs/JointState", "sensor_msgs/LaserScan", "nav_msgs/Path", "sensor_msgs/PointCloud2",
+    "sensor_msgs/CameraInfo", "trajectory_msgs/JointTrajectory", "diagnostic_msgs/DiagnosticArray", "sensor_msgs/Imu",
+    "visualization_msgs/Marker", "nav_msgs/OccupancyGrid", "geometry_msgs/PolygonStamped",
+    "sensor_msgs/MultiDOFJointState",
+    "std_msgs/UInt8MultiArray", "geometry_msgs/PoseWithCovarianceStamped", "sensor_msgs/NavSatFix",
+)  # fmt: skip
+
+
+def content(random: Random, kind: kinds.Type) -> object:
+    """A random value of a type, for the other library's encoder."""
+    if isinstance(kind, kinds.Record):
+        slots = Messages(definitions()).slots(kind.name)
+        return {name: content(random, slot.type) for name, slot in slots.items()}
+    if isinstance(kind, kinds.Vector):
+        count = random.randrange(4) if kind.length is None else kind.length
+        return [content(random, kind.element) for _ in range(count)]
+    if isinstance(kind, kinds.Integer):
+        return random.randint(kind.least, kind.most)
+    if isinstance(kind, kinds.Time | kinds.Duration):
+        return {"sec": random.randrange(2**31), "nanosec": random.randrange(10**9)}
+    if isinstance(kind, kinds.Bool):
+        return random.random() < 0.5
+    return (
+        "x" * random.randrange(6) if isinstance(kind, kinds.String) else float(random.randrange(-99, 99)) / 4
+    )
+
+
+def paths(kind: kinds.Type, value: object, path: str = "") -> Iterator[tuple[str, kinds.Type]]:
+    """Every path to a value in a message, and the type there."""
+    if path:
+        yield path, kind
+    if isinstance(kind, kinds.Record) and isinstance(value, dict):
+        for name, slot in Messages(definitions()).slots(kind.name).items():
+            yield from paths(slot.type, value[name], f"{path}.{name}" if path else name)
+    if isinstance(kind, kinds.Vector) and isinstance(value, list):
+        for index in range(min(len(value), 3)):
+            yield from paths(kind.element, value[index], f"{path}[{index}]")
+
+
+def change(kind: kinds.Type, name: str) -> str:
+    """A statement that gives a variable of this type another value; nothing for whole messages and fixed arrays."""
+    if isinstance(kind, kinds.String):
+        return f'{name} += "longer";'
+    if isinstance(kind, kinds.Bool):
+        return f"{name} = !{name};"
+    if isinstance(kind, kinds.Vector) and kind.length is None:
+        return f"{name}.resize(5);"
+    if isinstance(kind, kinds.Time | kinds.Duration):
+        return f"{name}.nsec = 17;"
+    return f"{name} = 7;" if kinds.is_number(kind) else ""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_every_field_of_a_random_message(kind: str, seed: int) -> None:
+    """Bound one by one, each field is read right, and changed right."""
+    random = Random(f"{kind} {seed}")  # noqa: S311  draws examples, not keys
+    value = content(random, kinds.Record(kind))
+    data = _encoded(kind, value)
+    found = list(paths(kinds.Record(kind), value))
+    for path, field in random.sample(found, min(len(found), 25)):
+        text = f"""s() {{ {kind} v; event e(auto p) /t {kind} '{{{path}:p}}' {{
+            v = MESSAGE; ROS_INFO("%d", p == v.{path});
+            {change(field, f"v.{path}")} {change(field, "p")} PUBLISH(/whole, {kind}, v); }} }}"""
+        outcome = load(text).process("/t", data, 0)
+        assert not outcome.faults, (path, outcome.faults)
+        assert [line.text for line in outcome.log] == ["1"], path
+        assert outcome.published[0].data == bytes(outcome.buffer), path
+
+
+def _encoded(kind: str, value: object) -> bytes:
+    assert isinstance(value, dict)
+    return message(kind, **value)

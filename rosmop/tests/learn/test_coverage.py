@@ -1,0 +1,135 @@
+"""What of a specification is said to have been exercised, line by line."""
+
+from collections.abc import Sequence
+
+import pytest
+
+from rosmop.learn.coverage import covered
+from rosmop.tests.acting import message
+from rosmop.tests.learn.test_learner import START, Recorded
+from rosmop.text.errors import SpecificationError
+from roswire.standard import standard_definitions
+
+TEXT = """gate() {
+    int n = 0;
+    bool big(int x) { return x > 5; }
+    void unused() { n = 0; }
+    event open(int x) /open std_msgs/Int32 '{data:x}' {
+        if (big(x)) { n++; }
+        else if (x == 1) { n--; }
+        for (int i = 0; i < x; i++) n++;
+    }
+    event shut() /shut std_msgs/Int32 '{}' { if (n > 1000) return; }
+    event other() /other std_msgs/Int32 '{}' { switch (n) { case 1: n = 2; break; default: n = 3; } }
+    fsm: closed [ open -> opened, default closed ]
+         opened [ shut -> closed, other -> broken, open -> opened ]
+         broken [ default broken ]
+    @opened { ROS_INFO("opened"); }
+    @fail { ROS_WARN("fail"); }
+}
+"""
+
+
+def recorded(name: str, messages: Sequence[tuple[str, int]]) -> Recorded:
+    """A recording of numbers, a second apart."""
+    rows = tuple(
+        (topic, START + place * 10**9, message("std_msgs/Int32", data=value))
+        for place, (topic, value) in enumerate(messages)
+    )
+    return Recorded(name, rows, {topic: "std_msgs/Int32" for topic, _ in messages})
+
+
+def exercised(*recordings: Recorded) -> dict[str, int]:
+    """How often each `line kind what` was exercised."""
+    found = covered({"gate.rv": TEXT}, standard_definitions(), recordings)
+    return {f"{item.position.line} {item.kind} {item.what}": count for item, count in found.items()}
+
+
+def test_each_thing_has_its_line_and_its_count() -> None:
+    """One recording that opens twice and shuts once; what it never did has 0."""
+    counts = exercised(recorded("a", [("/open", 7), ("/open", 0), ("/shut", 0)]))
+    assert counts == {
+        "3 function big": 2,
+        "4 function unused": 0,
+        "5 event open": 2,
+        "6 branch if": 1,
+        "7 branch if": 0,
+        "7 branch else": 1,
+        "8 branch loop": 7,
+        "10 event shut": 1,
+        "10 branch if": 0,
+        "10 branch else": 1,
+        "11 event other": 0,
+        "11 branch case": 0,
+        "12 state closed": 1,
+        "12 transition closed: open -> opened": 1,
+        "12 transition closed: default -> closed": 0,
+        "13 state opened": 2,
+        "13 transition opened: shut -> closed": 1,
+        "13 transition opened: other -> broken": 0,
+        "13 transition opened: open -> opened": 1,
+        "14 state broken": 0,
+        "14 transition broken: default -> broken": 0,
+        "15 handler @opened": 2,
+        "16 handler @fail": 0,
+    }
+
+
+def test_recordings_add_up() -> None:
+    """What one did not do another may; each begins with monitors in their initial state."""
+    counts = exercised(
+        recorded("a", [("/open", 1)]),
+        recorded("b", [("/shut", 0), ("/open", 0), ("/other", 0), ("/shut", 0)]),
+    )
+    assert counts["12 transition closed: open -> opened"] == 2
+    assert counts["12 transition closed: default -> closed"] == 1
+    assert counts["14 transition broken: default -> broken"] == 1
+    assert counts["7 branch if"] == 1
+    assert counts["11 branch case"] == 1
+
+
+def test_a_timeout_is_a_transition() -> None:
+    """The passing of a deadline moves the machine, and counts."""
+    text = """quiet() {
+    event a() /a std_msgs/Int32 '{}' { }
+    event b() /b std_msgs/Int32 '{}' { }
+    tfsm: idle [ a -> busy, default idle ]
+          busy [ a -> busy, timeout 2s -> late, default idle ]
+          late [ default late, timeout 1h -> idle ]
+    @late { ROS_WARN("late"); }
+}
+"""
+    recording = recorded("a", [("/a", 0), ("/c", 0), ("/c", 0), ("/c", 0), ("/c", 0), ("/b", 0)])
+    counts = {
+        f"{item.kind} {item.what}": count
+        for item, count in covered({"quiet.rv": text}, standard_definitions(), [recording]).items()
+    }
+    assert counts["transition busy: timeout -> late"] == 1
+    assert counts["transition late: default -> late"] == 1
+    assert counts["transition late: timeout -> idle"] == 0
+    assert counts["handler @late"] == 2
+
+
+def test_an_error_is_that_of_the_text() -> None:
+    """What is wrong with a specification is said with its own place and names."""
+    with pytest.raises(SpecificationError) as caught:
+        covered({"gate.rv": TEXT.replace("n--", "m--")}, standard_definitions(), [])
+    assert str(caught.value.findings[0]).startswith("gate.rv:7:28: error: there is no variable `m`")
+
+
+def test_slices_are_counted_together() -> None:
+    """Of a parametric specification: what any of its slices exercised."""
+    text = """gate(int id) {
+    event open(int id) /open std_msgs/Int32 '{data:id}' { }
+    event shut(int id) /shut std_msgs/Int32 '{data:id}' { if (id == 2) ROS_INFO("2"); }
+    fsm: closed [ open -> opened ] opened [ shut -> closed ]
+    @fail { __RESET; }
+}"""
+    messages = [("/open", 1), ("/open", 2), ("/shut", 1), ("/shut", 2), ("/shut", 1)]
+    found = covered({"gate.rv": text}, standard_definitions(), [recorded("a", messages)])
+    counts = {f"{item.kind} {item.what}": count for item, count in found.items()}
+    assert counts["event open"] == 2
+    assert counts["branch if"] == 1
+    assert counts["state opened"] == 2
+    assert counts["state closed"] == 2
+    assert counts["handler @fail"] == 1

@@ -1,0 +1,42 @@
+"""Bounds beyond what was seen: on samples whose extremes are known."""
+
+import random
+
+import pytest
+
+from rosmop.learn.extremes import FEWEST_WINDOWS, upper
+
+
+def test_a_bound_holds_on_ten_times_as_many_windows() -> None:
+    """Of fifty learnt bounds on noise, at most two are passed in ten times as many windows as they were learnt from."""
+    chance = random.Random(1)  # noqa: S311  no secret
+    passed = 0
+    for _ in range(50):
+        seen = [max(chance.gauss(0, 1) for _ in range(50)) for _ in range(24)]
+        bound = upper(seen, 10_000)
+        assert bound is not None
+        passed += max(chance.gauss(0, 1) for _ in range(50 * 240)) > bound
+    assert passed <= 2
+
+
+def test_a_bound_is_not_far_beyond_what_is_possible() -> None:
+    """Uniform noise between 0 and 1 gets bounds that a value of 1.5 or -0.5 passes."""
+    chance = random.Random(2)  # noqa: S311  no secret
+    windows = [[chance.random() for _ in range(50)] for _ in range(24)]
+    above, below = upper(map(max, windows), 1e6), upper((-min(window) for window in windows), 1e6)
+    assert above is not None and max(map(max, windows)) <= above < 1.5
+    assert below is not None and -0.5 < -below <= min(map(min, windows))
+
+
+def test_what_several_windows_reach_exactly_is_the_bound() -> None:
+    """A joint that is stopped at 0.6 has no margin."""
+    highs = [0.1, 0.3, 0.6, 0.2, 0.6, 0.5, 0.6, 0.4]
+    assert upper(highs, 1e6, stops=True) == 0.6
+    margin = upper(highs, 1e6)
+    assert margin is not None and margin > 1.0
+
+
+@pytest.mark.parametrize("count", [0, 1, FEWEST_WINDOWS - 1])
+def test_nothing_is_said_of_too_few_windows(count: int) -> None:
+    """Extremes of a few windows say nothing about the next one."""
+    assert upper([float(number) for number in range(count)], 100) is None

@@ -1,0 +1,209 @@
+"""What is learnt from recordings that are known, and what the text then warns of."""
+
+import math
+import random
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import pytest
+
+from rosmop.learn.learner import LearningError, Learnt, learn
+from rosmop.run.engine import MonitorSet
+from rosmop.tests.acting import message
+from roswire.standard import standard_definitions
+
+START = 1_700_000_000 * 10**9
+TYPES = {
+    "/speed": "std_msgs/Float64",
+    "/mode": "std_msgs/String",
+    "/ask": "std_msgs/Bool",
+    "/answer": "std_msgs/Bool",
+}
+Row = tuple[str, int, bytes]
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recording in memory."""
+
+    name: str
+    rows: tuple[Row, ...]
+    topics: Mapping[str, str]
+
+    @property
+    def began(self) -> int:
+        """The time of the first message."""
+        return self.rows[0][1]
+
+    @property
+    def ended(self) -> int:
+        """The time of the last message."""
+        return self.rows[-1][1]
+
+    def messages(self) -> Iterator[Row]:
+        """All messages."""
+        return iter(self.rows)
+
+
+def number(value: float) -> bytes:
+    """A `std_msgs/Float64`."""
+    return message("std_msgs/Float64", data=value)
+
+
+def drive(seed: int, seconds: float = 60.0) -> Recorded:
+    """A speed that swings slowly at about 20 Hz, a mode that goes round, and questions that are answered at once."""
+    chance = random.Random(seed)  # noqa: S311  no secret
+    modes = ["idle", "armed", "firing"]
+    rows: list[Row] = []
+    for tick in range(int(seconds * 20)):
+        time = START + seed * 10**12 + tick * 50_000_000 + int(chance.random() * 5e6)
+        speed = math.sin(tick / 40 + seed) + chance.gauss(0, 0.01)
+        rows.append(("/speed", time, number(speed)))
+        if tick % 20 == 0:
+            mode = modes[tick // 60 % 3]
+            rows.append(("/mode", time + 1000, message("std_msgs/String", data=mode)))
+        if chance.random() < 0.03:
+            rows.append(("/ask", time + 10_000_000, message("std_msgs/Bool", data=True)))
+            rows.append(
+                ("/answer", time + int(12e6 + chance.random() * 3e6), message("std_msgs/Bool", data=True))
+            )
+    return Recorded(f"drive {seed}", tuple(sorted(rows, key=lambda row: row[1])), TYPES)
+
+
+DRIVES = [drive(seed) for seed in range(1, 9)]
+
+
+@pytest.fixture(scope="module")
+def learnt() -> Learnt:
+    """What eight drives teach."""
+    return learn(DRIVES, standard_definitions(), 0.3, lambda _: None)
+
+
+def warnings(learnt: Learnt, rows: Sequence[Row]) -> list[str]:
+    """What the text warns of in a recording."""
+    monitors = MonitorSet.load({"learnt.rv": learnt.text}, standard_definitions())
+    monitors.start(rows[0][1], frozenset(TYPES))
+    found = []
+    for topic, time, data in rows:
+        outcome = monitors.process(topic, data, time)
+        assert outcome.result == "passed"
+        found += [line.text for each in (*outcome.before, outcome) for line in each.log]
+    return found
+
+
+def test_a_new_drive_gives_no_alarm(learnt: Learnt) -> None:
+    """Drives that nobody learnt from are quiet, and nothing is dropped or changed."""
+    assert [warnings(learnt, drive(seed).rows) for seed in (20, 21)] == [[], []]
+
+
+def test_the_recordings_are_split_and_named(learnt: Learnt) -> None:
+    """The comment at the head says what was learnt from, and what tested it."""
+    assert {part.name for part in learnt.held_out}.isdisjoint(part.name for part in learnt.trained)
+    assert len(learnt.held_out) == 2
+    head = learnt.text.split("\n\n", maxsplit=1)[0]
+    assert all(part.name in head for part in [*learnt.trained, *learnt.held_out])
+
+
+def faulty(kind: str) -> list[Row]:
+    """A drive with something wrong from its twentieth second on."""
+    rows = list(drive(30).rows)
+    from_then = rows[0][1] + 20 * 10**9
+    at = next(place for place, row in enumerate(rows) if row[0] == "/speed" and row[1] >= from_then)
+    topic, time, data = rows[at]
+    if kind == "out of range":
+        rows[at] = (topic, time, number(7.5))
+    elif kind == "NaN":
+        rows[at] = (topic, time, number(math.nan))
+    elif kind == "stuck":
+        rows = [(name, when, data if name == topic and when > time else old) for name, when, old in rows]
+    elif kind == "silent":
+        rows = [row for row in rows if row[0] != topic or row[1] < time]
+    elif kind == "too often":
+        rows += [(name, when + 1000, old) for name, when, old in rows if name == topic and when >= time]
+    elif kind == "unknown mode":
+        rows.append(("/mode", time + 1, message("std_msgs/String", data="flying")))
+    elif kind == "forbidden move":
+        rows.append(("/mode", time + 1, message("std_msgs/String", data="idle")))
+        rows.append(("/mode", time + 2, message("std_msgs/String", data="firing")))
+    elif kind == "unanswered":
+        rows.append(("/ask", time + 1, message("std_msgs/Bool", data=True)))
+    return sorted(rows, key=lambda row: row[1])
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        ("out of range", "/speed data is out of range"),
+        ("NaN", "/speed data is out of range"),
+        ("stuck", "/speed data is stuck"),
+        ("silent", "/speed is silent for"),
+        ("too often", "/speed comes too often"),
+        ("unknown mode", "/mode data has a new value: flying"),
+        ("forbidden move", "/mode data makes a move that was never seen"),
+        ("unanswered", "/ask was not followed by /answer"),
+    ],
+)
+def test_a_fault_is_warned_of(learnt: Learnt, kind: str, says: str) -> None:
+    """Each kind of fault gives the warning that names it."""
+    assert any(text.startswith(says) for text in warnings(learnt, faulty(kind)))
+
+
+def test_what_the_held_out_recordings_contradict_is_said() -> None:
+    """A bound that is passed there is widened, a value that is new there leaves the set out; both with their alarms."""
+    odd = [drive(seed) for seed in range(1, 5)]
+    rows = [(topic, time, number(50.0) if place == 600 else data) if topic == "/speed" else (topic, time, data)
+            for place, (topic, time, data) in enumerate(odd[2].rows)]  # fmt: skip
+    at = next(place for place, row in enumerate(rows) if row[0] == "/mode")
+    rows[at] = (*rows[at][:2], message("std_msgs/String", data="flying"))
+    speeds = [place for place, row in enumerate(rows) if row[0] == "/speed"]
+    rows[speeds[300]] = (*rows[speeds[300]][:2], number(50.0))
+    odd[2] = replace(odd[2], rows=tuple(rows))
+    learnt = learn(odd, standard_definitions(), 0.25, lambda _: None)
+    assert [part.name for part in learnt.held_out] == ["drive 3"]
+    widened = {each.says for each in learnt.candidates if each.widened}
+    assert "data is out of range" in widened
+    assert "WIDENED after" in learnt.text
+    assert "data has a new value" in {each.says for each in learnt.left_out}
+    assert "// /mode data has a new value (one of" in learnt.text
+    assert not any("out of range" in text for text in warnings(learnt, odd[2].rows))
+
+
+def test_a_recording_alone_is_divided_in_time() -> None:
+    """The end of a single recording tests what its beginning taught."""
+    learnt = learn([drive(1, 200.0)], standard_definitions(), 0.3, lambda _: None)
+    (trained,), (held_out,) = learnt.trained, learnt.held_out
+    assert trained.ended < held_out.began
+    assert held_out.seconds == pytest.approx(60, rel=0.01)
+
+
+def test_nothing_to_learn_from_is_an_error() -> None:
+    """Recordings that disagree about a type, or have nothing on the topics, are refused with the reason."""
+    other = replace(DRIVES[1], topics={**TYPES, "/speed": "std_msgs/Float32"})
+    with pytest.raises(
+        LearningError, match="/speed carries std_msgs/Float64 in one recording and std_msgs/Float32"
+    ):
+        learn([DRIVES[0], other], standard_definitions(), 0.3, lambda _: None)
+    with pytest.raises(LearningError, match="no message"):
+        learn([replace(DRIVES[0], topics={})], standard_definitions(), 0.3, lambda _: None)
+    broken = replace(DRIVES[0], rows=(("/speed", START, b"abc"), *DRIVES[0].rows[1:]))
+    with pytest.raises(LearningError, match="drive 1: a message on /speed is no std_msgs/Float64"):
+        learn([broken, DRIVES[1]], standard_definitions(), 0.3, lambda _: None)
+
+
+def test_what_is_left_out_to_keep_the_text_short_is_said() -> None:
+    """Eighteen numbers of one topic get no more conditions than a person reads; the comment counts the others."""
+    chance = random.Random(7)  # noqa: S311  no secret
+
+    def joints() -> bytes:
+        arrays = {name: [chance.gauss(0, 1) for _ in range(6)] for name in ("position", "velocity", "effort")}
+        return message("sensor_msgs/JointState", name=[f"joint{number}" for number in range(6)], **arrays)
+
+    rows = tuple(("/arm", START + tick * 50_000_000, joints()) for tick in range(600))
+    learnt = learn(
+        [Recorded("arm", rows, {"/arm": "sensor_msgs/JointState"})], standard_definitions(), 0, lambda _: None
+    )
+    kinds = [each.kind for each in learnt.candidates]
+    assert (kinds.count("range"), kinds.count("length")) == (10, 4)
+    assert re.search(r"^// \d+ conditions more on /arm are not here", learnt.text, re.MULTILINE)
+    assert "// Nothing was held out: it is untested." in learnt.text

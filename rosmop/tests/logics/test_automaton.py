@@ -1,0 +1,104 @@
+"""Automata as tables: the smallest one with the same verdicts, and components of graphs."""
+
+from random import Random
+
+import pytest
+
+from rosmop.logics.automaton import (
+    Automaton,
+    TooManyStatesError,
+    explore,
+    letter_classes,
+    minimise,
+)
+from rosmop.logics.components import strong_components
+from rosmop.tests.logics.driving import seeded
+
+
+def drawn(random: Random) -> Automaton:
+    """A random automaton of which all states can be entered."""
+    size, letters = random.randint(1, 9), random.randint(1, 3)
+    table = [[random.randrange(size) for _ in range(letters)] for _ in range(size)]
+    for state in range(1, size):
+        table[random.randrange(state)][random.randrange(letters)] = state
+    verdicts = tuple(random.choice([(), (), ("v",), ("w",)]) for _ in range(size))
+    return Automaton(0, tuple(map(tuple, table)), verdicts)
+
+
+def classes_by_refinement(automaton: Automaton) -> list[int]:
+    """The equivalence of states by splitting until nothing splits any more, as it is defined."""
+    known: list[object] = list(automaton.verdicts)
+    while True:
+        signatures = [(known[s], tuple(known[t] for t in row)) for s, row in enumerate(automaton.table)]
+        numbers = {signature: number for number, signature in enumerate(dict.fromkeys(signatures))}
+        refined = [numbers[signature] for signature in signatures]
+        if len(set(refined)) == len(set(known)):
+            return refined
+        known = list(refined)
+
+
+def reached(automaton: Automaton) -> set[int]:
+    """The initial state and all that follow it."""
+    found = {automaton.initial}
+    while fresh := {target for state in found for target in automaton.table[state]} - found:
+        found |= fresh
+    return found
+
+
+def test_minimal_and_equivalent() -> None:
+    """The result has one state per class of states that can be reached, and tells the same on every trace."""
+    random = seeded(18)
+    for _ in range(1500):
+        automaton = drawn(random)
+        small = minimise(automaton)
+        classes = classes_by_refinement(automaton)
+        assert len(small) == len({classes[state] for state in reached(automaton)})
+        for _ in range(5):
+            mine = theirs = 0
+            for _ in range(12):
+                letter = random.randrange(len(automaton.table[0]))
+                mine, theirs = automaton.table[mine][letter], small.table[theirs][letter]
+                assert automaton.verdicts[mine] == small.verdicts[theirs]
+
+
+def test_a_long_chain_is_minimised_in_time() -> None:
+    """Ten thousand states that can only be told apart one after the other take no quadratic time."""
+    size = 10_000
+    table = tuple((min(state + 1, size - 1),) for state in range(size))
+    verdicts = tuple(("v",) if state == size - 1 else () for state in range(size))
+    assert len(minimise(Automaton(0, table, verdicts))) == size
+
+
+def test_exploring_stops_at_the_limit() -> None:
+    """States are counted while they are found."""
+    with pytest.raises(TooManyStatesError, match="more than 100 states"):
+        explore(0, 1, lambda state, _: state + 1, lambda _: (), 100)
+
+
+def test_events_that_are_not_named_are_one_class() -> None:
+    """Classes are numbered by their first event; -1 stands for what is not named."""
+    assert letter_classes(("x", "a", "y", "b"), ("b", "a")) == ([0, 1, 0, 2], [-1, 1, 0])
+
+
+def test_components_against_reachability() -> None:
+    """Two nodes are in one component exactly if each leads to the other; components come after those they lead to."""
+    random = seeded(19)
+    for _ in range(300):
+        size = random.randint(1, 8)
+        edges = {node: [n for n in range(size) if random.random() < 0.2] for node in range(size)}
+        leads = {node: {node} for node in edges}
+        for _ in range(size):
+            leads = {node: {far for near in leads[node] for far in (near, *edges[near])} for node in edges}
+        components = strong_components(edges, edges.__getitem__)
+        place = {node: number for number, component in enumerate(components) for node in component}
+        assert sorted(place) == list(range(size))
+        for one in edges:
+            for other in edges:
+                assert (place[one] == place[other]) == (other in leads[one] and one in leads[other])
+                assert other not in leads[one] or place[other] <= place[one]
+
+
+def test_many_states_with_many_ways_out_are_refused() -> None:
+    """Memory is bounded by the transitions, not by the states alone: each takes room while minimising."""
+    with pytest.raises(TooManyStatesError, match="more than 500000 transitions"):
+        explore(0, 1000, lambda state, _letter: min(state + 1, 9_000), lambda _state: ())

@@ -1,0 +1,363 @@
+"""``mtl`` about the future: against its definition in three values, and against what really came of it."""
+
+import importlib
+import sys
+from collections.abc import Callable
+from itertools import combinations_with_replacement, product
+from random import Random
+from types import FrameType
+from typing import Any
+
+import pytest
+from rosmop.tests.examples import examples
+
+from rosmop.logics import bounded
+from rosmop.logics.interface import RunFaultError
+from rosmop.tests.logics.driving import ABC, compiled, play, refusal, seeded
+from rosmop.tests.logics.temporal import Printer, Tree, draw
+from rosmop.tests.logics.test_mtl import Timed, timed_trace
+
+PAST = ("previously", "once", "historically", "since")
+FUTURE = ("next", "eventually", "always", "until")
+ARITY = dict.fromkeys(("not", *PAST[:3], *FUTURE[:3]), 1)
+PRINTER = Printer(
+    {word: (word,) for word in (*PAST, *FUTURE)},
+    [["since", "until"], ["and"], ["xor"], ["or"], ["implies", "iff"]],
+    ["implies", "iff"],
+)
+OVER = 10**6
+"""A time at which nothing is open any more."""
+
+Truth = bool | None
+
+
+def least(values: list[Truth]) -> Truth:
+    """Whether all hold; None where that is open."""
+    return False if False in values else None if None in values else True
+
+
+def most(values: list[Truth]) -> Truth:
+    """Whether one holds."""
+    return negated(least([negated(value) for value in values]))
+
+
+def negated(value: Truth) -> Truth:
+    """The opposite; of what is open, that is open."""
+    return None if value is None else not value
+
+
+def worth(tree: Tree, trace: Timed, i: int, passed: int) -> Truth:  # noqa: PLR0911, PLR0912  # one per operator
+    """What a formula is worth at event ``i`` when ``trace`` has happened and no event comes up to ``passed``."""
+    operator, *rest = tree
+    low, high = 0, OVER
+    if operator in (*PAST, *FUTURE):
+        low, high = rest.pop()
+        high = OVER if high is None else high
+
+    def at(operand: int, j: int) -> Truth:
+        return worth(rest[operand], trace, j, passed)
+
+    def near(j: int) -> bool:
+        return low <= abs(trace[j][0] - trace[i][0]) <= high
+
+    open_still: Truth = None if trace[i][0] + high > passed else False
+    past, future = range(i + 1), range(i, len(trace))
+    match operator:
+        case "event":
+            return bool(trace[i][1] == rest[0])
+        case "true" | "false":
+            return bool(operator == "true")
+        case "not":
+            return negated(at(0, i))
+        case "and":
+            return least([at(0, i), at(1, i)])
+        case "or":
+            return most([at(0, i), at(1, i)])
+        case "implies":
+            return most([negated(at(0, i)), at(1, i)])
+        case "xor" | "iff":
+            left, right = at(0, i), at(1, i)
+            return None if left is None or right is None else (left != right) is (operator == "xor")
+        case "previously":
+            return at(0, i - 1) if i > 0 and near(i - 1) else False
+        case "once":
+            return most([at(0, j) for j in past if near(j)])
+        case "historically":
+            return least([at(0, j) for j in past if near(j)])
+        case "since":
+            return most(
+                [least([at(1, j), *(at(0, k) for k in range(j + 1, i + 1))]) for j in past if near(j)]
+            )
+        case "next":
+            return open_still if i + 1 == len(trace) else at(0, i + 1) if near(i + 1) else False
+        case "eventually":
+            return most([open_still, *(at(0, j) for j in future if near(j))])
+        case "always":
+            return least([negated(open_still), *(at(0, j) for j in future if near(j))])
+        case "until":
+            ways = [least([at(1, j), *(at(0, k) for k in range(i, j))]) for j in future if near(j)]
+            return most([*ways, least([open_still, *(at(0, k) for k in future)])])
+    raise AssertionError(operator)
+
+
+def expected(tree: Tree, trace: Timed, end: int) -> list[tuple[int, str]]:
+    """When which verdicts are told, by the definition: whenever one is certain at an event for the first time."""
+    record: list[tuple[int, str]] = []
+    known: set[int] = set()
+
+    def look(time: int, seen: Timed, passed: int) -> None:
+        told = set()
+        for i in range(len(seen)):
+            if i not in known:
+                value = worth(tree, seen, i, passed)
+                if value is not None:
+                    known.add(i)
+                    told.add(value)
+        record.extend(
+            (time, word) for word, value in (("violation", False), ("validation", True)) if value in told
+        )
+
+    for place, (time, _) in enumerate(trace):
+        seen = trace[: place + 1]
+        look(time, seen, time - 1)
+        following = trace[place + 1][0] if place + 1 < len(trace) else end
+        for passed in range(time, following):
+            look(passed, seen, passed)
+    return record
+
+
+def told(text: str, trace: Timed, end: int) -> list[tuple[int, str]]:
+    """When which verdicts are told by the monitor."""
+    record = play(compiled("mtl", text).start(0), ABC, trace, end)
+    return [(time, category) for time, categories in record for category in categories]
+
+
+def with_bounds(tree: Tree, random: Random) -> Tree:
+    """The formula with random bounds on all its temporal operators."""
+    operands = tuple(with_bounds(part, random) if isinstance(part, tuple) else part for part in tree[1:])
+    if tree[0] not in (*PAST, *FUTURE):
+        return (tree[0], *operands)
+    low = random.choice([0, 0, 1, 2])
+    high = low + random.choice([0, 1, 2, 3])
+    return (tree[0], *operands, (low, None if tree[0] in PAST and random.random() < 0.4 else high))
+
+
+def is_about_the_future(tree: Tree) -> bool:
+    """Whether it has an operator about the future."""
+    return tree[0] in FUTURE or any(is_about_the_future(part) for part in tree[1:] if isinstance(part, tuple))
+
+
+SMALL = [
+    *((one, ("event", "a"), (low, high)) for one in FUTURE[:3] for low, high in ((0, 0), (0, 1), (1, 2))),
+    *(("until", ("event", "a"), ("event", "b"), (low, high)) for low, high in ((0, 1), (1, 1), (1, 2))),
+    ("implies", ("event", "a"), ("eventually", ("event", "b"), (0, 1))),
+    ("historically", ("implies", ("event", "a"), ("eventually", ("event", "b"), (0, 1))), (0, None)),
+    ("always", ("implies", ("event", "a"), ("once", ("event", "b"), (1, 1))), (0, 2)),
+    ("until", ("next", ("event", "a"), (0, 1)), ("always", ("event", "b"), (0, 1)), (0, 2)),
+    ("since", ("eventually", ("event", "a"), (0, 1)), ("next", ("event", "b"), (1, 1)), (1, None)),
+    ("previously", ("eventually", ("event", "a"), (1, 2)), (0, 1)),
+]
+
+
+def test_all_short_traces() -> None:
+    """Every trace of up to four events (three, if not all are tried) of three kinds at times 0 to 2."""
+    random = seeded(41)
+    for tree in SMALL:
+        text = PRINTER.show(tree, random)
+        for length in range(1, 5 if examples(6) == 6 else 4):
+            for times in combinations_with_replacement(range(3), length):
+                for events in product(ABC if length < 4 else ABC[:2], repeat=length):
+                    trace = list(zip(times, events, strict=True))
+                    assert told(text, trace, 12) == expected(tree, trace, 12), (text, trace)
+
+
+def test_random_formulas_by_definition() -> None:
+    """1500 formulas, if all are tried, with operators of past and future, at random in each other."""
+    random = seeded(42)
+    checked = 0
+    while checked < examples(1500):
+        tree = with_bounds(draw(random, 3, (*PAST, *FUTURE, *FUTURE), ARITY, ("a", "b")), random)
+        if not is_about_the_future(tree):
+            continue
+        checked += 1
+        text, trace = PRINTER.show(tree, random), timed_trace(random, 7, 3)
+        end = trace[-1][0] + 20
+        assert told(text, trace, end) == expected(tree, trace, end), (text, trace)
+
+
+def rtamt_text(tree: Tree) -> str:
+    """The formula in the language of the other monitor, over signals that are 1 where the event is, else -1."""
+    operator, *rest = tree
+    if operator == "event":
+        return f"({rest[0]} >= 0)"
+    bounds = "[{}:{}]".format(*rest.pop()) if operator in (*PAST, *FUTURE) else ""
+    operands = [rtamt_text(operand) for operand in rest]
+    if len(operands) == 1:
+        return f"({operator}{bounds} {operands[0]})"
+    return f"({operands[0]} {operator}{bounds} {operands[1]})"
+
+
+def rtamt_knows(tree: Tree) -> bool:
+    """Whether it has all operators: `xor` and `iff` are distances there, and what is before the first event holds."""
+    if tree[0] == "event":
+        return True
+    endless = tree[0] in PAST and tree[-1][1] is None
+    if endless or tree[0] in ("true", "false", "previously", "next", "xor", "iff"):
+        return False
+    return all(rtamt_knows(part) for part in tree[1:] if isinstance(part[0], str))
+
+
+@pytest.mark.skipif(
+    sys.version_info >= (3, 12), reason="the parser of rtamt needs typing.io, which Python 3.12 has not"
+)
+def test_against_another_monitor() -> None:
+    """With one event per unit of time, what a formula is worth once all is over is what another monitor says."""
+    rtamt = importlib.import_module("rtamt")
+    random = seeded(44)
+    compared = 0
+    while compared < 60:
+        tree = with_bounds(draw(random, 3, (*PAST[1:], *FUTURE[1:]), ARITY, ("a", "b")), random)
+        if not (rtamt_knows(tree) and is_about_the_future(tree)):
+            continue
+        compared += 1
+        trace = [(time, random.choice(ABC)) for time in range(40)]
+        other = rtamt.StlDiscreteTimeSpecification()
+        for name in ("a", "b", "out"):
+            other.declare_var(name, "float")
+        other.spec = f"out = {rtamt_text(tree)}"
+        other.parse()
+        signals = {name: [1.0 if event == name else -1.0 for _, event in trace] for name in ("a", "b")}
+        theirs = [value > 0 for _, value in other.evaluate({"time": [*range(40)], **signals})]
+        # no formula of this depth looks further ahead than fifteen units
+        ours = [worth(tree, trace, place, 40) for place in range(25)]
+        assert ours == theirs[:25], PRINTER.show(tree, random)
+
+
+def test_no_verdict_is_taken_back() -> None:
+    """What is told of an event is what the formula is worth there when all is over, however the trace goes on."""
+    random = seeded(43)
+    for _ in range(300):
+        tree = with_bounds(draw(random, 3, (*PAST, *FUTURE), ARITY, ("a", "b")), random)
+        trace = timed_trace(random, 8, 3)
+        final = [worth(tree, trace, i, 3 * OVER) for i in range(len(trace))]
+        assert None not in final
+        for place, (time, _) in enumerate(trace):
+            for i in range(place + 1):
+                early = worth(tree, trace[: place + 1], i, time - 1)
+                assert early is None or early is final[i], (tree, trace)
+
+
+def test_at_the_latest_when_the_bound_passes() -> None:
+    """Without another message the deadline brings the verdict; an event at the bound is in time."""
+    text = "a => eventually[0,5ns] b"
+    assert told(text, [(0, "a")], 100) == [(5, "violation")]
+    assert told(text, [(0, "a"), (5, "b")], 100) == [(5, "validation")]
+    assert told("a => always[0,5ns] !b", [(0, "a"), (2, "b")], 100) == [(2, "violation"), (2, "validation")]
+
+
+def test_nothing_is_waited_for_that_nobody_asks() -> None:
+    """What is decided otherwise leaves no deadline behind."""
+    run = compiled("mtl", "eventually[0,9ns] a or eventually[0,1s] (b and next[0,1s] b)").start(0)
+    run.step(ABC.index("c"), 0)
+    waiting = run.deadline
+    run.step(ABC.index("a"), 3)
+    assert (waiting, run.deadline) == (9, None)
+
+
+def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Events that wait are bounded in number; beyond that is a fault, and the run goes on."""
+    monkeypatch.setattr(bounded, "MOST_OPEN", 100)
+    run = compiled("mtl", "a => eventually[0,1s] b").start(0)
+    for time in range(100):
+        assert run.step(0, time) == ()
+    with pytest.raises(RunFaultError, match="more than 100 events"):
+        run.step(0, 100)
+    for _ in range(100):
+        assert run.expire() == ("violation",)
+    assert run.step(1, 3 * 10**9) == ("validation",)
+    assert run.step(0, 3 * 10**9) == ()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "always[0,2s] (a => eventually[0,1s] b)",
+        "eventually[0,2s] (a and eventually[0,1s] b)",
+        "(a => eventually[0,1s] b) until[0,2s] c",
+        "(next[0,1s] a) until[1s,2s] eventually[0,1s] c",
+    ],
+)
+@pytest.mark.parametrize("events", ["a", "ab", "b"])
+def test_a_step_costs_the_same_however_many_wait(text: str, events: str) -> None:
+    """What comes to be known of one event decides others without a look at all of them."""
+
+    def lines_run(each_second: int) -> float:
+        run, counted = compiled("mtl", text).start(0), 0
+
+        def trace(frame: FrameType, event: str, _argument: object) -> Callable[..., Any] | None:
+            nonlocal counted
+            counted += event == "line"
+            return trace if frame.f_code.co_filename == bounded.__file__ else None
+
+        before = sys.gettrace()
+        for number in range(4 * each_second):
+            if number == 3 * each_second:
+                sys.settrace(trace)
+            time = number * 10**9 // each_second
+            while (deadline := run.deadline) is not None and deadline < time:
+                run.expire()
+            run.step(ABC.index(events[number % len(events)]), time)
+        sys.settrace(before)
+        return counted / each_second
+
+    assert lines_run(400) < 1.2 * lines_run(100) + 10
+
+
+def test_enforceable() -> None:
+    """A handler may drop what brings the verdict, unless a bound that passes may bring it."""
+    for text, late in {
+        "a => eventually[0,1s] b": {"violation"},
+        "a => always[0,1s] !b": {"validation"},
+        "a => !eventually[0,1s] b": {"validation"},
+        "a until[0,1s] b": {"violation"},
+        "a <=> next[0,1s] b": {"violation", "validation"},
+        "once[0,1s] always[0,1s] a": {"validation"},
+    }.items():
+        refused = {
+            word for word in ("violation", "validation") if compiled("mtl", text).blocking_refused(word)
+        }
+        assert refused == late, text
+
+
+def test_no_verdict_that_may_be_dropped_for_comes_from_a_deadline() -> None:
+    """What the deadlines of random formulas bring is what their handlers must not drop for."""
+    random = seeded(44)
+    for _ in range(600):
+        tree = with_bounds(draw(random, 3, (*PAST, *FUTURE), ARITY, ("a", "b")), random)
+        monitor = compiled("mtl", PRINTER.show(tree, random))
+        run = monitor.start(0)
+        for time, event in timed_trace(random, 8, 6):
+            while (deadline := run.deadline) is not None and deadline < time:
+                assert all(monitor.blocking_refused(category) for category in run.expire()), monitor.formula
+            run.step(ABC.index(event), time)
+
+
+@pytest.mark.parametrize("text", ["always a", "a => eventually[1s,inf] b", "a until b", "next a"])
+def test_without_an_upper_bound(text: str) -> None:
+    """It is refused, and what to write is said."""
+    (finding,) = refusal("mtl", text)
+    assert "has no upper bound, so its verdict might never come; write" in finding
+
+
+def test_a_part_that_nobody_waits_for_any_more() -> None:
+    """It may hear, in the same step, of what it had waited for."""
+    text = (
+        "next[0ns,1ns] previously[0ns,inf] (b -> a)"
+        " or historically[0ns,inf] eventually[0ns,1ns] false and next[1ns,4ns] eventually[0ns,2ns] true"
+    )
+    part: Tree = ("previously", ("implies", ("event", "b"), ("event", "a")), (0, None))
+    other: Tree = ("historically", ("eventually", ("false",), (0, 1)), (0, None))
+    last: Tree = ("next", ("eventually", ("true",), (0, 2)), (1, 4))
+    tree: Tree = ("or", ("next", part, (0, 1)), ("and", other, last))
+    trace = list(zip((4, 4, 5, 5, 5, 5, 6, 7, 8), "cbbaaacbb", strict=True))
+    assert told(text, trace, 40) == expected(tree, trace, 40)

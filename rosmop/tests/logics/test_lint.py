@@ -1,0 +1,180 @@
+"""What is said of a property before it runs, and its picture."""
+
+from itertools import accumulate, product
+
+import pytest
+
+from rosmop.logics.dot import to_dot
+from rosmop.logics.lint import TIME, Fact, analyse, shortest_trace_to
+from rosmop.logics.past import ClockedPast
+from rosmop.tests.logics.driving import compiled, seeded, told, traces
+from rosmop.tests.logics.temporal import draw
+from rosmop.tests.logics.test_mtl import ARITY, PRINTER, TEMPORAL, bounded
+
+
+def kinds(logic: str, formula: str, handled: tuple[str, ...]) -> list[tuple[str, str]]:
+    """The facts, short."""
+    return [(fact.kind, fact.category) for fact in analyse(compiled(logic, formula), handled)]
+
+
+@pytest.mark.parametrize(
+    ("logic", "formula", "handled", "expected"),
+    [
+        (
+            "ltl",
+            "[](a => <> b)",
+            ("violation",),
+            [("never runs", "violation"), ("never violated", "violation")],
+        ),
+        ("ltl", "a and b", ("violation",), [("violated at once", "violation")]),
+        ("ltl", "[] !a", ("violation", "validation"), [("never runs", "validation")]),
+        ("ptltl", "a or !a", (), [("never violated", "violation")]),
+        ("ptltl", "(*) a", ("violation",), [("violated at once", "violation")]),
+        ("ere", "a* | ~a*", ("fail",), [("never runs", "fail")]),
+        ("ere", "empty", ("match",), [("never runs", "match"), ("violated at once", "fail")]),
+        (
+            "fsm",
+            "s0 [ default s0 ] s1 [ a -> s0 ]",
+            ("s0", "s1", "fail"),
+            [("never runs", "s1"), ("never runs", "fail")],
+        ),
+        ("fsm", "s0 [ a -> s1, default s1 ] s1 [ default s1 ]", ("s0",), [("never runs", "s0")]),
+        ("tfsm", "s0 [ timeout 1s -> s1, a -> s0 ] s1 [ ]", ("s1", "timeout"), []),
+        ("tfsm", "s0 [ default s0 ]", ("timeout",), []),
+        (
+            "pattern",
+            "globally: some a",
+            ("violation",),
+            [("never runs", "violation"), ("never violated", "violation")],
+        ),
+        ("pattern", "globally: some a within 1s", ("violation",), []),
+        ("pattern", "globally: a requires b within 1s", ("validation",), [("never runs", "validation")]),
+        ("mtl", "a => once[0,1s] b", ("violation",), []),
+        ("mtl", "once[0,1s] a or !once[0,1s] a", (), [("never violated", "violation")]),
+        ("mtl", "previously once[0,1s] a", (), [("violated at once", "violation")]),
+        (
+            "mtl",
+            "a and !a and once[0,1s] b",
+            ("validation",),
+            [("never runs", "validation"), ("violated at once", "violation")],
+        ),
+        ("cfg", "S -> a S b | epsilon", ("fail",), []),
+    ],
+)
+def test_facts(logic: str, formula: str, handled: tuple[str, ...], expected: list[tuple[str, str]]) -> None:
+    """Handlers that never run, and properties with one verdict only, are told; nothing is told that is not certain."""
+    assert kinds(logic, formula, handled) == expected
+
+
+def test_violated_at_once_shows_a_trace() -> None:
+    """The fact names a shortest trace that shows it."""
+    facts = analyse(compiled("ltl", "false"), ())
+    assert facts == [
+        Fact(
+            "violated at once",
+            "violation",
+            "the property is violated at the first event, whatever it is",
+            ("a",),
+        )
+    ]
+
+
+def test_shortest_traces_are_shortest() -> None:
+    """No shorter trace reaches the category, and the one given does."""
+    random = seeded(17)
+    formulas = ["[](a => o (b U c))", "<>(a and o (b and o c))", "(a U b) or [] c", "[](a => o o !a)"]
+    for formula in [*formulas, *(f"o {random.choice(formulas)}" for _ in range(4))]:
+        monitor = compiled("ltl", formula)
+        for category in monitor.categories:
+            found = next(
+                (trace for trace in traces("abc", 6) if told(monitor, trace)[-1] == (category,)), None
+            )
+            shown = shortest_trace_to(monitor, category)
+            assert (shown is None) == (found is None)
+            if shown is not None and found is not None:
+                assert len(shown) == len(found)
+                assert told(monitor, shown)[-1] == (category,)
+
+
+def test_of_a_time_bound_on_the_past_the_shortest_trace_leads_there() -> None:
+    """By the definition, with the time that it says has passed; where there is none no trace does."""
+    random, clocked, none = seeded(18), 0, 0
+    while clocked < 200:
+        tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 3)
+        monitor = compiled("mtl", PRINTER.show(tree, random))
+        if not isinstance(monitor, ClockedPast):
+            continue
+        clocked += 1
+        for category in monitor.categories:
+            shown = shortest_trace_to(monitor, category)
+            if shown is not None:
+                run, now = monitor.start(0), 0
+                said: tuple[str, ...] = ()
+                for word in shown:
+                    if word == TIME:
+                        now += 10**9
+                    else:
+                        said = run.step(monitor.events.index(word), now)
+                assert said == (category,), (monitor.formula, shown)
+            none += shown is None
+            for trace in traces("abc", 3) if shown is None else ():
+                for times in product((0, 1, 5), repeat=len(trace)):
+                    run = monitor.start(0)
+                    told_of = [
+                        run.step("abc".index(event), at)
+                        for event, at in zip(trace, accumulate(times), strict=True)
+                    ]
+                    assert (category,) not in told_of, (monitor.formula, trace, times)
+    assert none
+
+
+def test_time_is_part_of_a_trace() -> None:
+    """Where only the passing of time leads on, the trace says so."""
+    assert shortest_trace_to(
+        compiled("tfsm", "s0 [ a -> s1 ] s1 [ timeout 1s -> late ] late [ ]"), "late"
+    ) == ("a", TIME)
+    assert shortest_trace_to(compiled("tfsm", "s0 [ a -> s0 ]"), "timeout") == ("a", TIME)
+    assert shortest_trace_to(compiled("pattern", "globally: a causes b within 1s"), "violation") == (
+        "a",
+        TIME,
+    )
+    assert shortest_trace_to(compiled("pattern", "globally: a requires b within 1s"), "violation") == ("a",)
+
+
+def test_categories_after_an_event() -> None:
+    """Which categories an event can lead to is told, so that a timer's handlers can be found."""
+    machine = compiled("fsm", "s0 [ a -> s1, b -> s0 ] s1 [ a -> s1, b -> s0 ]", ("a", "b"))
+    assert machine.categories_after(0) == {"s1", "fail"}
+    assert machine.categories_after(1) == {"s0", "fail"}
+
+
+def test_picture() -> None:
+    """The picture has every state that can be entered, its categories, and one arrow per pair of states."""
+    picture = to_dot(compiled("fsm", "s0 [ a -> s1, b -> s1, c -> s0 ] s1 [ default s0 ] alias bad = s1"))
+    assert picture is not None
+    assert picture.startswith('digraph "fsm" {')
+    assert '1 [label="s1\\nbad"];' in picture
+    assert '0 -> 1 [label="a, b"];' in picture
+    assert "fail" not in picture
+
+
+@pytest.mark.parametrize(
+    ("logic", "formula"),
+    [
+        ("tfsm", "s0 [ timeout 1s -> s1 ] s1 [ ]"),
+        ("pattern", "after a: some b within 1s"),
+        ("ltl", "a U b"),
+        ("ere", "a b"),
+    ],
+)
+def test_pictures_of_timed_and_untimed_properties(logic: str, formula: str) -> None:
+    """Every finite monitor has a picture; braces and quotes are balanced."""
+    picture = to_dot(compiled(logic, formula))
+    assert picture is not None
+    assert picture.count("{") == picture.count("}") == 1
+    assert picture.count('"') % 2 == 0
+
+
+def test_no_picture_of_a_stack() -> None:
+    """A grammar that needs a stack has no picture."""
+    assert to_dot(compiled("cfg", "S -> a S b | epsilon")) is None

@@ -1,0 +1,248 @@
+"""``ltl``: verdicts against the meaning of the formula on ultimately periodic traces."""
+
+from collections.abc import Callable
+from itertools import product
+
+import pytest
+from rosmop.tests.examples import examples
+
+from rosmop.tests.logics.driving import compiled, refusal, seeded, told, traces
+from rosmop.tests.logics.temporal import Printer, Tree, draw
+
+AB = ("a", "b")
+UNARY = {"not": 1, "next": 1, "always": 1, "eventually": 1}
+TEMPORAL = ("next", "always", "eventually", "until", "release")
+PRINTER = Printer(
+    {"next": ("o", "~o"), "always": ("[]",), "eventually": ("<>",), "until": ("U",), "release": ("R", "~U")},
+    [["and"], ["xor"], ["or"], ["until", "release", "implies", "iff"]],
+    ["until", "release", "implies", "iff"],
+)
+
+PAST = ("previously", "once", "historically", "since", "dual since", "dual previously")
+MIXED = Printer(
+    {
+        "next": ("o",), "always": ("[]",), "eventually": ("<>",), "until": ("U",), "release": ("R",),
+        "previously": ("(*)",), "once": ("<*>",), "historically": ("[*]",), "since": ("S",), "dual since": ("~S",),
+        "dual previously": ("~(*)",),
+    },
+    [["and"], ["xor"], ["or"], ["until", "release", "since", "dual since", "implies", "iff"]],
+    ["until", "release", "since", "dual since", "implies", "iff"],
+)  # fmt: skip
+
+Lasso = tuple[tuple[str, ...], int]
+"""A trace that goes on for ever: its positions, and where the last one leads back to."""
+
+
+def lassos(events: tuple[str, ...], stem: int, loop: int) -> list[Lasso]:
+    """All with at most so many positions before and in the loop."""
+    return [
+        (word, length)
+        for length in range(stem + 1)
+        for turn in range(1, loop + 1)
+        for word in product(events, repeat=length + turn)
+    ]
+
+
+def holds(tree: Tree, lasso: Lasso) -> list[bool]:  # noqa: PLR0911  # one per kind of operator
+    """The truth of a formula at each position, by the definition of each operator; fixed points by iteration."""
+    word, back = lasso
+    size = len(word)
+    after = [*range(1, size), back]
+    operator = tree[0]
+    if operator == "event":
+        return [event == tree[1] for event in word]
+    if operator in ("true", "false"):
+        return [operator == "true"] * size
+    values = [holds(operand, lasso) for operand in tree[1:]]
+    if operator == "next":
+        return [values[0][after[i]] for i in range(size)]
+    if operator in ("always", "eventually"):
+        tail = [{*range(i, size), *range(back, size)} for i in range(size)]
+        test = all if operator == "always" else any
+        return [test(values[0][j] for j in tail[i]) for i in range(size)]
+    if operator in PAST:
+        truth = looking_back(operator, values)
+        turn = size - back
+        assert truth[-turn:] == truth[-2 * turn : -turn], "the trace is not unrolled far enough"
+        return truth
+    if operator in ("until", "release"):
+        truth = [operator == "release"] * size
+        for _ in range(size + 1):
+            for i in reversed(range(size)):
+                if operator == "until":
+                    truth[i] = values[1][i] or (values[0][i] and truth[after[i]])
+                else:
+                    truth[i] = values[1][i] and (values[0][i] or truth[after[i]])
+        return truth
+    table: dict[str, Callable[..., bool]] = {
+        "not": lambda x: not x,
+        "and": lambda x, y: x and y,
+        "or": lambda x, y: x or y,
+        "xor": lambda x, y: x != y,
+        "implies": lambda x, y: not x or y,
+        "iff": lambda x, y: x == y,
+    }
+    return [table[operator](*(value[i] for value in values)) for i in range(size)]
+
+
+def looking_back(operator: str, values: list[list[bool]]) -> list[bool]:
+    """The truth of an operator about the past at each position, by its definition."""
+    truth: list[bool] = []
+    for i, value in enumerate(values[-1]):
+        if operator in ("previously", "dual previously"):
+            truth.append(values[0][i - 1] if i else operator == "dual previously")
+        elif operator in ("once", "since"):
+            reach = values[0] if operator == "since" else [True] * (i + 1)
+            truth.append(any(values[-1][j] and all(reach[j + 1 : i + 1]) for j in range(i + 1)))
+        elif operator == "historically":
+            truth.append(all(values[0][: i + 1]))
+        else:
+            truth.append(value and (all(values[1][: i + 1]) or any(
+                values[0][j] and all(values[1][j : i + 1]) for j in range(i + 1)
+            )))  # fmt: skip
+    return truth
+
+
+def by_enumeration(tree: Tree, words: list[Lasso], longest: int) -> dict[tuple[str, ...], tuple[str, ...]]:
+    """The verdict for each prefix: what the continuations that were enumerated have in common."""
+    verdicts: dict[tuple[str, ...], set[bool]] = {}
+    for lasso in words:
+        truth = holds(tree, lasso)[0]
+        unrolled = list(lasso[0])
+        while len(unrolled) < longest:
+            unrolled += lasso[0][lasso[1] :]
+        for length in range(1, longest + 1):
+            verdicts.setdefault(tuple(unrolled[:length]), set()).add(truth)
+    names = {
+        frozenset({True}): ("validation",),
+        frozenset({False}): ("violation",),
+        frozenset({True, False}): (),
+    }
+    return {prefix: names[frozenset(found)] for prefix, found in verdicts.items()}
+
+
+@pytest.mark.parametrize(("events", "stem", "loop", "count"), [(AB, 5, 3, 120), (("a", "b", "x"), 4, 2, 80)])
+def test_verdicts_against_enumerated_continuations(
+    events: tuple[str, ...], stem: int, loop: int, count: int
+) -> None:
+    """A violation is where no continuation satisfies the formula, a validation where all do; `x` is not named."""
+    random = seeded(5)
+    words = lassos(events, stem, loop)
+    for _ in range(examples(count)):
+        tree = draw(random, 3, TEMPORAL, UNARY, AB)
+        text = PRINTER.show(tree, random)
+        monitor = compiled("ltl", text, events)
+        expected = by_enumeration(tree, words, 3)
+        for prefix in traces(events, 3):
+            assert told(monitor, prefix)[-1] == expected[prefix], (text, prefix)
+
+
+def unrolled(lasso: Lasso, turns: int) -> Lasso:
+    """The same trace, its loop written down several times before it leads back."""
+    word, back = lasso
+    loop = word[back:]
+    return word + loop * turns, len(word) + len(loop) * (turns - 1)
+
+
+def has(tree: Tree, operators: tuple[str, ...]) -> bool:
+    """Whether the formula has one of these."""
+    return tree[0] in operators or any(has(part, operators) for part in tree[1:] if isinstance(part, tuple))
+
+
+def test_past_and_future_against_enumerated_continuations() -> None:
+    """Operators of both kinds in each other: the verdict is what all continuations have in common."""
+    random = seeded(7)
+    words = [unrolled(lasso, 6) for lasso in lassos(AB, 4, 2)]
+    arity = UNARY | dict.fromkeys(("previously", "once", "historically", "dual previously"), 1)
+    checked = 0
+    while checked < 100:
+        tree = draw(random, 3, (*TEMPORAL, *PAST), arity, AB)
+        if not (has(tree, PAST) and has(tree, TEMPORAL)):
+            continue
+        checked += 1
+        text = MIXED.show(tree, random)
+        monitor = compiled("ltl", text, AB)
+        expected = by_enumeration(tree, words, 3)
+        for prefix in traces(AB, 3):
+            assert told(monitor, prefix)[-1] == expected[prefix], (text, prefix)
+
+
+def test_many_operators_about_the_past() -> None:
+    """What looks back over past events only costs no more than what it remembers."""
+    monitor = compiled("ltl", "[](a => " + "(*) " * 7 + "b)", AB)
+    assert told(monitor, "bbbbbbbab")[-2:] == [(), ()]
+    assert told(monitor, "abbbbbbaa") == [("violation",)] * 9
+    assert told(monitor, "b" + "b" * 7 + "a" * 8 + "a")[-2:] == [("violation",)] * 2
+
+
+def test_long_traces_of_random_formulas() -> None:
+    """On a long prefix the verdict is that of looping on for ever, as far as there is one; and it is for good."""
+    random = seeded(6)
+    for _ in range(400):
+        tree = draw(random, 4, TEMPORAL, UNARY, ("a", "b", "c"))
+        monitor = compiled("ltl", PRINTER.show(tree, random), ("a", "b", "c", "x"))
+        stem = tuple(random.choices("abcx", k=6))
+        loop = tuple(random.choices("abcx", k=3))
+        told_so_far = told(monitor, stem + loop * 20)
+        final = told_so_far[-1]
+        if final:
+            assert (final == ("validation",)) == holds(tree, (stem + loop, 6))[0]
+        decided = [verdict for verdict in told_so_far if verdict]
+        assert decided == [final] * len(decided)
+
+
+def test_known_properties() -> None:
+    """The verdicts of properties from the literature, with the traces that show them."""
+    assert told(compiled("ltl", "[](a => o (!a U b))"), "abaa")[-2:] == [(), ("violation",)]
+    assert told(compiled("ltl", "a => <> b"), "b") == [("validation",)]
+    assert told(compiled("ltl", "[]<> a"), "bbbb") == [()] * 4
+    assert told(compiled("ltl", "true"), "ab") == [("validation",)] * 2
+    assert told(compiled("ltl", "a and b"), "ab") == [("violation",)] * 2
+
+
+def test_a_contradiction_is_found_before_it_shows() -> None:
+    """A formula that no trace satisfies is violated at the first event, even if only liveness contradicts itself."""
+    assert told(compiled("ltl", "[]<> a and <>[] !a"), "a") == [("violation",)]
+
+
+def test_chains_need_parentheses() -> None:
+    """Operators of the loosest level do not chain."""
+    assert refusal("ltl", "a U b => c") == [
+        "7:17: `=>` in a chain without parentheses; write which part belongs together"
+    ]
+    assert told(compiled("ltl", "a U (b => c)"), "c") == told(compiled("ltl", "a U (!b or c)"), "c")
+
+
+def test_formulas_about_the_past_are_refused() -> None:
+    """A formula about the past alone is pointed to ptltl; one with too many operators about it is refused."""
+    assert refusal("ltl", "[*] a") == ["7:11: a formula about the past; write `ptltl:` for `ltl:`"]
+    assert refusal("ltl", "a S b") == ["7:11: a formula about the past; write `ptltl:` for `ltl:`"]
+    assert "10 different operators about the past" in refusal("ltl", "[](a => " + "(*) " * 10 + "b)")[0]
+
+
+def test_an_event_with_the_name_of_an_operator() -> None:
+    """Where only an event fits, the operator's name is explained."""
+    assert refusal("ltl", "[] o", ("o", "b")) == ["7:14: `o` is an operator of ltl; rename the event"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<>(a and " + "o " * 40 + "b)",
+        "!" * 100_000 + "a",
+        "(" * 90_000,
+        " and ".join(f"<>(a and {'o ' * i} b)" for i in range(1, 30)),
+        "a or " * 100_000 + "a",
+    ],
+)
+def test_hostile_formulas_are_refused(text: str) -> None:
+    """Formulas whose monitor would be huge, or that are nested too deep, are refused with a reason."""
+    assert len(refusal("ltl", text)) == 1
+
+
+def test_nested_parity_is_small() -> None:
+    """`xor` and `<=>` nested to the limit do not blow up the construction."""
+    text = "[] a"
+    for number in range(60):
+        text = f"({text}) {'xor' if number % 2 else '<=>'} b"
+    assert compiled("ltl", text).categories == ("violation", "validation")

@@ -1,0 +1,274 @@
+"""``mtl`` over the past: against the definition of its operators, and against another monitor."""
+
+from copy import copy
+from random import Random
+from typing import Any
+
+import pytest
+import reelay
+
+from rosmop.logics import past
+from rosmop.logics.interface import ClockedProperty, FiniteProperty, Run
+from rosmop.logics.past import PastProperty, PastRun, Window
+from rosmop.tests.logics.driving import ABC, compiled, refusal, seeded
+from rosmop.tests.logics.temporal import Printer, Tree, draw
+
+ARITY = {"not": 1, "previously": 1, "once": 1, "historically": 1}
+TEMPORAL = ("previously", "once", "historically", "since")
+PRINTER = Printer(
+    {
+        "previously": ("previously",),
+        "once": ("once",),
+        "historically": ("historically",),
+        "since": ("since",),
+    },
+    [["since"], ["and"], ["xor"], ["or"], ["implies", "iff"]],
+    ["implies", "iff"],
+)
+Timed = list[tuple[int, str]]
+
+
+def bounded(tree: Tree, random: Random, largest: int) -> Tree:
+    """The formula with random bounds on its temporal operators."""
+    if tree[0] in ("event", "true", "false"):
+        return tree
+    operands = tuple(bounded(operand, random, largest) for operand in tree[1:])
+    if tree[0] not in TEMPORAL or random.random() < 0.2:
+        return (tree[0], *operands)
+    low = random.choice([0, 0, random.randint(0, largest)])
+    high = random.choice([None, low + random.randint(0, largest)])
+    return (tree[0], *operands, (low, high))
+
+
+def holds(tree: Tree, trace: Timed, i: int) -> bool:  # noqa: PLR0911, PLR0912  # one per operator
+    """The truth of a formula at event ``i``, by the definition of each operator."""
+    operator, *rest = tree
+    low, high = (0, None)
+    if operator in TEMPORAL and rest and isinstance(rest[-1][0], int):
+        low, high = rest.pop()
+
+    def at(operand: int, position: int) -> bool:
+        return holds(rest[operand], trace, position)
+
+    def near(j: int) -> bool:
+        distance = trace[i][0] - trace[j][0]
+        return distance >= low and (high is None or distance <= high)
+
+    past = range(i + 1)
+    match operator:
+        case "event":
+            return bool(trace[i][1] == rest[0])
+        case "true" | "false":
+            return bool(operator == "true")
+        case "not":
+            return not at(0, i)
+        case "and":
+            return at(0, i) and at(1, i)
+        case "or":
+            return at(0, i) or at(1, i)
+        case "xor":
+            return at(0, i) != at(1, i)
+        case "implies":
+            return not at(0, i) or at(1, i)
+        case "iff":
+            return at(0, i) == at(1, i)
+        case "previously":
+            return i > 0 and near(i - 1) and at(0, i - 1)
+        case "once":
+            return any(near(j) and at(0, j) for j in past)
+        case "historically":
+            return all(at(0, j) for j in past if near(j))
+        case "since":
+            return any(near(j) and at(1, j) and all(at(0, k) for k in range(j + 1, i + 1)) for j in past)
+    raise AssertionError(operator)
+
+
+def verdicts(run: Run, trace: Timed, events: tuple[str, ...] = ABC) -> list[bool]:
+    """Whether the formula holds, at each event."""
+    return [run.step(events.index(event), time) == ("validation",) for time, event in trace]
+
+
+def timed_trace(random: Random, length: int, gap: int) -> Timed:
+    """Events at random times, several at one instant now and then."""
+    time, trace = random.randint(0, 5), []
+    for _ in range(length):
+        time += random.choice([0, 1, random.randint(0, gap)])
+        trace.append((time, random.choice(ABC)))
+    return trace
+
+
+@pytest.mark.parametrize("folded", [past.MAX_FOLDED, 0])
+def test_random_formulas_by_definition(folded: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Validation exactly where the formula holds: 1500 formulas with bounds of all kinds, two traces each.
+
+    Also of formulas that are too large to find what is left of them at each event.
+    """
+    monkeypatch.setattr(past, "MAX_FOLDED", folded)
+    random = seeded(9)
+    for _ in range(1500):
+        tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 6)
+        text = PRINTER.show(tree, random)
+        monitor = compiled("mtl", text)
+        for trace in (timed_trace(random, 8, 4), timed_trace(random, 9, 9)):
+            expected = [holds(tree, trace, i) for i in range(len(trace))]
+            assert verdicts(monitor.start(0), trace) == expected, (text, trace)
+
+
+def test_long_traces_by_definition() -> None:
+    """On traces of hundreds of events, one operator with every kind of bounds agrees with its definition."""
+    random = seeded(10)
+    for low, high in ((0, 30), (10, None), (10, 40), (20, 20), (7, 9), (0, None), (0, 0)):
+        for tree in (
+            ("since", ("not", ("event", "c")), ("event", "a"), (low, high)),
+            ("once", ("event", "a"), (low, high)),
+        ):
+            monitor = compiled("mtl", PRINTER.show(tree, random))
+            trace = timed_trace(random, 250, 8)
+            assert verdicts(monitor.start(0), trace) == [holds(tree, trace, i) for i in range(len(trace))]
+
+
+def reelay_text(tree: Tree) -> str:  # noqa: PLR0911  # one per operator
+    """The formula in the language of the other monitor."""
+    operator, *rest = tree
+    bounds = ""
+    if rest and isinstance(rest[-1][0], int):
+        low, high = rest.pop()
+        bounds = f"[{low}:{'inf' if high is None else high}]"
+    parts = [reelay_text(operand) if isinstance(operand, tuple) else f"{{{operand}}}" for operand in rest]
+    match operator:
+        case "event":
+            return parts[0]
+        case "not":
+            return f"(!{parts[0]})"
+        case "and" | "or":
+            return f"({parts[0]} {'&&' if operator == 'and' else '||'} {parts[1]})"
+        case "implies":
+            return f"({parts[0]} -> {parts[1]})"
+        case "previously":
+            return f"(pre {parts[0]})"
+        case "once" | "historically":
+            return f"({operator}{bounds} {parts[0]})"
+        case "since":
+            return f"({parts[0]} since{bounds} {parts[1]})"
+    raise AssertionError(operator)
+
+
+def expressible(tree: Tree) -> bool:
+    """Whether the other monitor knows all operators (and it takes `[0:0]` for no bounds)."""
+    if isinstance(tree[-1], tuple) and tree[-1] == (0, 0):
+        return False
+    if tree[0] in ("true", "false", "xor", "iff") or (tree[0] == "previously" and len(tree) > 2):
+        return False
+    return tree[0] == "event" or all(expressible(part) for part in tree[1:] if isinstance(part[0], str))
+
+
+def test_against_another_monitor() -> None:
+    """With one event per unit of time, verdicts agree with those of an independent discrete-time monitor."""
+    random = seeded(11)
+    compared = 0
+    while compared < 80:
+        tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 6)
+        if not expressible(tree):
+            continue
+        compared += 1
+        other: Any = reelay.discrete_timed_monitor(
+            pattern=reelay_text(tree), semantics="boolean", condense=False
+        )
+        trace = [(time, random.choice(ABC)) for time in range(30)]
+        theirs = [other.update({name: name == event for name in ("a", "b")})["value"] for _, event in trace]
+        text = PRINTER.show(tree, random)
+        assert verdicts(compiled("mtl", text).start(0), trace) == theirs, text
+
+
+def test_bounds_are_closed() -> None:
+    """An event exactly 500 ms ago is within `[0,500ms]`, one nanosecond earlier it is not."""
+    run = compiled("mtl", "a => once[0,500ms] b").start(0)
+    trace = [(0, "b"), (500_000_000, "a"), (500_000_001, "a")]
+    assert verdicts(run, trace) == [True, True, False]
+
+
+def test_durations() -> None:
+    """Units may stand apart, a bare number is seconds, and fractions are exact."""
+    for bound in ("0.1s", "0.1 s", "100ms", "100 ms", "0.1", "100000us", "100000000 ns"):
+        run = compiled("mtl", f"once[{bound}, {bound}] a").start(0)
+        assert verdicts(run, [(0, "a"), (99_999_999, "b"), (100_000_000, "b")]) == [False, False, True], bound
+
+
+def test_without_bounds_it_is_a_table() -> None:
+    """A formula without time bounds is compiled to a finite automaton."""
+    assert isinstance(compiled("mtl", "a since !b"), FiniteProperty)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a => once[0,3ns] b",
+        "!c since[2ns,inf] a",
+        "previously[0,2ns] (a or previously b)",
+        "historically[0,0] (a => once b)",
+    ],
+)
+def test_with_one_bound_it_has_tables_and_a_clock(text: str) -> None:
+    """One that begins at once, or has no end: a module can step it; and it tells what the windows tell."""
+    one, other = compiled("mtl", text), compiled("mtl", f"({text}) or once[1ns,1ns] false")
+    assert isinstance(one, ClockedProperty)
+    assert isinstance(other, PastProperty)
+    random = seeded(14)
+    for _ in range(200):
+        trace = timed_trace(random, 12, 4)
+        assert verdicts(one.start(0), trace) == verdicts(other.start(0), trace), trace
+
+
+def test_time_does_not_run_backwards() -> None:
+    """An event with an earlier time counts as of the latest time seen."""
+    run = compiled("mtl", "once[5ns,inf] a").start(0)
+    assert verdicts(run, [(10, "a"), (3, "b"), (15, "b")]) == [False, False, True]
+
+
+def test_a_copy_of_a_run_goes_on_by_itself() -> None:
+    """What happens to one of the two changes nothing for the other."""
+    random = seeded(12)
+    for _ in range(300):
+        tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 6)
+        run = compiled("mtl", PRINTER.show(tree, random)).start(0)
+        begun = timed_trace(random, 5, 4)
+        verdicts(run, begun)
+        runs = run, copy(run)
+        traces = [
+            [*begun, *((begun[-1][0] + time, event) for time, event in timed_trace(random, 5, 4))]
+            for _ in runs
+        ]
+        for place in range(5, 10):
+            for one, trace in zip(runs, traces, strict=True):
+                assert verdicts(one, trace[place : place + 1]) == [holds(tree, trace, place)], (tree, trace)
+
+
+def test_memory_of_what_is_not_asked_for_is_bounded() -> None:
+    """However many events happen at which the formula holds anyway, no window grows."""
+    run = compiled("mtl", "a => once[1s,2s] b or previously[1s,2s] b").start(0)
+    assert isinstance(run, PastRun)
+    for second in range(0, 3_000, 3):
+        assert run.step(1, second * 10**9) == ("validation",)
+    assert all(len(value) <= 2 for value in run.values if isinstance(value, Window))
+
+
+def test_memory_of_a_window_is_bounded_by_its_bounds() -> None:
+    """However many events, `since[l,u]` keeps about l/(u-l) intervals."""
+    window = Window(1000, 1100)
+    longest = 0
+    for now in range(0, 200_000, 3):
+        window.step(True, True, now)
+        longest = max(longest, len(window))
+    assert longest <= 12
+
+
+def test_refusals() -> None:
+    """What has no bound, symbols of ltl and impossible bounds are refused with what to write."""
+    assert refusal("mtl", "a S b") == ["7:13: `S` is written `since` in mtl"]
+    assert "above the upper bound" in refusal("mtl", "once[2s,1s] a")[0]
+    assert refusal("mtl", "once[0,5sec] a") == [
+        "7:19: `sec` is no unit of time; write one of ns, us, ms, s, m, min, h"
+    ]
+    assert "finer than a nanosecond" in refusal("mtl", "once[0,0.5ns] a")[0]
+    assert "31 years" in refusal("mtl", "once[0,99999999h] a")[0]
+    assert "digits" in refusal("mtl", f"once[0,{'9' * 5000}] a")[0]

@@ -1,0 +1,297 @@
+"""``pattern``: against a declarative meaning, with certainty decided by looking at what may follow."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import pytest
+from rosmop.tests.examples import examples
+
+from rosmop.logics.interface import CompiledProperty
+from rosmop.tests.logics.driving import compiled, play, refusal, seeded, told
+
+Timed = tuple[tuple[int, str], ...]
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """A pattern, read as a statement about what has happened until now."""
+
+    kind: str
+    opens: str | None
+    closes: str | None
+    first: str
+    second: str
+    within: int | None
+
+    def text(self) -> str:
+        """The pattern in the syntax of the logic."""
+        scope = {
+            (False, False): "globally",
+            (True, False): f"after {self.opens}",
+            (False, True): f"until {self.closes}",
+            (True, True): f"after {self.opens} until {self.closes}",
+        }[self.opens is not None, self.closes is not None]
+        body = (
+            f"{self.kind} {self.second}"
+            if self.kind in ("no", "some")
+            else f"{self.first} {self.kind} {self.second}"
+        )
+        return f"{scope}: {body}" + ("" if self.within is None else f" within {self.within} ns")
+
+    def scopes(self, trace: Timed) -> Iterator[tuple[int, Timed, bool]]:
+        """For each scope: when it opened, the events inside it, and whether it is closed."""
+        opened: int | None = 0 if self.opens is None else None
+        inside: list[tuple[int, str]] = []
+        for time, event in trace:
+            if opened is None:
+                if event == self.opens:
+                    opened, inside = time, []
+            elif event == self.closes:
+                yield opened, tuple(inside), True
+                opened = None
+                if self.opens is None:
+                    return
+            else:
+                inside.append((time, event))
+        if opened is not None:
+            yield opened, tuple(inside), False
+
+    def unmet(self, trace: Timed, now: int) -> tuple[bool, frozenset[tuple[int, int]]]:
+        """Whether the pattern is violated by now, and what is still due (as scope and place in it)."""
+        results = [self._in_scope(*scope, now) for scope in self.scopes(trace)]
+        due = {(number, place) for number, (_, places) in enumerate(results) for place in places}
+        return any(violated for violated, _ in results), frozenset(due)
+
+    def _in_scope(self, opened: int, inside: Timed, closed: bool, now: int) -> tuple[bool, set[int]]:
+        def near(early: int, late: int) -> bool:
+            return self.within is None or late - early <= self.within
+
+        def missing(since: int, place: int) -> tuple[bool, set[int]]:
+            over = closed or not near(since, now)
+            return over, set() if over else {place}
+
+        firsts = [(i, time) for i, (time, event) in enumerate(inside) if event == self.first]
+        seconds = [(i, time) for i, (time, event) in enumerate(inside) if event == self.second]
+        if self.kind == "no":
+            return any(near(opened, time) for _, time in seconds), set()
+        if self.kind == "some":
+            return (False, set()) if any(near(opened, time) for _, time in seconds) else missing(opened, -1)
+        if self.kind == "causes":
+            unanswered = [
+                missing(t, i) for i, t in firsts if not any(j > i and near(t, u) for j, u in seconds)
+            ]
+            return any(violated for violated, _ in unanswered), set().union(*(due for _, due in unanswered))
+        if self.kind == "requires":
+            return any(not any(j < i and near(u, t) for j, u in seconds) for i, t in firsts), set()
+        return any(j > i and near(t, u) for i, t in firsts for j, u in seconds), set()
+
+    def verdict(self, trace: Timed, now: int, events: tuple[str, ...], ahead: int) -> tuple[str, ...]:
+        """What is certain. Validation: nothing can be violated or due. Violation: what is due now cannot be met."""
+        gaps = (0,) if self.within is None else (0, self.within + 1)
+        _, due_now = self.unmet(trace, now)
+        can_meet = can_miss = False
+        for length in range(ahead + 1):
+            for steps in product(product(gaps, events), repeat=length):
+                time, longer = now, list(trace)
+                for gap, event in steps:
+                    time += gap
+                    longer.append((time, event))
+                for end in {time, time + gaps[-1]}:
+                    violated, due = self.unmet(tuple(longer), end)
+                    can_meet = can_meet or not (violated or due & due_now)
+                    can_miss = can_miss or violated or bool(due)
+                if can_meet and can_miss:
+                    return ()
+        return ("validation",) if can_meet else ("violation",)
+
+
+def meanings(events: tuple[str, ...], bounds: tuple[int | None, ...]) -> list[Meaning]:
+    """Every pattern over some events, those in which one event has several parts included."""
+    scopes = [
+        (None, None),
+        *((e, None) for e in events),
+        *((None, e) for e in events),
+        *product(events, events),
+    ]
+    return [
+        Meaning(kind, opens, closes, first, second, within)
+        for kind in ("no", "some", "causes", "requires", "forbids")
+        for opens, closes in scopes
+        for first, second in product(events[:1] if kind in ("no", "some") else events, events)
+        for within in bounds
+    ]
+
+
+def test_every_untimed_pattern_on_all_short_traces() -> None:
+    """Untimed verdicts are certain when they are told, and told as soon as they are certain."""
+    random = seeded(15)
+    for meaning in random.sample(meanings(("a", "b", "c"), (None,)), 150):
+        pattern = compiled("pattern", meaning.text())
+        for trace in random.sample(list(product("abc", repeat=4)), 10):
+            told_here = told(pattern, trace)
+            for length in range(1, 5):
+                timed = tuple((0, event) for event in trace[:length])
+                expected = meaning.verdict(timed, 0, ("a", "b", "c"), 4)
+                assert told_here[length - 1] == expected, (meaning.text(), trace[:length])
+
+
+def told_by(meaning: Meaning, trace: Timed, end: int) -> list[tuple[int, tuple[str, ...]]]:
+    """What is told when, by definition: at each instant before ``end`` what is certain."""
+    record = []
+    decided = bool(meaning.verdict((), 0, ("a", "b", "c"), 3))
+    seen: list[tuple[int, str]] = []
+    for instant in range(end):
+        for time, event in trace:
+            if time == instant:
+                seen.append((time, event))
+                verdict = meaning.verdict(tuple(seen), instant, ("a", "b", "c"), 3)
+                record.append((instant, verdict))
+                decided = bool(verdict)
+        if not decided and (passed := _deadline(meaning, tuple(seen), instant)):
+            record.append((instant, passed))
+            decided = True
+    return record
+
+
+def test_timed_patterns_event_by_event() -> None:
+    """With time bounds, each verdict is the certain one at its instant, those of deadlines included."""
+    random = seeded(16)
+    for meaning in random.sample(meanings(("a", "b", "c"), (0, 3)), examples(220)):
+        pattern = compiled("pattern", meaning.text())
+        for _ in range(3):
+            times = sorted(random.randint(0, 12) for _ in range(4))
+            trace = tuple((time, random.choice("abc")) for time in times)
+            told_here = play(pattern.start(0), ("a", "b", "c"), trace, 20)
+            assert told_here == told_by(meaning, trace, 20), (meaning.text(), trace)
+
+
+def _deadline(meaning: Meaning, seen: Timed, instant: int) -> tuple[str, ...]:
+    """What becomes certain only because nothing more happens at this instant."""
+    if meaning.unmet(seen, instant + 1)[0]:
+        return ("violation",)
+    windows = [opened + (meaning.within or 0) for opened, _, closed in meaning.scopes(seen) if not closed]
+    if meaning.kind == "no" and instant in windows:
+        return meaning.verdict(seen, instant + 1, ("a", "b", "c"), 3)
+    return ()
+
+
+def test_examples() -> None:
+    """The patterns of the documentation."""
+    ms = 1_000_000
+    causes = compiled("pattern", "globally: a causes b within 100 ms")
+    trace = [(0, "a"), (100 * ms, "b"), (150 * ms, "a"), (300 * ms, "b")]
+    assert play(causes.start(0), causes.events, trace) == [
+        (0, ()),
+        (100 * ms, ()),
+        (150 * ms, ()),
+        (250 * ms, ("violation",)),
+        (300 * ms, ("violation",)),
+    ]
+    some = compiled("pattern", "after a: some b within 2s")
+    assert play(some.start(0), some.events, [(10**9, "a"), (3 * 10**9, "b")]) == [
+        (10**9, ()),
+        (3 * 10**9, ("validation",)),
+    ]
+    assert told(compiled("pattern", "after a until b: no c"), "cacb") == [
+        (),
+        (),
+        ("violation",),
+        ("violation",),
+    ]
+    assert told(compiled("pattern", "until b: c requires a"), "acb") == [("validation",)] * 3
+    assert told(compiled("pattern", "globally: a forbids b"), "bab") == [(), (), ("violation",)]
+
+
+def test_an_event_that_causes_itself_is_a_heartbeat() -> None:
+    """`a causes a within t`: each `a` needs another one; the one that answers is waited for anew."""
+    beat = compiled("pattern", "globally: a causes a within 3 ns")
+    assert play(beat.start(0), beat.events, [(0, "a"), (3, "a"), (6, "a")], 20)[-1] == (9, ("violation",))
+
+
+def test_enforceable() -> None:
+    """What a deadline decides cannot block; what comes with the message can."""
+    for text, refused in {
+        "globally: some a within 1s": True,
+        "globally: a causes b within 1s": True,
+        "globally: a causes b": False,
+        "globally: a requires b within 1s": False,
+        "globally: a forbids b within 1s": False,
+        "until a: no b": False,
+    }.items():
+        assert (compiled("pattern", text).blocking_refused("violation") is not None) == refused, text
+
+
+def test_what_is_published_counts_as_having_come() -> None:
+    """With the remedies put into the trace as answers, the pattern without them says the same of all short traces."""
+    for scope, closes in (("globally", ""), ("after c", ""), ("until c", "c"), ("after c until b", "b")):
+        for body in ("some a", "b causes a", "some b", "a causes b"):
+            if body[-1] == closes:
+                continue
+            text = f"{scope}: {body} within 2 ns"
+            enforced, plain = compiled("pattern", f"{text} enforced by f"), compiled("pattern", text)
+            for times in ((0, 1, 3), (1, 2, 2), (2, 2, 5), (0, 4, 9)):
+                for events in product("abc", repeat=3):
+                    trace = list(zip(times, events, strict=True))
+                    record = play(enforced.start(0), "abc", trace, 30)
+                    remedies = [time for time, told in record if "enforced" in told]
+                    check_remedies(plain, trace, remedies, body[-1])
+                    told = [(time, tuple(one for one in told if one != "enforced")) for time, told in record]
+                    answered = with_answers(trace, remedies, body[-1])
+                    assert first(told) == first(play(plain.start(0), "abc", answered, 30)), (text, trace)
+
+
+def with_answers(trace: list[tuple[int, str]], remedies: list[int], answer: str) -> list[tuple[int, str]]:
+    """The trace with an answer at each remedy, behind what happened at that time."""
+    return sorted([*trace, *((time, answer) for time in remedies)], key=lambda one: one[0])
+
+
+def check_remedies(
+    plain: CompiledProperty, trace: list[tuple[int, str]], remedies: list[int], answer: str
+) -> None:
+    """Each comes when, without it, the deadline would have violated the pattern."""
+    for place, time in enumerate(remedies):
+        before = [one for one in with_answers(trace, remedies[:place], answer) if one[0] <= time]
+        assert play(plain.start(0), "abc", before, time + 1)[-1] == (time, ("violation",)), (trace, remedies)
+
+
+def first(record: list[tuple[int, tuple[str, ...]]]) -> tuple[int, tuple[str, ...]] | None:
+    """The first verdict, which is for good."""
+    return next((one for one in record if one[1]), None)
+
+
+def test_a_heartbeat_that_stops_is_answered_once() -> None:
+    """What is published asks for no answer itself."""
+    run = compiled("pattern", "globally: a causes a within 3 ns enforced by f").start(0)
+    assert play(run, "a", [(0, "a"), (2, "a"), (20, "a")], 50) == [
+        (0, ()), (2, ()), (5, ("enforced",)), (20, ()), (23, ("enforced",)),
+    ]  # fmt: skip
+
+
+def test_what_cannot_be_enforced_by_publishing() -> None:
+    """Where nothing is due, and where nobody knows when."""
+    assert "leaves nothing due" in refusal("pattern", "globally: no a within 1s enforced by f")[0]
+    assert "needs to know when" in refusal("pattern", "globally: some a enforced by f")[0]
+    assert "expected `by`" in refusal("pattern", "globally: some a within 1s enforced f")[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "finding"),
+    [
+        (
+            "always: no a",
+            "7:11: expected a scope: `globally:`, `after a:`, `until b:` or `after a until b:`, found `always`",
+        ),
+        ("globally no a", "7:20: expected `:` after the scope, found `no`"),
+        ("globally: a leads b", "7:23: expected `causes`, `requires` or `forbids`, found `leads`"),
+        ("globally: no x", "7:24: `x` is not an event of this specification; there are: a, b, c"),
+        ("globally: no a b", "7:26: expected `within` and a duration, or the end of the pattern, found `b`"),
+        (
+            "globally: some a within soon",
+            "7:35: expected a time bound such as `100ms`, `0.5s` or `2m`, found `soon`",
+        ),
+    ],
+)
+def test_refusals(text: str, finding: str) -> None:
+    """A pattern that cannot be read is refused where reading stopped, with what was expected."""
+    assert refusal("pattern", text) == [finding]

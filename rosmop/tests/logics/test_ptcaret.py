@@ -1,0 +1,186 @@
+"""``ptcaret``: against the definition, which looks back through the whole trace for every question."""
+
+from collections.abc import Sequence
+from copy import copy
+
+import pytest
+
+from rosmop.logics.interface import RunFaultError
+from rosmop.logics.ptcaret import MAX_DEPTH
+from rosmop.tests.logics.driving import compiled, refusal, seeded, told
+from rosmop.tests.logics.temporal import Tree, draw
+from rosmop.text.parser import parse
+
+EVENTS = ("begin", "end", "call", "a")
+SIGNS = {
+    "previously": "(*)", "once": "<*>", "historically": "[*]", "since": "S",
+    "ab previously": "(*a)", "ab once": "<*a>", "ab historically": "[*a]", "ab since": "Sa",
+    "not": "!", "implies": "=>", "iff": "<=>",
+}  # fmt: skip
+UNARY = {name: 1 for name in SIGNS if name not in ("since", "ab since", "implies", "iff")}
+TEMPORAL = [name for name in SIGNS if name not in ("not", "implies", "iff")]
+
+
+def show(tree: Tree) -> str:
+    """The formula, with all parentheses."""
+    operator, *operands = tree
+    if operator == "event":
+        return str(operands[0])
+    sign = SIGNS.get(operator, operator)
+    texts = [f"({show(operand)})" for operand in operands]
+    return f"{sign} {texts[0]}" if len(texts) == 1 else f" {sign} ".join(texts) or str(operator)
+
+
+def before(trace: Sequence[str], place: int) -> int:
+    """The event before this one in the abstract past: over calls that have returned; -1 if there is none."""
+    depth, at = 0, place - 1
+    if at >= 0 and trace[at] == "end":
+        while at >= 0:
+            depth += {"end": 1, "begin": -1}.get(trace[at], 0)
+            if not depth:
+                return before(trace, at)
+            at -= 1
+    return at
+
+
+def holds(tree: Tree, trace: Sequence[str], place: int) -> bool:
+    """Whether a formula holds at a place of a trace."""
+    operator, *operands = tree
+    if operator in ("event", "true", "false"):
+        return bool(operator == "true" or (operator == "event" and trace[place] == operands[0]))
+    name = operator.removeprefix("ab ")
+    if name in ("previously", "once", "historically", "since"):
+        earlier = before(trace, place) if operator != name else place - 1
+        if name == "previously":
+            return earlier >= 0 and holds(operands[0], trace, earlier)
+        now = holds(operands[-1], trace, place)
+        if name == "historically":
+            return now and (earlier < 0 or holds(tree, trace, earlier))
+        left = name == "once" or holds(operands[0], trace, place)
+        return now or (left and earlier >= 0 and holds(tree, trace, earlier))
+    values = [holds(operand, trace, place) for operand in operands]
+    meaning = {
+        "not": lambda: not values[0],
+        "and": lambda: all(values),
+        "or": lambda: any(values),
+        "xor": lambda: values[0] != values[1],
+        "implies": lambda: not values[0] or values[1],
+        "iff": lambda: values[0] == values[1],
+    }
+    return bool(meaning[operator]())
+
+
+def verdicts(tree: Tree, trace: Sequence[str]) -> list[tuple[str, ...]]:
+    """What the definition says after each event."""
+    return [("validation",) if holds(tree, trace, place) else ("violation",) for place in range(len(trace))]
+
+
+def test_random_formulas() -> None:
+    """On random traces, with calls that return, that do not, and returns from nowhere."""
+    random = seeded(11)
+    for _ in range(400):
+        tree = draw(random, random.randint(1, 4), TEMPORAL, UNARY, EVENTS)
+        trace = [random.choice(EVENTS) for _ in range(12)]
+        assert told(compiled("ptcaret", show(tree), EVENTS), trace) == verdicts(tree, trace), (
+            show(tree),
+            trace,
+        )
+
+
+def test_a_copy_of_a_run_goes_on_by_itself() -> None:
+    """What happens to one of the two, calls and returns too, changes nothing for the other."""
+    random = seeded(13)
+    for _ in range(200):
+        tree = draw(random, 3, TEMPORAL, UNARY, EVENTS)
+        begun, *ends = ([random.choice(EVENTS) for _ in range(6)] for _ in range(3))
+        run = compiled("ptcaret", show(tree), EVENTS).start(0)
+        for event in begun:
+            run.step(EVENTS.index(event), 0)
+        runs = run, copy(run)
+        found: tuple[list[tuple[str, ...]], ...] = [], []
+        for events in zip(*ends, strict=True):
+            for one, event, told_of_it in zip(runs, events, found, strict=True):
+                told_of_it.append(one.step(EVENTS.index(event), 0))
+        for end, told_of_it in zip(ends, found, strict=True):
+            assert told_of_it == verdicts(tree, [*begun, *end])[6:], (show(tree), begun, end)
+
+
+BEGIN, CALL, A = ("event", "begin"), ("event", "call"), ("event", "a")
+X = ("previously", A)
+DERIVED: list[tuple[str, Tree]] = [
+    ("@b (*) a", ("ab since", ("not", BEGIN), ("and", BEGIN, X))),
+    ("@c a", ("ab since", ("not", BEGIN), ("and", BEGIN, ("previously", A)))),
+    ("<*s@b> (*) a", ("ab once", ("and", BEGIN, X))),
+    ("[*s@c] a", ("ab historically", ("implies", BEGIN, ("previously", A)))),
+    ("<*s@bc> (*) a", ("ab once", ("and", ("or", BEGIN, CALL), X))),
+    ("call Ss@b (*) a", ("ab since", ("implies", BEGIN, CALL), ("and", BEGIN, X))),
+    ("(*) a Ss@c a", ("ab since", ("implies", CALL, X), ("and", BEGIN, X))),
+    ("(*) a Ss@bc (*) a", ("ab since", ("implies", ("or", BEGIN, CALL), X), ("and", ("or", BEGIN, CALL), X))),
+    ("a Sa begin S call", ("ab since", A, ("since", BEGIN, CALL))),
+    ("a S begin Sa call", ("ab since", ("since", A, BEGIN), CALL)),
+    ("call Ss@b a Sa begin", ("ab since", ("implies", BEGIN, CALL), ("and", BEGIN, ("ab since", A, BEGIN)))),
+]
+
+
+@pytest.mark.parametrize(("text", "tree"), DERIVED)
+def test_derived_operators(text: str, tree: Tree) -> None:
+    """What they stand for."""
+    random = seeded(12)
+    for _ in range(100):
+        trace = [random.choice(EVENTS) for _ in range(12)]
+        assert told(compiled("ptcaret", text, EVENTS), trace) == verdicts(tree, trace)
+
+
+IN_A_FILE = [
+    *(text for text, _tree in DERIVED),
+    "a Ss@bc a Ss@c a Ss@b a",
+    "a => @b  a",
+    "!@c a // @fail",
+    "@b @c a",
+]
+BEHIND = {"": [], "@violation { } @c { }": ["violation", "c"], "// why\n@c /* {} */ { }": ["c"]}
+
+
+@pytest.mark.parametrize("text", IN_A_FILE)
+@pytest.mark.parametrize("behind", BEHIND)
+def test_a_formula_stands_in_a_file_as_it_is(text: str, behind: str) -> None:
+    """Its `@` begins no handler, and a handler's belongs to no formula."""
+    (found,) = parse(f"s() {{ ptcaret: {text}\n{behind} }}", "x.rv").specifications[0].properties
+    assert found.formula.removesuffix("// why").rstrip() == text
+    assert [handler.category for handler in found.handlers] == BEHIND[behind]
+
+
+def test_nobody_looks_into_a_call_that_has_returned() -> None:
+    """Inside it the lock is seen; after it, it is as if nothing had been."""
+    monitor = compiled("ptcaret", "write => <*a> lock", ("begin", "end", "lock", "write"))
+    trace = ["begin", "lock", "write", "end", "write"]
+    assert [verdict for (verdict,) in told(monitor, trace)] == [*["validation"] * 4, "violation"]
+
+
+def test_too_many_open_calls_are_a_fault_and_change_nothing() -> None:
+    """The next event is judged as if the refused `begin` had not been."""
+    run = compiled("ptcaret", "<*a> a", EVENTS).start(0)
+    for _ in range(MAX_DEPTH):
+        run.step(0, 0)
+    with pytest.raises(RunFaultError, match="calls are open"):
+        run.step(0, 0)
+    assert run.step(1, 0) == ("violation",)
+
+
+@pytest.mark.parametrize(
+    ("formula", "events", "finding"),
+    [
+        (
+            "<*a> a",
+            ("a", "begin"),
+            "needs the events `begin` and `end` of the specification; it has no `end`",
+        ),
+        ("<*s@bc> a", ("a", "begin", "end"), "needs the event `call`"),
+        ("a Ss a", ("a", "begin", "end"), "write `Ss@b`, `Ss@c` or `Ss@bc`, without a space"),
+        ("a Ss@c a", ("a", "begin", "end"), "needs the event `call`"),
+        ("[] a", ("a",), "is about the future"),
+    ],
+)
+def test_refusals(formula: str, events: Sequence[str], finding: str) -> None:
+    """With what to write instead."""
+    assert any(finding in text for text in refusal("ptcaret", formula, events))

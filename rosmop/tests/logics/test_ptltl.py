@@ -1,0 +1,129 @@
+"""``ptltl``: against the definition of its operators."""
+
+from itertools import product
+
+import pytest
+from rosmop.tests.examples import examples
+
+from rosmop.logics import past
+from rosmop.logics.interface import FiniteProperty
+from rosmop.logics.past import PastProperty
+from rosmop.tests.logics.driving import ABC, compiled, refusal, seeded, told, traces
+from rosmop.tests.logics.temporal import Printer, Tree, draw
+
+ARITY = {"not": 1, "previously": 1, "weakly previously": 1, "once": 1, "historically": 1}
+TEMPORAL = ("previously", "weakly previously", "once", "historically", "since", "dual since")
+PRINTER = Printer(
+    {
+        "previously": ("(*)",),
+        "weakly previously": ("~(*)",),
+        "once": ("<*>",),
+        "historically": ("[*]",),
+        "since": ("S",),
+        "dual since": ("~S",),
+    },
+    [["since", "dual since"], ["and"], ["xor"], ["or"], ["implies", "iff"]],
+    ["implies", "iff"],
+)
+
+
+def holds(tree: Tree, trace: tuple[str, ...], i: int) -> bool:  # noqa: PLR0911, PLR0912  # one per operator
+    """The truth of a formula at position ``i``, by the definition of each operator."""
+    operator, *operands = tree
+
+    def at(operand: int, position: int) -> bool:
+        return holds(operands[operand], trace, position)
+
+    past = range(i + 1)
+    match operator:
+        case "event":
+            return bool(trace[i] == operands[0])
+        case "true" | "false":
+            return bool(operator == "true")
+        case "not":
+            return not at(0, i)
+        case "and":
+            return at(0, i) and at(1, i)
+        case "or":
+            return at(0, i) or at(1, i)
+        case "xor":
+            return at(0, i) != at(1, i)
+        case "implies":
+            return not at(0, i) or at(1, i)
+        case "iff":
+            return at(0, i) == at(1, i)
+        case "previously":
+            return i > 0 and at(0, i - 1)
+        case "weakly previously":
+            return i == 0 or at(0, i - 1)
+        case "once":
+            return any(at(0, j) for j in past)
+        case "historically":
+            return all(at(0, j) for j in past)
+        case "since":
+            return any(at(1, j) and all(at(0, k) for k in range(j + 1, i + 1)) for j in past)
+        case "dual since":
+            return all(at(1, j) or any(at(0, k) for k in range(j + 1, i + 1)) for j in past)
+    raise AssertionError(operator)
+
+
+def test_random_formulas_on_all_short_traces() -> None:
+    """Validation exactly where the formula holds, violation exactly where not; `x` is never named."""
+    random = seeded(7)
+    words = [*product("abx", repeat=3), *(tuple(random.choices("abx", k=6)) for _ in range(5))]
+    for _ in range(examples(700)):
+        tree = draw(random, 3, TEMPORAL, ARITY, ("a", "b"))
+        text = PRINTER.show(tree, random)
+        monitor = compiled("ptltl", text, ("a", "b", "x"))
+        for word in words:
+            expected = [("validation",) if holds(tree, word, i) else ("violation",) for i in range(len(word))]
+            assert told(monitor, word) == expected, (text, word)
+
+
+@pytest.mark.parametrize("folded", [past.MAX_FOLDED, 0])
+def test_table_and_folded_program_agree(folded: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A formula too large for a table is computed, with the same verdicts."""
+    monkeypatch.setattr(past, "MAX_FOLDED", folded)
+    random = seeded(8)
+    for _ in range(examples(40)):
+        tree = draw(random, 4, TEMPORAL, ARITY, ("a", "b"))
+        text = PRINTER.show(tree, random)
+        wide = " xor ".join("((*) " * number + "c" + ")" * number for number in range(1, 16))
+        small = compiled("ptltl", text, ABC)
+        large = compiled("ptltl", f"({text}) xor ({wide}) xor ({wide})", ABC)
+        assert isinstance(small, FiniteProperty)
+        assert isinstance(large, PastProperty)
+        trace = random.choices(ABC, k=60)
+        assert told(small, trace) == told(large, trace), text
+
+
+def test_at_the_first_event_there_is_no_previous_one() -> None:
+    """`(*) a` is false at the first event, `[*] a` is `a` there."""
+    assert told(compiled("ptltl", "(*) a"), "aa") == [("violation",), ("validation",)]
+    assert told(compiled("ptltl", "(*) true"), "aa") == [("violation",), ("validation",)]
+    assert told(compiled("ptltl", "[*] a"), "ab") == [("validation",), ("violation",)]
+
+
+def test_since_groups_leftwards_and_binds_tighter_than_and() -> None:
+    """`a S b S c` is `(a S b) S c`; `a S b and c` is `(a S b) and c`."""
+    for word in traces(ABC, 4):
+        assert told(compiled("ptltl", "a S b S c"), word) == told(compiled("ptltl", "(a S b) S c"), word)
+        assert told(compiled("ptltl", "a or b S c and !a"), word) == told(
+            compiled("ptltl", "a or ((b S c) and (!a))"), word
+        )
+
+
+def test_refusals() -> None:
+    """Future operators are pointed to ltl; implications do not chain; unknown events are all told."""
+    assert "write `ltl:`" in refusal("ptltl", "[] a")[0]
+    assert "without parentheses" in refusal("ptltl", "a -> b -> c")[0]
+    assert refusal("ptltl", "x S\ny") == [
+        "7:11: `x` is not an event of this specification; there are: a, b, c",
+        "8:1: `y` is not an event of this specification; there are: a, b, c",
+    ]
+
+
+def test_a_wide_formula_is_accepted() -> None:
+    """Ten thousand operands are no error."""
+    text = " xor ".join(["<*> a", *["b"] * 10_000])
+    assert told(compiled("ptltl", text), "ab") == [("validation",), ("validation",)]

@@ -1,0 +1,161 @@
+"""Modules that are wrong in one place: whatever a writer of modules may get wrong in an instruction."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import islice
+
+from rosmop.fast.batch_codegen import written
+from rosmop.form.compiled import Compiled
+from rosmop.form.components import groups
+from rosmop.prove.decoding import Code, Instruction
+from rosmop.prove.equality import EQUAL, Validation
+from rosmop.run.engine import MonitorSet
+from rosmop.runtime.values import Values
+from rosmop.tests.random_specifications import definitions
+from roswire.definitions import Definitions
+
+_COMPARED = ("eq", "ne", "lt", "le", "gt", "ge")
+_OTHER = {"add": "sub", "sub": "add", "mul": "add", "div": "mul", "and": "or", "or": "and", "xor": "or", "shl": "shr_u",
+          "neg": "abs", "abs": "neg", "floor": "ceil", "ceil": "floor", "rem": "div"}  # fmt: skip
+
+
+def _comparison(one: Instruction) -> Iterator[Instruction]:
+    family, _, name = one.name.partition(".")
+    name, _, sign = name.partition("_")
+    if name in _COMPARED:
+        other = _COMPARED[_COMPARED.index(name) ^ 1]
+        needs = other not in ("eq", "ne") and family[0] == "i"
+        yield replace(one, name=f"{family}.{other}" + (f"_{sign or 's'}" if needs else ""))
+        if name in ("lt", "gt", "le", "ge"):
+            turned = {"lt": "gt", "gt": "lt", "le": "ge", "ge": "le"}[name]
+            yield replace(one, name=f"{family}.{turned}" + (f"_{sign}" if sign else ""))
+
+
+def _operation(one: Instruction) -> Iterator[Instruction]:
+    family, _, name = one.name.partition(".")
+    name, _, sign = name.partition("_")
+    if name in _OTHER and family in ("i32", "i64", "f32", "f64"):
+        other = _OTHER[name]
+        yield replace(
+            one, name=f"{family}.{other}" + (f"_{sign}" if other in ("div", "rem") and sign else "")
+        )
+
+
+def _sign(one: Instruction) -> Iterator[Instruction]:
+    if one.name.endswith(("_s", "_u")) and one.name not in ("i32.extend8_s", "i32.extend16_s"):
+        yield replace(one, name=one.name[:-1] + ("u" if one.name.endswith("s") else "s"))
+
+
+def _width(one: Instruction) -> Iterator[Instruction]:
+    widths = {
+        "i32.load": "i32.load16_u", "i32.load8_u": "i32.load16_u", "i32.load16_u": "i32.load8_u",
+        "i32.load8_s": "i32.load16_s", "i32.load16_s": "i32.load8_s", "i32.store8": "i32.store16",
+        "i32.store16": "i32.store", "i32.store": "i32.store16", "i32.extend8_s": "i32.extend16_s",
+        "i32.extend16_s": "i32.extend8_s",
+    }  # fmt: skip
+    if one.name in widths:
+        yield replace(one, name=widths[one.name])
+
+
+def _offset(one: Instruction) -> Iterator[Instruction]:
+    if ".load" in one.name or ".store" in one.name:
+        yield replace(one, operands=(one.operands[0] + 1,))
+        yield replace(one, operands=(one.operands[0] + 8,))
+
+
+def _constant(one: Instruction) -> Iterator[Instruction]:
+    if one.name.endswith(".const"):
+        yield replace(one, operands=(one.operands[0] + 1,))
+        if one.operands[0]:
+            yield replace(one, operands=(-one.operands[0],))
+
+
+def _check(one: Instruction) -> Iterator[Instruction]:
+    """A bound that is not looked at, or after which the message goes on."""
+    if one.name == "if" and one.body:
+        if not one.otherwise:
+            yield Instruction("drop")
+        yield replace(one, body=one.otherwise, otherwise=one.body)
+
+
+FAULTS: dict[str, Callable[[Instruction], Iterator[Instruction]]] = {
+    "comparison": _comparison, "operation": _operation, "sign": _sign, "width": _width, "offset": _offset,
+    "constant": _constant, "check": _check,
+}  # fmt: skip
+
+
+def _trees(
+    body: Sequence[Instruction], change: Callable[[Instruction], Iterator[Instruction]]
+) -> Iterator[tuple[Instruction, ...]]:
+    for place, one in enumerate(body):
+        before, after = tuple(body[:place]), tuple(body[place + 1 :])
+        changed = [*change(one)]
+        changed += [replace(one, body=inner) for inner in _trees(one.body, change)]
+        changed += [replace(one, otherwise=inner) for inner in _trees(one.otherwise, change)]
+        for other in changed:
+            yield (*before, other, *after)
+
+
+def operands(code: Code) -> Iterator[tuple[Instruction, ...]]:
+    """Each variable that is read, once the next one of its type instead."""
+    kinds = [*code.parameters, *code.made]
+
+    def change(one: Instruction) -> Iterator[Instruction]:
+        if one.name == "local.get":
+            place = int(one.operands[0])
+            same = [other for other, kind in enumerate(kinds) if kind == kinds[place] and other != place]
+            if same:
+                yield replace(one, operands=(same[place % len(same)],))
+
+    yield from _trees(code.body, change)
+
+
+def mutants(code: Code) -> Iterator[tuple[str, Code]]:
+    """The kind of each fault, and the function that has it."""
+    for kind, change in FAULTS.items():
+        for body in _trees(code.body, change):
+            yield kind, replace(code, body=body)
+    for body in operands(code):
+        yield "operand", replace(code, body=body)
+
+
+def event(body: str, parameters: str, pattern: str, before: str = "") -> str:
+    """A specification with one event on `/plain`."""
+    return f"s() {{ {before} event e({parameters}) /plain own/Plain '{{{pattern}}}' {{ {body} }} }}"
+
+
+FAULTY = {
+    "fields, variables, a drop": event(
+        "if (x < 3) { return; } if (y > 2.5) { y = -y; } n = n + (uint16_t) x; x = n ^ 7; b = n == x;",
+        "int x, double y", "count:x, x:y", "int n = 0; bool b = false;",
+    ),
+    "a string and what stands behind it": """s() { int n = 0; double d = 0;
+        event e(std::string f, double a) /stamped own/Stamped '{frame:f, values[1]:a}' when (f == "abc") {
+            n = f.size(); d = a; } }""",
+    "messages that are made, kept and published": event(
+        "std_msgs::Int32 m; m.data = x + 1; if (x > 3) { PUBLISH(/out, std_msgs/Int32, m); told = m; n += x; }"
+        ' if (n > 7) { ROS_INFO("%d", n); PUBLISH(/told, std_msgs/Int32, told); }',
+        "int x", "count:x", "std_msgs::Int32 told; int n = 0;",
+    ),
+}  # fmt: skip
+
+
+def compiled(text: str, known: Definitions | None = None) -> Compiled:
+    """One specification."""
+    known = definitions() if known is None else known
+    return MonitorSet.load({"a.rv": text}, known).compiled
+
+
+def faulty(text: str, every: int = 1) -> Iterator[tuple[str, str]]:
+    """The kind of each fault that is put into the function of a specification's event, and what is said of it."""
+    code = compiled(text)
+    (group,) = groups(code.specifications)
+    values = Values(code.messages)
+    module = written(code.functions, [group.component], values)
+    validation = Validation(code.functions, values, module, time.monotonic, patience=100)
+    ((topic, (one,)),) = group.component.topics
+    assert validation.finding(topic, "s.e", one.function, 0).answer == EQUAL
+    for kind, wrong in islice(mutants(validation.codes[0]), 0, None, every):
+        validation.codes[0] = wrong
+        yield kind, validation.finding(topic, "s.e", one.function, 0).answer.partition(":")[0]

@@ -1,0 +1,169 @@
+"""What is written of an event is proved to be what it means; a module that is wrong anywhere is found."""
+
+import itertools
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from rosmop.prove.equality import EQUAL, IN_PYTHON, findings_of
+from rosmop.tests.prove.module_mutants import FAULTY, compiled, event, faulty
+from roswire.definitions import Definitions
+from roswire.standard import standard_definitions
+
+MONITORS = Path(__file__).parents[3] / "monitors"
+
+
+def answers(text: str, known: Definitions | None = None) -> dict[str, str]:
+    """What is known of each event of a specification, with as much time as it needs."""
+    return {one.event: one.answer for one in findings_of(compiled(text, known), time.monotonic, patience=600)}
+
+
+SHIPPED = {
+    "goals": {"goals.goal": IN_PYTHON, "goals.cancel": IN_PYTHON, "goals.result": IN_PYTHON},
+    "logging": {
+        "logging.batteryState": EQUAL, "logging.position": EQUAL, "logging.turretMovement": "not loop-free",
+        "logging.shot": EQUAL,
+    },
+    "obstacle_avoidance": {
+        "obstacleAvoidance.speed": EQUAL, "obstacleAvoidance.scan": "not loop-free",
+        "obstacleAvoidance.drive": EQUAL,
+    },
+    "safe_triggering": {"safeTrigger.checkPosition": "not loop-free", "safeTrigger.safeTrigger": EQUAL},
+    "safe_zone": {"safeZone.odometry": IN_PYTHON, "safeZone.gps": IN_PYTHON, "safeZone.drive": EQUAL},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_specifications(name: str) -> None:
+    """All events that have a module without loops are proved; of the others it is said why not."""
+    trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
+    own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
+    assert (
+        answers((MONITORS / f"{name}.rv").read_text(), standard_definitions().extended(own)) == SHIPPED[name]
+    )
+
+
+def test_no_shipped_specification_is_left_out() -> None:
+    """A new one is proved, too."""
+    assert {path.stem for path in MONITORS.glob("*.rv")} == set(SHIPPED)
+
+
+PROVED = {
+    "guards, fields that are written, a drop": event(
+        "if (x < 3) { return; } if (y > 2.5) { y = -y; } x = n + 7; n++;",
+        "int x, double y", "count:x, x:y", "uint8_t n = 0;",
+    ),
+    "conversions at the limits": event(
+        "a = y; b = y; c = x; d = c; e = a; x = y;", "long x, double y", "three[0]:x, x:y",
+        "int8_t a = 0; unsigned long b = 0; float c = 0; double d = 0; uint16_t e = 0;",
+    ),
+    "a service": "s() { bool open = false; event e(bool wish) service /mode std_srvs/SetBool request '{data:wish}' {"
+    " if (open) { return; } open = wish; wish = !wish; } }",
+    "rounding": event("y = floor(y) + trunc(fabs(y)) - rint(y) + ceil(y);", "double y", "x:y"),
+    "times": event(
+        "last = t; t.sec = 7; if (t.nsec > 5 && t > last) { n++; }",
+        "ros::Time t", "when:t", "ros::Time last; int n = 0;",
+    ),
+    "helper functions, and what they cannot go on with": event(
+        "n = f(x, 7); x = n;", "int x", "count:x",
+        'int n = 0; int f(int a, int b) { if (a > 3) { ROS_INFO("x"); } n += a; return a > 2 ? b : a << 1; }',
+    ),
+    "output": event('ROS_INFO("%d %f", x, y); y = 3;', "int x, double y", "count:x, x:y"),
+    "output that is not due": event('n++; ROS_INFO_THROTTLE(10.0, "%d", n);', "int x", "count:x", "int n = 0;"),
+    "an element of an array": event(
+        "n = three[x] + three.size();", "std::vector<long> three, int x", "three:three, count:x", "long n = 0;"
+    ),
+    "a string": """s() { int n = 0;
+        event e(std::string f) /stamped own/Stamped '{frame:f}' when (f == "base_link") { n += f.size(); } }""",
+    "a message that is kept, changed and published": event(
+        "told.linear.x = y; told.angular = told.linear; n++; if (y > 3) { PUBLISH(/told, geometry_msgs/Twist, told);"
+        " PUBLISH(/linear, geometry_msgs/Vector3, told.linear); }",
+        "double y", "x:y", "geometry_msgs::Twist told; int n = 0;",
+    ),
+    "messages that are made and copied": event(
+        "geometry_msgs::Twist m = told; m.linear.y = y; if (y > 2) { told = m; } else {"
+        " geometry_msgs::Vector3 v; v.x = 2; PUBLISH(/v, geometry_msgs/Vector3, v); }",
+        "double y", "x:y", "geometry_msgs::Twist told;",
+    ),
+    "strings in messages, and a time": """s() { std_msgs::Header k;
+        event e(std::string f, double x) /stamped own/Stamped '{frame:f, x:x}' {
+            std_msgs::Header m; m.seq = x; m.frame_id = f; PUBLISH(/h, std_msgs/Header, m); k = m;
+            k.stamp = ros::Time::now(); std_msgs::String c; c.data = "const"; PUBLISH(/c, std_msgs/String, c); } }""",
+    "lines and publications in their order": event(
+        'ROS_INFO("%d %f", x, y); ROS_INFO("%d", b); PUBLISH(/out, std_msgs/Int32, m); ROS_WARN("%d", x);',
+        "int x, float y, bool b", "count:x, y:y, on:b", "std_msgs::Int32 m;",
+    ),
+    "a string that is put out": """s() { event e(std::string f) /stamped own/Stamped '{frame:f}' {
+        ROS_INFO("from %s", f.c_str()); } }""",
+    "a message with an array that is kept": event(
+        "pose.pose.position.x = x; if (x > 1) { PUBLISH(/out, geometry_msgs/PoseWithCovariance, pose); }",
+        "double x", "x:x", "geometry_msgs::PoseWithCovariance pose;",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PROVED)
+def test_what_the_language_has_without_loops(name: str) -> None:
+    """For every message and every state, of which there are more than any test can try."""
+    assert answers(PROVED[name]) == {"s.e": EQUAL}
+
+
+UNPROVED = {
+    "not loop-free": event("for (int i = 0; i < x; i++) { x += i; }", "int x", "count:x"),
+    "uses seconds": event("d = t.toSec();", "ros::Time t", "when:t", "double d = 0;"),
+    "uses the instruction f64.copysign": event("y = copysign(y, 1.0);", "double y", "x:y"),
+    "uses the instruction memory.copy": event(
+        "v[1] = count;", "std::vector<long> v, int count", "three:v, count:count"
+    ),
+    "uses a constant string, or a string or vector that is kept or made": event(
+        'if (x) { last = "x"; }', "int x", "count:x", "std::string last;"
+    ),
+    "uses an element of a message that is made, kept or published": event(
+        "geometry_msgs::PoseWithCovariance m; m.covariance[x] = 1; PUBLISH(/out, geometry_msgs/PoseWithCovariance, m);",
+        "int x",
+        "count:x",
+    ),
+    IN_PYTHON: event("y = sin(y);", "double y", "x:y"),
+}
+
+
+@pytest.mark.parametrize("answer", UNPROVED)
+def test_what_is_not_proved_says_why(answer: str) -> None:
+    """Nothing is called equal that was not shown to be."""
+    assert answers(UNPROVED[answer]) == {"s.e": answer}
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "v.push_back(x);", "v.clear();", "x = v.size();", "if (x) { v[0] = 3; }", "f[1] = x;",
+        "std::vector<int> t(5); x = t[0];", "std::vector<int> t; t.push_back(x);", "auto t = v; t[0] = 1;",
+    ],
+)  # fmt: skip
+def test_vectors_that_are_kept_or_made_are_not_proved(body: str) -> None:
+    """None is called equal, and none is said to differ."""
+    (answer,) = answers(event(body, "int x", "count:x", "std::vector<int> v; int f[3];")).values()
+    assert answer.startswith("uses ")
+
+
+def test_without_time_nothing_is_proved() -> None:
+    """What is not decided is said to be so."""
+    clock = itertools.count(0.0, 1000.0)
+    (found,) = findings_of(compiled(PROVED["conversions at the limits"]), lambda: next(clock), patience=0)
+    assert (found.answer, found.differs) == ("not decided in time", False)
+
+
+@pytest.mark.parametrize(
+    ("name", "every", "times"),
+    [("fields, variables, a drop", 9, 4), ("messages that are made, kept and published", 23, 2)],
+)
+def test_wrong_modules_are_found(name: str, every: int, times: int) -> None:
+    """Some of those that `tests/proofs/test_events.py` makes: each is decided, and most differ."""
+    told = Counter(answer for _, answer in faulty(FAULTY[name], every=every))
+    unproved = (
+        "uses an element of a message that is made, kept or published"  # an address that is not constant
+    )
+    assert {*told} - {unproved} == {EQUAL, "not equal"}
+    assert told["not equal"] > times * told[EQUAL]

@@ -1,0 +1,77 @@
+"""The processor time of one message is bounded, whatever the message makes monitors do."""
+
+from collections.abc import Callable
+
+import pytest
+
+from rosmop.run.engine import MonitorSet
+from rosmop.tests.acting import message
+from roswire.standard import standard_definitions
+
+JOINTS = "sensor_msgs/JointState"
+NAMES = message(JOINTS, name=[""] * 20_000, position=[0.5] * 20_000)
+TEXT = message("std_msgs/String", data="x" * 20_000)
+
+WALKS = {
+    "a loop": ("std_msgs/String", "std::string s", "{data:s}", "for (int i = 0; i < s.size(); i++) n += i;", TEXT),
+    "a field behind strings": (JOINTS, "double x", "{position[0]:x}", "n = x;", NAMES),
+    "a copy of the message": (JOINTS, "", "{}", "sensor_msgs::JointState all = MESSAGE; n = all.name.size();", NAMES),
+    "a sum": (JOINTS, "double[] p", "{position:p}", "n = std::accumulate(p.begin(), p.end(), 0.0);", NAMES),
+    "a search": ("std_msgs/String", "std::string s", "{data:s}", 'n = s.find_first_of("yz");', TEXT),
+    "a vector": ("std_msgs/String", "std::string s", "{data:s}", "std::vector<int> v(s.size() * 4, 1); n = v.size();",
+                 TEXT),
+}  # fmt: skip
+
+
+def ticking(readings: list[None]) -> Callable[[], float]:
+    """A clock that shows a millisecond more with each reading."""
+
+    def read() -> float:
+        readings.append(None)
+        return len(readings) / 1000
+
+    return read
+
+
+@pytest.mark.parametrize("name", WALKS)
+def test_every_walk_of_a_message_ends_with_its_time(name: str) -> None:
+    """A message that may be read ten times is cut off at the eleventh; without a limit it passes."""
+    kind, parameter, pattern, action, data = WALKS[name]
+    text = f"a() {{ double n = 0; event e({parameter}) /t {kind} '{pattern}' {{ {action} }} }}"
+    monitors = MonitorSet.load({"a.rv": text}, standard_definitions())
+    monitors.start(0)
+    free = monitors.process("/t", bytearray(data), 1)
+    assert (free.result, free.faults) == ("passed", ())
+    readings: list[None] = []
+    monitors.limit_time(ticking(readings), 0.010)
+    outcome = monitors.process("/t", bytearray(data), 2)
+    assert outcome.result == "dropped"
+    assert "more than 10 ms of processor time" in outcome.faults[0].text
+    assert len(readings) <= 16
+    assert monitors.late
+
+
+def test_on_fault_decides_about_a_message_that_was_cut_off() -> None:
+    """With `pass` it goes on unchanged, and the next specification finds the time used up."""
+    loop = (
+        "event e(std::string s) /t std_msgs/String '{data:s}' { for (int i = 0; i < s.size(); i++) n += i; }"
+    )
+    sources = {f"{name}.rv": f"{name}() {{ int n = 0; {loop} }}" for name in ("a", "b")}
+    monitors = MonitorSet.load(sources, standard_definitions(), "pass")
+    monitors.start(0)
+    readings: list[None] = []
+    monitors.limit_time(ticking(readings), 0.010)
+    outcome = monitors.process("/t", bytearray(TEXT), 1)
+    assert outcome.result == "passed"
+    assert [fault.monitor for fault in outcome.faults] == ["a", "b"]
+    assert len(readings) <= 16
+
+
+def test_a_hurried_message_has_a_part_of_the_time() -> None:
+    """And the fault says so."""
+    text = "a() { int n; event e(std::string s) /t std_msgs/String '{data:s}' { for (;;) n++; } }"
+    monitors = MonitorSet.load({"a.rv": text}, standard_definitions())
+    monitors.start(0)
+    monitors.limit_time(ticking([]), 0.010)
+    monitors.hurry(0.1)
+    assert "more than 1 ms" in monitors.process("/t", bytearray(TEXT), 1).faults[0].text

@@ -1,0 +1,69 @@
+"""The page on the language is right: its examples load, its functions and limits are those of the code."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from rosmop.check.loops import MAX_NESTED
+from rosmop.check.standard_functions import LIBRARY
+from rosmop.check.string_members import TEXT_METHODS
+from rosmop.check.time_members import MOMENT_METHODS
+from rosmop.check.vector_members import VECTOR_METHODS
+from rosmop.runtime.context import BUDGET, MAX_BYTES, MAX_CALLS
+from rosmop.runtime.numbers import MATH
+from rosmop.tests.acting import load
+from rosmop.text.parser import MAX_CHARACTERS, MAX_DEPTH
+
+PAGE = (Path(__file__).parents[2] / "docs" / "rv-language.md").read_text()
+CODE = re.findall(r"```cpp\n(.*?)```", PAGE, re.DOTALL)
+
+
+def test_the_example_loads() -> None:
+    """What the page shows as a file is one."""
+    assert [monitor.name for monitor in load(CODE[0]).monitors] == ["safeTrigger"]
+
+
+def test_the_example_of_a_property_loads() -> None:
+    """What the page shows as a property is one."""
+    events = "event go() /t std_msgs/Empty '{}' { } event stop() /u std_msgs/Empty '{}' { }"
+    text = CODE[1]
+    assert load(f"s() {{ {events} {text} }}").monitors[0].properties
+
+
+def row(head: str) -> str:
+    """A row of the tables."""
+    return next(line for line in PAGE.splitlines() if line.startswith(f"| {head} "))
+
+
+@pytest.mark.parametrize(
+    ("head", "names"),
+    [
+        ("`<math.h>`", MATH),
+        ("strings", TEXT_METHODS),
+        ("vectors", VECTOR_METHODS),
+        ("`ros::Time`, `ros::Duration`", MOMENT_METHODS),
+    ],
+)
+def test_every_function_is_on_the_page(head: str, names: dict[str, object]) -> None:
+    """What can be called is written down."""
+    words = set(re.findall(r"\w+", row(head)))
+    assert set(names) - words - {"data", "nearbyint", "fromNSec"} == set()
+
+
+def test_every_function_of_the_library_is_on_the_page() -> None:
+    """Also those that come from several headers; those on `float` are one rule."""
+    words = set(re.findall(r"\w+", PAGE))
+    words |= {f"{name}f" for name in MATH} if "(also as `sqrtf`, …)" in PAGE else set()
+    assert (
+        set(LIBRARY) - words - {"labs", "llabs", "stoll", "stoull", "atol", "strcmp", "strlen", "nearbyint"}
+        == set()
+    )
+
+
+def test_the_limits_are_those_of_the_code() -> None:
+    """Numbers on the page are the numbers in force."""
+    assert f"{BUDGET:,};" in row("instructions for one message and specification")
+    assert f"| {MAX_BYTES >> 20} MiB |" in PAGE
+    assert f"| {MAX_CALLS} deep |" in PAGE
+    assert f"{MAX_CHARACTERS // 1024} Ki characters; {MAX_DEPTH}; {MAX_NESTED} |" in PAGE

@@ -1,0 +1,160 @@
+"""What the module takes is what the interpreter makes of it, of any specifications: bytes, records, faults, state."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rosmop.tests.examples import examples
+
+from rosmop.form import nodes
+from rosmop.run.engine import MonitorSet
+from rosmop.run.execution import OnFault
+from rosmop.runtime.values import Values
+from rosmop.tests.acting import message
+from rosmop.tests.interpreted import beside, check_same
+from rosmop.tests.random_specifications import Messages, Specifications, definitions
+from rosmop.text.errors import SpecificationError
+from rosmop.types import kinds
+from rosmop.types.messages import Messages as MessageTypes
+from roswire.definitions import Definitions
+from roswire.standard import standard_definitions
+
+MONITORS = Path(__file__).parents[2] / "monitors"
+FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck))
+
+
+def check(monitors: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> None:
+    """Fail if the two ways differ anywhere on the way of these messages, or in the variables at the end."""
+    other = beside(monitors)
+    monitors.write_module()
+    check_same(monitors.start(0), other.start(0))
+    for number, (topic, body) in enumerate(traffic):
+        time = number * step_ns
+        check_same(monitors.judge(topic, bytearray(body), time), other.process(topic, bytearray(body), time))
+    for one in monitors.compiled.specifications:
+        for variable in one.variables:
+            known, found = (each.value(one.name, variable) for each in (monitors, other))
+            assert repr(known) == repr(found)  # a NaN is one, too
+
+
+@FEW
+@given(
+    seed=st.integers(0, 1 << 30),
+    on_fault=st.sampled_from(["drop", "pass"]),
+    step_ns=st.sampled_from([1, 700_000]),
+)
+def test_random_specifications_and_messages(seed: int, on_fault: OnFault, step_ns: int) -> None:
+    """Actions, conditions, helper functions, loops, timers and properties, on messages that are not always whole."""
+    sources = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
+    messages = Messages(seed)
+    together = [(one.topic, body) for one in (messages.traffic() for _ in range(4)) for body in one.bodies()]
+    try:
+        monitors = MonitorSet.load(sources, definitions(), on_fault)
+    except SpecificationError:
+        return  # a draw that means nothing
+    check(monitors, together, step_ns)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ["Nothing", 1],
+        ["Break", "1"],
+        ["Break"],
+        ["Evaluate", 1, ["Read", ["Integer", 8, True], "x"]],
+        ["Evaluate", 1, ["Break", 1]],
+        ["Evaluate", 1, ["Literal", ["Void"], "text"]],
+    ],
+    ids=["kind", "type", "missing", "missing in a type", "statement as a value", "no value of the language"],
+)
+def test_what_is_no_form_is_not_read(wrong: list[object]) -> None:
+    """Whatever is sent in its place: what is read is what the form can be, throughout."""
+    statement = msgspec.msgpack.Decoder(nodes.Statement)
+    assert statement.decode(msgspec.msgpack.encode(["Break", 1])) == nodes.Break(1)
+    with pytest.raises(msgspec.ValidationError):
+        statement.decode(msgspec.msgpack.encode(wrong))
+    deep = b"\x93\xa4Loop\x01\x91" * 100_000 + b"\x92\xa5Break\x01"
+    with pytest.raises(RecursionError):
+        statement.decode(deep)
+
+
+def shipped() -> MonitorSet:
+    """All specifications of `monitors/`."""
+    trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
+    own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
+    sources = {path.name: path.read_text() for path in sorted(MONITORS.glob("*.rv"))}
+    return MonitorSet.load(sources, standard_definitions().extended(own))
+
+
+def a_value(values: Values, kind: kinds.Type) -> st.SearchStrategy[Any]:
+    """Any value of a type."""
+    if isinstance(kind, kinds.Record):
+        return st.tuples(*(a_value(values, field) for field in values.fields(kind))).map(list)
+    if isinstance(kind, kinds.Vector):
+        most = 4 if kind.length is None else kind.length
+        return st.lists(a_value(values, kind.element), min_size=kind.length or 0, max_size=most)
+    if isinstance(kind, kinds.Integer):
+        return st.integers(kind.least, kind.most)
+    known: dict[kinds.Type, st.SearchStrategy[Any]] = {
+        kinds.BOOL: st.booleans(),
+        kinds.STRING: st.sampled_from([b"turret_tilt", b"turret_pan", b"", b"x"]),
+        kinds.FLOAT: st.floats(width=32),
+        kinds.DOUBLE: st.floats() | st.floats(-2, 2),
+        kinds.TIME: st.integers(0, 1 << 40),
+        kinds.DURATION: st.integers(-(1 << 40), 1 << 40),
+    }
+    return known[kind]
+
+
+@FEW
+@given(data=st.data())
+def test_shipped_specifications(data: st.DataObject) -> None:
+    """Any messages on their topics, cut short now and then."""
+    monitors = shipped()
+    values = Values(MessageTypes(monitors.definitions))
+    traffic = []
+    for topic in data.draw(st.lists(st.sampled_from(sorted(monitors.topics)), min_size=1, max_size=12)):
+        kind = kinds.Record(monitors.topics[topic])
+        body = bytearray()
+        values.encoder(kind)(data.draw(a_value(values, kind)), body)
+        end = data.draw(st.just(len(body)) | st.integers(0, len(body)))
+        traffic.append((topic, bytes(body[:end])))
+    check(monitors, traffic, 50_000_000)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        'if (names.size() > 1) { names[0] = "other"; position.push_back(1.5); }',
+        "position[5] = 1;",
+        "stamp.sec = 7; stamp.nsec += 1;",
+        "v = MESSAGE; v.velocity.clear(); PUBLISH(/out, sensor_msgs/JointState, v);",
+        "std::vector<double> all(3, 2.5); all.insert(all.begin() + 1, position.size()); position = all;",
+        "for (auto &name : names) { name += 'x'; }",
+        "double sum = 0; for (double p : position) { if (p < 0) { continue; } sum += p; } position[0] = sum;",
+        "switch (names.size()) { case 0: return; case 1: n = 1; case 2: n += 2; break; default: n = -1; } f(n);",
+        "std::sort(position.begin(), position.end()); n = std::accumulate(position.begin(), position.end(), 0);",
+        "std::string s = names[0]; while (true) { s += s; }",
+        "n = deep(0);",
+        "n = deep(1); position.resize(n);",
+        "swap(position[0], position[1]);",
+    ],
+)
+def test_values_that_grow_and_fields_of_any_size(body: str) -> None:
+    """Vectors, strings, whole messages, references, recursion, the bounds of memory and work."""
+    text = f"""s() {{ int n = 0; sensor_msgs::JointState v;
+    void f(int &x) {{ x = x * 3; }}
+    void swap(double &a, double &b) {{ double c = a; a = b; b = c; }}
+    int deep(int down) {{ if (down == 0) {{ return deep(0); }} return down > 50 ? 5 : deep(down + 1) + 1; }}
+    event e(std::vector<std::string> names, double[] position, ros::Time stamp) /j sensor_msgs/JointState
+    '{{name:names, position:position, header.stamp:stamp}}' {{ {body} ROS_INFO("%d %f", n, position[0]); }} }}"""
+    monitors = MonitorSet.load({"x.rv": text}, standard_definitions())
+    told = [
+        message("sensor_msgs/JointState", name=["a", "b"], position=[0.5, -1.0]),
+        message("sensor_msgs/JointState", name=["a"], position=[3.0], velocity=[1.0]),
+        message("sensor_msgs/JointState"),
+    ]
+    check(monitors, [("/j", body) for body in told], 1)

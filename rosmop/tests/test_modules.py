@@ -1,0 +1,143 @@
+"""What one relay runs of a set: its specifications, and the machine code of their module."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+
+import msgspec
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rosmop.tests.examples import examples
+
+from rosmop.check.sources import compiled_from
+from rosmop.fast.serialization import decoded_part, encoded_part
+from rosmop.fast.wasm_build import part_of
+from rosmop.fast.wasm_instance import MachineError
+from rosmop.form.compiled import Compiled
+from rosmop.run.engine import MonitorSet
+from rosmop.run.outcomes import Outcome
+from rosmop.tests.random_specifications import Messages, Specifications, definitions
+from rosmop.text.errors import SpecificationError
+
+FEW = settings(max_examples=examples(60), suppress_health_check=list(HealthCheck))
+RULE = """
+{0}() {{ int count = 0; std::string last = "";
+    event e(std::string text) /{0} std_msgs/String '{{data:text}}' {{
+        if (text == last) {{ count++; ROS_WARN("%d: %s", count, text.c_str()); }} last = text;
+        PUBLISH(/said/{0}, std_msgs/Int32, said); said.data = 100 / (3 - count); }}
+    std_msgs::Int32 said;
+    fsm : idle [ e -> idle ]
+    @idle {{ count += 0; }}
+}}"""
+PROGRAM = """
+import hashlib, sys
+from rosmop.fast.wasm_build import part_of
+from rosmop.fast.serialization import encoded_part
+from rosmop.tests.test_modules import compiled
+print(hashlib.sha256(encoded_part(part_of(compiled("b", "a"), ["a"], []))).hexdigest())
+"""
+
+
+def rule(name: str) -> str:
+    """A specification of that name, with a bit of all."""
+    head, _, rest = RULE.format(name).partition("event")
+    body, _, said = rest.partition("    std_msgs::Int32 said;\n")
+    return f"{head}std_msgs::Int32 said; event{body}{said}"
+
+
+def compiled(*names: str) -> Compiled:
+    """A set of such specifications."""
+    return compiled_from({f"{name}.rv": rule(name) for name in names}, definitions())
+
+
+def story(outcome: Outcome, names: set[str]) -> Iterator[object]:
+    """All that these specifications did."""
+    for earlier in outcome.before:
+        yield from story(earlier, names)
+    yield [one for one in outcome.events if one.partition(".")[0] in names]
+    yield [one for one in outcome.verdicts if one.monitor in names]
+    yield [(one.position, one.text, one.values) for one in outcome.faults if one.monitor in names]
+    yield [one for one in outcome.log if one.monitor in names]
+    yield [
+        (one._replace(site=0), outcome.sites[one.site].position)
+        for one in outcome.published
+        if one.monitor in names
+    ]
+
+
+def test_a_part_is_the_same_whatever_else_is_in_the_set() -> None:
+    """Bytes and machine code: so a relay is given nothing new when others change."""
+    alone = encoded_part(part_of(compiled("a"), ["a"], []))
+    assert encoded_part(part_of(compiled("a", "b", "c"), ["a"], [])) == alone
+    assert encoded_part(part_of(compiled("c", "b", "a"), ["a"], [])) == alone
+    assert encoded_part(part_of(compiled("a", "b"), ["b"], [])) != alone
+    assert encoded_part(part_of(compiled("a"), ["a"], ["a"])) != alone
+
+
+def test_it_is_the_same_whoever_makes_it() -> None:
+    """In another process, with other hashes of strings."""
+    hashes = {
+        subprocess.run(
+            [sys.executable, "-c", PROGRAM],
+            env=os.environ | {"PYTHONHASHSEED": seed},
+            capture_output=True, text=True, check=True,
+        ).stdout
+        for seed in "123"
+    }  # fmt: skip
+    part = encoded_part(part_of(compiled("b", "a"), ["a"], []))
+    assert hashes == {hashlib.sha256(part).hexdigest() + "\n"}
+
+
+@FEW
+@given(seed=st.integers(0, 1 << 30))
+def test_it_does_what_its_specifications_do_in_the_set(seed: int) -> None:
+    """Of random ones; what is told of places in the text is the same, and so is the module that was sent."""
+    texts = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
+    try:
+        whole = compiled_from(texts, definitions(), margins=True)
+    except SpecificationError:
+        return  # a draw that means nothing
+    for names in whole.groups([one.name for one in whole.specifications]):
+        part = encoded_part(part_of(whole, names, ()))
+        sent = decoded_part(part)
+        assert encoded_part(sent) == part
+        own = MonitorSet.of(sent.compiled)
+        own.take_module(sent.module)
+        among = MonitorSet.of(whole.part(names))
+        stories = [[*story(one.start(0), names)] for one in (own, among)]
+        messages, time = Messages(seed), 0
+        for traffic in (messages.traffic() for _ in range(4)):
+            for body in traffic.bodies():
+                time += 400_000
+                for told, one in zip(stories, (own, among), strict=True):
+                    outcome = one.process(traffic.topic, bytearray(body), time)
+                    told += [outcome.result, bytes(outcome.buffer), *story(outcome, names)]
+        assert stories[0] == stories[1]
+
+
+def test_only_what_is_not_on_trial_has_a_module() -> None:
+    """The others are given copies; those that share variables with them are on trial with them."""
+    part = part_of(compiled("a", "b"), ["a", "b"], ["b"])
+    assert list(part.module.feeds) == ["/a"]
+    assert {one.name for one in part.compiled.specifications} == {"a", "b"}
+
+
+@pytest.mark.parametrize("wrong", [b"", b"\x7fELF", b"\0asm\1\0\0\0"])
+def test_what_is_no_machine_code_of_this_library(wrong: bytes) -> None:
+    """It is refused, and nothing of it is run."""
+    part = part_of(compiled("a"), ["a"], [])
+    monitors = MonitorSet.of(part.compiled)
+    with pytest.raises(MachineError):
+        monitors.take_module(replace(part.module, code=wrong))
+    assert monitors.walker("/a") is None
+
+
+@pytest.mark.parametrize("length", [0, 1, 100])
+def test_a_part_that_is_cut(length: int) -> None:
+    """It is no part."""
+    with pytest.raises(msgspec.MsgspecError):
+        decoded_part(encoded_part(part_of(compiled("a"), ["a"], []))[:length])

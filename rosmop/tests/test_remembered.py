@@ -1,0 +1,84 @@
+"""The state of a property outlives the process that had it (of whole monitors: `relay/monitors/test_keeper.py`)."""
+
+from random import Random
+from typing import Any
+
+import msgspec
+import pytest
+
+from rosmop.run.engine import MonitorSet
+from rosmop.run.state_of_runs import MOST_PARTS, StateTooLargeError, kept, run_of
+from roswire.standard import standard_definitions
+
+FORMULAS = {
+    "fsm": "fsm: a [ e0 -> b, default a ] b [ e1 -> c, default b ] c [ default a ]",
+    "tfsm": "tfsm: a [ e0 -> b, default a ] b [ e1 -> a, timeout 5ms -> c, default b ] c [ default a ]",
+    "ere": "ere: (e0 e1 | e2)*",
+    "ltl": "ltl: [](e0 => o (e1 or e2))",
+    "ptltl": "ptltl: e0 -> (*) (e1 or e2)",
+    "past with two bounds": "mtl: once[1ms,7ms] e0 and once[0,3ms] e1",
+    "past with a clock": "mtl: once[0,4ms] e0",
+    "future": "mtl: e0 -> eventually[0,6ms] e1",
+    "future and past": "mtl: (e0 until[1ms,9ms] e1) or not once[2ms,5ms] (e2 and eventually[0,3ms] e0)",
+    "next": "mtl: e0 -> next[0,5ms] (e1 or eventually[0,4ms] e2)",
+    "since of what is open": "mtl: (eventually[0,3ms] e1) since[0,8ms] e0",
+    "cfg": "cfg: S -> e0 S e1 | e2 | epsilon",
+    "ambiguous cfg": "cfg: S -> S S | e0 S e1 | e2 | epsilon",
+    "srs": "srs: e0 e1 -> #epsilon . e2 e2 e2 -> #fail .",
+    "ptcaret": "ptcaret: e0 -> @b e2",
+    "pattern": "pattern: globally: e0 causes e1 within 6ms",
+    "pattern with a scope": "pattern: after e0 until e2: e1 forbids e2 within 4ms",
+}
+
+
+def compiled(formula: str) -> MonitorSet:
+    """A specification with this property over three events on /e0, /e1, /e2."""
+    events = " ".join(f"event e{n}() /e{n} std_msgs/Empty '{{}}' {{ }}" for n in range(3))
+    if formula.startswith("ptcaret"):
+        events = events.replace("event e0", "event begin").replace("event e1", "event end")
+        formula = formula.replace("e0", "begin").replace("e1", "end")
+    return MonitorSet.load({"s.rv": f"s() {{ {events}\n{formula}\n }}"}, standard_definitions())
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize("seed", range(20))
+def test_a_run_goes_on_where_it_was(name: str, seed: int) -> None:
+    """A run of each kind that is written and read after any step or deadline tells what it would have told."""
+    random = Random(seed)  # noqa: S311  draws examples, not keys
+    [declared] = compiled(FORMULAS[name]).compiled.specifications[0].properties
+    formula = declared.property
+    run, copied, time = formula.start(0), formula.start(0), 0
+    for _ in range(60):
+        time += random.choice((0, 1, 500_000, 2_000_000, 5_000_000))
+        while (deadline := run.deadline) is not None and deadline < time:
+            copied = again(formula, copied)
+            assert copied.deadline == deadline
+            assert copied.expire() == run.expire()
+        copied = again(formula, copied)
+        event = random.randrange(3)
+        assert copied.step(event, time) == run.step(event, time)
+        assert copied.deadline == run.deadline
+
+
+def again(formula: Any, run: Any) -> Any:
+    """The run as another process reads it."""
+    return run_of(formula, msgspec.msgpack.decode(msgspec.msgpack.encode(kept(run))), 0)
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+@pytest.mark.parametrize("data", [[], [[], []], [["x"], []], [[["o", 3]], []], 7, [[10**6, 0, 0], []], None])
+def test_what_is_no_state_of_a_property_is_refused(name: str, data: object) -> None:
+    """Whatever is written in the place of a run, another is not made of it, and nothing else is raised."""
+    formula = compiled(FORMULAS[name]).compiled.specifications[0].properties[0].property
+    with pytest.raises(ValueError):
+        run_of(formula, data, 0)
+
+
+def test_a_deep_stack_is_too_large_to_keep() -> None:
+    """What is written with each message is bounded: a grammar nested thousands deep is not kept, and that is said."""
+    formula = compiled(FORMULAS["cfg"]).compiled.specifications[0].properties[0].property
+    run = formula.start(0)
+    for _ in range(2 * MOST_PARTS):
+        run.step(0, 0)
+    with pytest.raises(StateTooLargeError):
+        kept(run)

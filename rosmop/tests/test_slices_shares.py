@@ -1,0 +1,209 @@
+"""Slices are charged to the hosts whose messages make them: none uses up what others need, in number or in time."""
+
+# ruff: noqa: E501  the rows of tables
+
+from random import Random
+
+import pytest
+from rosmop.tests.examples import examples
+
+from rosmop.run.causes import Sender
+from rosmop.run.engine import MonitorSet
+from rosmop.run.execution import TICK_BUDGET
+from rosmop.run.outcomes import Outcome
+from rosmop.run.slices import TOGETHER_LIMIT
+from rosmop.tests.acting import definitions, message
+
+ROBOT, GUEST = Sender(1), Sender(2)
+HOSTS = {1: "10.0.0.1", 2: "10.0.0.2", 3: "10.0.0.3", 4: "10.0.0.4"}
+GOALS = """goals(std::string id) {
+    creation event goal(std::string id) /goal std_msgs/String '{data:id}' { }
+    event result(std::string id) /result std_msgs/String '{data:id}' { }
+    fsm: new [ goal -> sent, default new ] sent [ goal -> twice, result -> done ] twice [ result -> done, default twice ]
+         done [ default done ]
+    @twice { %s }
+}"""
+ACTING, OBSERVING = GOALS % "DROP;", GOALS % 'ROS_WARN("twice");'
+
+
+def begun(text: str, slices: int) -> MonitorSet:
+    """A set in which each source is a host."""
+    monitors = MonitorSet.load({"x.rv": text}, definitions(), slices=slices)
+    monitors.charge_slices(HOSTS.get)
+    monitors.start(0)
+    return monitors
+
+
+def send(monitors: MonitorSet, topic: str, name: str, sender: Sender, time: int = 1) -> Outcome:
+    """A message about a goal."""
+    return monitors.process(topic, message("std_msgs/String", data=name), time, sender)
+
+
+def live(monitors: MonitorSet) -> int:
+    """How many slices there are."""
+    slices = monitors.monitors[0].slices
+    assert slices is not None
+    return slices.live
+
+
+def test_a_guest_that_makes_up_ids_refuses_the_robot_nothing() -> None:
+    """Where a specification acts, the guest's own new ids fault; the robot's goals are judged as before."""
+    monitors = begun(ACTING, 100)
+    assert not send(monitors, "/goal", "r", ROBOT).faults
+    outcomes = [send(monitors, "/goal", f"g{number}", GUEST) for number in range(1000)]
+    assert [bool(one.faults) for one in outcomes] == [False] * 49 + [True] * 951
+    assert outcomes[-1].result == "dropped"
+    assert outcomes[-1].faults[0].values == {"id": "g999"}
+    for number in range(20):
+        assert not send(monitors, "/goal", f"r{number}", ROBOT).faults
+    assert send(monitors, "/goal", "r", ROBOT).verdicts
+    assert send(monitors, "/goal", "g0", GUEST).verdicts  # what it owes is not forgotten
+
+
+def test_a_guest_that_makes_up_ids_pushes_out_its_own() -> None:
+    """Where a specification only observes, the guest's oldest goals are forgotten, which is said; the robot's stay."""
+    monitors = begun(OBSERVING, 100)
+    send(monitors, "/goal", "r", ROBOT)
+    outcomes = [send(monitors, "/goal", f"g{number}", GUEST) for number in range(1000)]
+    assert not any(one.faults or one.result == "dropped" for one in outcomes)
+    assert [line.text for one in outcomes for line in one.log] == [
+        "1 of its oldest slices are forgotten to make room for new ones of the same host; there may be 100 slices"
+    ]
+    assert live(monitors) == 50
+    assert send(monitors, "/goal", "r", ROBOT).verdicts
+    assert not send(monitors, "/goal", "g0", GUEST).verdicts
+    assert send(monitors, "/goal", "g999", GUEST).verdicts
+
+
+def test_hosts_that_are_not_told_apart_have_the_whole() -> None:
+    """A recording has no hosts: there all slices are one's."""
+    monitors = begun(ACTING, 100)
+    for number in range(100):
+        assert not send(monitors, "/goal", str(number), Sender(9)).faults
+    assert send(monitors, "/goal", "more", Sender(9)).faults
+
+
+@pytest.mark.parametrize("text", [ACTING, OBSERVING])
+def test_no_sequence_removes_a_slice_for_another_host(text: str) -> None:
+    """Whoever sends what in whatever order: within the bound, and what a host has goes by its own messages only."""
+    for seed in range(examples(60)):
+        random = Random(seed)  # noqa: S311  draws examples, not keys
+        monitors = begun(text, 12)
+        for _ in range(80):
+            slices = monitors.monitors[0].slices
+            assert slices is not None
+            before = {host: [*slices._live._of.get(host, ())] for host in HOSTS.values()}
+            host = random.choice((*HOSTS,))
+            send(
+                monitors,
+                random.choice(("/goal", "/goal", "/result")),
+                f"{host} {random.randrange(9)}",
+                Sender(host),
+            )
+            after = {host: [*slices._live._of.get(host, ())] for host in HOSTS.values()}
+            assert slices.live == sum(map(len, after.values())) <= 12
+            assert all(after[other] == before[other] for other in HOSTS.values() if other != HOSTS[host])
+
+
+def test_a_guest_has_no_binding_of_the_robot_forgotten() -> None:
+    """However many goals of a guest end, the robot's late messages begin none of its own goals again."""
+    monitors = begun(ACTING, 10)
+    send(monitors, "/goal", "r", ROBOT)
+    send(monitors, "/result", "r", ROBOT)
+    for number in range(100):
+        send(monitors, "/goal", f"g{number}", GUEST)
+        send(monitors, "/result", f"g{number}", GUEST)
+    send(monitors, "/goal", "r", ROBOT)
+    assert live(monitors) == 0
+
+
+STOPPED = """goals(std::string id) {
+    static int most = 1000000; int times = 0;
+    creation event goal(std::string id) /goal std_msgs/String '{data:id}' { }
+    event stop() /stop std_msgs/Empty '{}' %s
+    fsm: new [ goal -> sent, default new ] sent [ goal -> sent, stop -> stopped ] stopped [ goal -> again, stop -> stopped ]
+         again [ default again ]
+    @again { DROP; }
+}"""
+
+
+def states(monitors: MonitorSet) -> list[object]:
+    """The states and variables of all slices."""
+    slices = monitors.monitors[0].slices
+    assert slices is not None
+    return [
+        (slice_.runs[0].state, slice_.values)  # type: ignore[attr-defined]  # of tables
+        for slice_ in slices._whole.values()
+        if slice_ is not None
+    ]
+
+
+def test_one_message_concerns_a_bounded_number_of_slices() -> None:
+    """Where an event does not bind all parameters there are at most so many slices, whatever the setting is."""
+    monitors = begun(STOPPED % "{ }", 100_000)
+    for number in range(TOGETHER_LIMIT):
+        send(monitors, "/goal", str(number), Sender(9))
+    assert live(monitors) == TOGETHER_LIMIT
+    assert send(monitors, "/goal", "more", Sender(9)).faults
+    assert not monitors.process("/stop", b"", 2, GUEST).faults
+    assert len({repr(state) for state in states(monitors)}) == 1
+
+
+@pytest.mark.parametrize("on_fault", ["drop", "pass"])
+def test_a_message_that_is_cut_has_happened_in_no_slice(on_fault: str) -> None:
+    """The budget ends in the middle of the slices: one fault, nothing put out, and all slices as before."""
+    action = '{ times = times + 1; ROS_INFO("stop"); for (int i = 0; i < 300000; i++) { times = times; } }'
+    monitors = MonitorSet.load({"x.rv": STOPPED % action}, definitions(), on_fault)  # type: ignore[arg-type]
+    monitors.start(0)
+    for name in "abcde":
+        send(monitors, "/goal", name, GUEST)
+    before = states(monitors)
+    outcome = monitors.process("/stop", b"", 2, GUEST)
+    assert outcome.result == ("dropped" if on_fault == "drop" else "passed")
+    assert (len(outcome.faults), outcome.verdicts, [*outcome.log], outcome.events) == (1, (), [], ())
+    assert states(monitors) == before
+
+
+def test_slices_of_a_guest_take_no_tick_from_those_of_the_robot() -> None:
+    """At a tick each slice has a budget of its own: the robot's stop is published, however many slices loop."""
+    text = """goals(std::string id) {
+        static std_msgs::Empty stop; int loops = 0; bool waits = true;
+        creation event goal(std::string id, int seq) /goal std_msgs/Header '{frame_id:id, seq:seq}' { loops = seq; }
+        event look() every 1s { for (int i = 0; i < loops; i++) { } if (waits) { waits = false; PUBLISH(/stop, std_msgs/Empty, stop); } }
+    }"""
+    monitors = begun(text, 1000)
+    for number in range(200):
+        goal = message("std_msgs/Header", frame_id=f"g{number}", seq=2 * TICK_BUDGET)
+        monitors.process("/goal", goal, 1, GUEST)
+    monitors.process("/goal", message("std_msgs/Header", frame_id="r", seq=0), 1, ROBOT)
+    (outcome,) = monitors.advance(10**9 + 1)
+    assert [one.topic for one in outcome.published] == ["/stop"]
+
+
+def test_what_a_message_may_take_grows_with_the_slices_that_it_concerns() -> None:
+    """The robot's stop for all its goals is not cut off, though each handler takes some microseconds."""
+    text = STOPPED.replace("@again { DROP; }", '@stopped { ROS_INFO("stopped"); }') % "{ }"
+    monitors = begun(text, 1000)
+    for number in range(900):
+        send(monitors, "/goal", str(number), Sender(9))
+    turn = monitors.interpreter.turn
+    monitors.limit_time(lambda: 12e-6 * len(turn.log), 0.005)
+    outcome = monitors.process("/stop", b"", 2, ROBOT)
+    assert (len(outcome.verdicts), outcome.faults) == (900, ())
+
+
+def test_slices_of_a_guest_take_no_time_of_a_tick_from_those_of_the_robot() -> None:
+    """Each has processor time of its own at a tick, too."""
+    text = """goals(std::string id) {
+        static std_msgs::Empty stop; bool waits = true;
+        creation event goal(std::string id) /goal std_msgs/String '{data:id}' { }
+        event look() every 1s { for (int i = 0; i < 300; i++) { } if (waits) { waits = false; PUBLISH(/stop, std_msgs/Empty, stop); } }
+    }"""
+    monitors = begun(text, 1000)
+    for number in range(200):
+        send(monitors, "/goal", f"g{number}", GUEST)
+    send(monitors, "/goal", "r", ROBOT)
+    turn = monitors.interpreter.turn
+    monitors.limit_time(lambda: 0.004 * len(turn.published), 0.005)
+    (outcome,) = monitors.advance(10**9 + 1)
+    assert (len(outcome.published), outcome.faults) == (201, ())

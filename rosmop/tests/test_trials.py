@@ -1,0 +1,337 @@
+"""Specifications on trial: to the messages they are not there, and what they say is what enabled ones say."""
+
+from collections.abc import Collection, Iterator
+from random import Random
+
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from rosmop.tests.examples import examples
+
+from rosmop.logics.catalogue import LOGICS
+from rosmop.run.engine import MonitorSet
+from rosmop.run.execution import OnFault
+from rosmop.run.outcomes import Outcome
+from rosmop.tests.acting import message
+from rosmop.tests.random_specifications import Messages, Specifications, definitions
+from rosmop.text.errors import SpecificationError
+
+FEW = settings(max_examples=examples(60), suppress_health_check=list(HealthCheck))
+PROPERTIES = {
+    "fsm": "fsm: one [ e0 -> two, default one ] two [ e1 -> one, default two ]\n@two { DROP; }",
+    "tfsm": "tfsm: one [ e0 -> two, default one ] two [ e1 -> one, timeout 3ms -> one ]\n@fail { DROP; __RESET; }\n"
+    "@timeout { late++; }\n",
+    "ere": "ere: (e0 e1)*\n@fail { DROP; __RESET; }",
+    "cfg": "cfg: S -> e0 S e1 | epsilon\n@fail { DROP; __RESET; }",
+    "ltl": "ltl: [](e0 => o e1)\n@violation { DROP; __RESET; }",
+    "ptltl": "ptltl: e1 -> (*) e0\n@violation { DROP; }",
+    "mtl": "mtl: e1 => once[0,2ms] e0\n@violation { DROP; }",
+    "pattern": "pattern: globally: e0 causes e1 within 3ms\n@violation { late++; __RESET; }",
+    "srs": "srs: e0 e1 -> #epsilon . e1 -> #fail .\n@fail { DROP; __RESET; }",
+    "ptcaret": "ptcaret: begin -> (*a) end\n@violation { DROP; }",
+}
+
+
+def number(data: int) -> bytes:
+    """A std_msgs/UInt8."""
+    return bytes([data])
+
+
+class Both:
+    """Specifications up to one with that enabled, all of them with that on trial, and all others."""
+
+    def __init__(self, texts: dict[str, str], tried: str, on_fault: OnFault = "drop") -> None:
+        self.tried, self.on_fault = tried, on_fault
+        place = next(at for at, text in enumerate(texts.values()) if text.startswith(tried))
+        others = {file: text for file, text in texts.items() if not text.startswith(tried)}
+        self.texts = dict(list(texts.items())[: place + 1])
+        self.enabled = MonitorSet.load(self.texts, definitions(), on_fault)
+        self.with_trial = MonitorSet.load(texts, definitions(), on_fault, trials=[tried])
+        self.without = MonitorSet.load(others, definitions(), on_fault)
+        self.stories = [self.story(self.enabled.start(0)), list(self._start())]
+        self.without.start(0)
+
+    def _start(self) -> Iterator[object]:
+        outcome = self.with_trial.start(0)
+        for tried in outcome.tried:
+            yield from self.story(tried)
+        assert not self.story(outcome)
+
+    def give(self, topic: str, body: bytes, time: int) -> None:
+        """A message for all; what goes on is what goes on without the one on trial."""
+        done = self.enabled.process(topic, bytearray(body), time)
+        self.stories[0] += self.story(done)
+        left = self.with_trial.process(topic, bytearray(body), time)
+        expected = self.without.process(topic, bytearray(body), time)
+        assert (left.result, bytes(left.buffer)) == (expected.result, bytes(expected.buffer))
+        assert (list(left.events), list(left.verdicts)) == (list(expected.events), list(expected.verdicts))
+        tapped, self.with_trial.tapped[:] = list(self.with_trial.tapped), []
+        for one in tapped:
+            would = one.give()
+            self.stories[1] += self.story(would)
+            assert (would.result == "dropped") is (done.result == "dropped")
+            if would.result != "dropped":
+                assert bytes(would.buffer) == bytes(done.buffer)
+
+    def promote(self, time: int) -> None:
+        """The one on trial comes into force, with its state."""
+        self.check(time)
+        following = MonitorSet.load(self.texts, definitions(), self.on_fault)
+        following.succeed(self.with_trial, time)
+        assert not following.began
+        self.with_trial = following
+
+    def go_on(self, topic: str, body: bytes, time: int) -> None:
+        """A message for those that are all enabled now."""
+        self.stories[0] += self.story(self.enabled.process(topic, bytearray(body), time))
+        self.stories[1] += self.story(self.with_trial.process(topic, bytearray(body), time))
+
+    def check(self, time: int) -> list[object]:
+        """Until now both have told the same of it; that."""
+        for place, sets in enumerate(([self.enabled], [self.with_trial, *self.with_trial.trials])):
+            for outcome in [outcome for one in sets for outcome in one.advance(time)]:
+                self.stories[place] += self.story(outcome)
+        assert self.stories[0] == self.stories[1]
+        return self.stories[0]
+
+    def story(self, outcome: Outcome) -> list[object]:
+        """All that it did, in order."""
+        before = [told for earlier in outcome.before for told in self.story(earlier)]
+        did: list[object] = [one for one in outcome.events if one.startswith(f"{self.tried}.")]
+        did += [one for one in outcome.verdicts if one.monitor == self.tried]
+        did += [(one.position, one.text) for one in outcome.faults if one.monitor == self.tried]
+        did += [one for one in outcome.log if one.monitor == self.tried]
+        did += [
+            (one._replace(site=0), outcome.sites[one.site].position)
+            for one in outcome.published
+            if one.monitor == self.tried
+        ]
+        did += ["dropped", outcome.reason] * (outcome.dropped_by == self.tried)
+        return [*before, (outcome.time, did)] if did else before
+
+
+# The same as when it is enabled
+
+
+@FEW
+@example(seed=11435, wild=[])  # it publishes, and others that publish stand before it
+@given(seed=st.integers(0, 1 << 30), wild=st.lists(st.binary(max_size=80), max_size=3))
+def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> None:
+    """Bytes, drops and verdicts of the others are as without it, its own as with it; and it goes on after `promote`."""
+    texts = {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())}
+    try:
+        both = Both(texts, f"s{seed % len(texts)}", ("drop", "pass")[seed % 2])
+    except SpecificationError:
+        return  # a draw that means nothing
+    messages, time = Messages(seed), 0
+    for _ in range(4):
+        traffic = messages.traffic()
+        for body in (*traffic.bodies(), *wild):
+            time += 400_000
+            both.give(traffic.topic, body, time)
+    both.promote(time)
+    for traffic in (messages.traffic() for _ in range(2)):
+        for body in traffic.bodies():
+            time += 400_000
+            both.go_on(traffic.topic, body, time)
+    both.check(time)
+
+
+def test_that_compares_something() -> None:
+    """Drops, changes, verdicts, faults and ticks come up."""
+    found: set[str] = set()
+    for seed in range(40):
+        try:
+            both = Both({"0.rv": Specifications(seed).texts()[0]}, "s0")
+        except SpecificationError:
+            continue
+        messages, time = Messages(seed), 0
+        for traffic in (messages.traffic() for _ in range(4)):
+            for body in traffic.bodies():
+                time += 400_000
+                both.give(traffic.topic, body, time)
+        story = str(both.check(time))
+        found |= {word for word in ("dropped", "Verdict", "s0.tick", "Position", "LogLine") if word in story}
+        if len(found) == 5:
+            return
+    pytest.fail(f"only {found}")
+
+
+@pytest.mark.parametrize("logic", LOGICS)
+def test_every_logic(logic: str) -> None:
+    """Events in any order, with deadlines that pass, while an enabled one changes and drops messages before it."""
+    names = ("begin", "end") if logic == "ptcaret" else ("e0", "e1")
+    events = "".join(
+        f"event {name}() /n std_msgs/UInt8 '{{data:{at}}}' {{ }} " for at, name in enumerate(names)
+    )
+    texts = {
+        "0.rv": "a() { event e(int n) /n std_msgs/UInt8 '{data:n}' { if (n == 2) n = 1; if (n == 3) { return; } } }",
+        "1.rv": f"s() {{ int late = 0; {events} {PROPERTIES[logic]} }}",
+    }
+    both, random, time = Both(texts, "s"), Random(logic), 0  # noqa: S311  draws examples
+    for _ in range(60):
+        time += random.choice((300_000, 1_000_000, 3_500_000))
+        both.give("/n", number(random.randrange(4)), time)
+    both.promote(time)
+    for _ in range(30):
+        time += random.choice((300_000, 1_000_000, 3_500_000))
+        both.go_on("/n", number(random.randrange(4)), time)
+    assert "Verdict" in str(both.check(time + 10_000_000))
+
+
+@pytest.mark.parametrize("logic", ["fsm", "ere", "cfg", "ltl", "ptltl", "ptcaret", "tick"])
+def test_every_logic_that_can_be_parametric(logic: str) -> None:
+    """Each slice has its own state, variables and ticks, from the first message that it sees."""
+    names = ("begin", "end") if logic == "ptcaret" else ("e0", "e1")
+    events = "".join(
+        f"event {name}(int n) /n{at} std_msgs/UInt8 '{{data:n}}' {{ seen++; }} "
+        for at, name in enumerate(names)
+    )
+    rule = PROPERTIES.get(logic, "event tick() every 2ms { if (seen > 2) { seen = 0; LOG } }")
+    rule = rule.replace("DROP;", "DROP; LOG").replace("LOG", 'ROS_WARN("%d: %d", n, seen);')
+    texts = {
+        "0.rv": "a() { event e(int n) /n0 std_msgs/UInt8 '{data:n}' { if (n == 2) n = 1; if (n == 3) { return; } } }",
+        "1.rv": f"s(int n) {{ int seen = 0; creation {events} {rule} }}",
+    }
+    both, random, time = Both(texts, "s"), Random(logic), 0  # noqa: S311  draws examples
+    for _ in range(100):
+        time += random.choice((300_000, 1_000_000, 3_500_000))
+        both.give(f"/n{random.randrange(2)}", number(random.randrange(6)), time)
+    both.promote(time)
+    for _ in range(30):
+        time += random.choice((300_000, 1_000_000, 3_500_000))
+        both.go_on(f"/n{random.randrange(2)}", number(random.randrange(6)), time)
+    story = str(both.check(time + 10_000_000))
+    assert "LogLine" in story
+    assert logic == "tick" or "Verdict" in story
+
+
+@pytest.mark.parametrize("handler", ["@enforced { late++; }", "@violation { late++; __RESET; }"])
+def test_what_is_enforced_at_a_deadline(handler: str) -> None:
+    """What would have been published is what is, at the same times, with the variables as they are then."""
+    remedy = "help() { std_msgs::UInt8 one; one.data = late; PUBLISH(/n1, std_msgs/UInt8, one); }"
+    events = "".join(f"event e{at}() /n{at} std_msgs/UInt8 '{{}}' {{ }} " for at in range(2))
+    rule = f"pattern: globally: e0 causes e1 within 3ms enforced by help {handler}"
+    texts = {"1.rv": f"s() {{ int late = 0; {remedy} {events} {rule} }}"}
+    both, random, time = Both(texts, "s"), Random(handler), 0  # noqa: S311  draws examples
+    for _ in range(100):
+        time += random.choice((300_000, 1_000_000, 3_500_000))
+        both.give(f"/n{random.randrange(2)}", number(0), time)
+    both.promote(time)
+    for _ in range(30):
+        time += random.choice((300_000, 1_000_000, 3_500_000))
+        both.go_on(f"/n{random.randrange(2)}", number(0), time)
+    assert "Publi" in str(both.check(time + 10_000_000))
+
+
+# What it stands between, and with whom
+
+NUMBER = "int n) /n std_msgs/UInt8 '{data:n}'"
+
+
+def trial(*texts: str, tried: Collection[str]) -> MonitorSet:
+    """A set, started."""
+    found = MonitorSet.load({f"{at}.rv": text for at, text in enumerate(texts)}, definitions(), trials=tried)
+    found.start(0)
+    return found
+
+
+def test_it_sees_what_those_before_it_left_and_not_what_they_dropped() -> None:
+    """And those behind it see what it would have changed as it was."""
+    monitors = trial(
+        f"a() {{ event e({NUMBER} {{ if (n == 3) {{ return; }} n += 10; }} }}",
+        f"b() {{ event e({NUMBER} {{ n += 100; }} }}",
+        f"c() {{ event e({NUMBER} {{ n += 1; }} }}",
+        tried=["b"],
+    )
+    assert bytes(monitors.process("/n", bytearray(number(1)), 1).buffer) == number(12)
+    assert monitors.process("/n", number(3), 2).result == "dropped"
+    (tapped,) = monitors.tapped
+    assert (tapped.resource, tapped.data, tapped.time) == ("/n", number(11), 1)
+    assert bytes(tapped.give().buffer) == number(111)
+
+
+def test_requests_and_responses() -> None:
+    """Of services, too; their definition is the others' affair."""
+    text = """s() { event asked(bool on) service /mode std_srvs/SetBool request '{data:on}' { if (on) { return; } } }"""
+    monitors = trial(text, tried=["s"])
+    assert monitors.process_service("/mode", "request", b"\x01", 1).result == "passed"
+    assert monitors.tapped.pop().give().result == "dropped"
+    assert monitors.service_type_of("/mode") is None
+    assert monitors.service_type_of("/mode", tried=True) == "std_srvs/SetBool"
+
+
+def test_those_that_share_variables_are_on_trial_together() -> None:
+    """However indirectly, in the order they have; what one would have dropped the next does not see."""
+    monitors = trial(
+        f"a() {{ int k = 0; event e({NUMBER} {{ k = n; if (n == 3) {{ return; }} }} }}",
+        f"b() {{ event e({NUMBER} when (k > 1) {{ return; }} }}",
+        f"c() {{ event e({NUMBER} {{ n = 7; }} }}",
+        tried=["b"],
+    )
+    assert [one.name for one in monitors.tried] == ["a", "b"]
+    assert [one.name for one in monitors.monitors] == ["c"]
+    for data in (1, 2, 3):
+        monitors.process("/n", number(data), data)
+    assert [one.give().dropped_by for one in monitors.tapped] == ["", "b", "a"]
+
+
+def test_a_fault_and_a_loop_without_end_are_its_own() -> None:
+    """Others have their whole budget, and the messages; it has less."""
+    monitors = trial(
+        f"a() {{ event e({NUMBER} {{ while (true) {{ n = n; }} }} }}",
+        f"b() {{ event e({NUMBER} {{ for (int i = 0; i < 30000; i++) {{ n = n; }} n = 1 / (n - 1); }} }}",
+        tried=["a"],
+    )
+    outcome = monitors.process("/n", number(2), 1)
+    assert (outcome.result, list(outcome.faults)) == ("changed", [])
+    tried = monitors.tapped.pop().give()
+    assert tried.dropped_by == "a"
+    assert "more than 100000 instructions" in tried.faults[0].text
+    assert monitors.process("/n", number(1), 2).dropped_by == "b"
+
+
+def test_a_disabled_one_is_given_nothing_and_nothing_is_held() -> None:
+    """A specification that is declared `hold` holds no topic while it is on trial, nor when it comes from there."""
+    text = f"hold a() {{ event e({NUMBER} {{ return; }} }}"
+    monitors = MonitorSet.load({"0.rv": text}, definitions(), trials=["a"])
+    monitors.start(0, restarted=True)
+    assert not monitors.tried[0].held
+    monitors.switch({"a": False}, 1)
+    assert not monitors.wants("/n")
+    monitors.switch({"a": True}, 2)
+    monitors.process("/n", number(1), 3)
+    assert [one.give().dropped_by for one in monitors.tapped] == ["a"]
+    following = MonitorSet.load({"0.rv": text}, definitions())
+    following.succeed(monitors, 4)
+    assert not following.monitors[0].held
+
+
+def test_one_that_is_incomplete_begins_anew_when_it_comes_into_force() -> None:
+    """Not while it stays on trial; faults of the trial are not its faults in force."""
+    text = f"a() {{ int k = 0; event e({NUMBER} {{ k += 1; if (n == 9) {{ n = n / (n - 9); }} }} }}"
+    sources = {"0.rv": text}
+    monitors = trial(text, tried=["a"])
+    for data in (1, 9):
+        monitors.process("/n", number(data), data)
+    for one in monitors.tapped:
+        one.give()
+    still = MonitorSet.load(sources, definitions(), trials=["a"])
+    still.succeed(monitors, 10, ["a"])
+    assert (still.trials[0].value("a", "k"), still.tried[0].faults, still.began) == (2, 1, ())
+    anew, kept = (MonitorSet.load(sources, definitions()) for _ in range(2))
+    kept.succeed(still, 11)
+    assert (kept.value("a", "k"), kept.monitors[0].faults, kept.began) == (2, 0, ())
+    anew.succeed(still, 11, ["a"])
+    assert (anew.value("a", "k"), anew.began) == (0, ("a",))
+
+
+def test_a_topic_that_only_a_trial_wants_has_a_type_for_it_alone() -> None:
+    """A publisher with another definition is not refused for its sake."""
+    monitors = trial("s() { event e() /chatter std_msgs/String '{}' { } }", tried=["s"])
+    assert monitors.wants("/chatter")
+    assert (monitors.type_of("/chatter"), monitors.type_of("/chatter", tried=True)) == (
+        None,
+        "std_msgs/String",
+    )
+    assert monitors.process("/chatter", message("std_msgs/String", data="x"), 1).result == "passed"

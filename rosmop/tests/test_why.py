@@ -1,0 +1,416 @@
+"""What explains a verdict is enough for it: the named events alone, given to a run that begins anew, give the verdict.
+
+For each logic, over random formulas and traces. None of them can be left out (`fewest`).
+"""
+
+import copy
+from collections.abc import Sequence
+from random import Random
+
+import pytest
+
+from rosmop.logics import mtl, ptcaret, ptltl
+from rosmop.logics.formula import read_formula
+from rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError, Run
+from rosmop.run import explain
+from rosmop.run.causes import NOBODY, SEQ, Explanation, Happened, Sender
+from rosmop.run.engine import MonitorSet
+from rosmop.run.explain import ClockedSteps, Steps, history_of
+from rosmop.run.subformulas import Meaning, deciding
+from rosmop.tests.acting import definitions, message
+from rosmop.tests.logics.driving import compiled, seeded
+from rosmop.tests.logics.temporal import ARITY, BOOLEAN, Printer, draw
+
+EVENTS = ("a", "b", "c")
+CALLS = ("begin", "end", "a")
+MILLISECOND = 10**6
+
+_PAST = ("previously", "once", "historically", "since")
+_UNARY = {**ARITY, "previously": 1, "once": 1, "historically": 1}
+_BINARY = (*BOOLEAN, "since")
+_PTLTL = Printer(
+    {"previously": ("(*)",), "once": ("<*>",), "historically": ("[*]",), "since": ("S",)}, [_BINARY], _BINARY
+)
+
+
+def machine(random: Random, *, timed: bool) -> str:
+    """A random machine of four states."""
+    text = ""
+    for state in range(4):
+        moves = [f"{event} -> s{random.randrange(4)}" for event in EVENTS if random.random() < 0.8]
+        if timed and random.random() < 0.5:
+            moves.append(f"timeout {random.randrange(1, 5)}ms -> s{random.randrange(4)}")
+        moves.append(f"default s{random.randrange(4)}")
+        text += f"s{state} [ {', '.join(moves)} ] "
+    return text
+
+
+def expression(random: Random, depth: int) -> str:
+    """A random regular expression."""
+    if depth == 0:
+        return random.choice(EVENTS)
+    one, other = expression(random, depth - 1), expression(random, depth - 1)
+    return random.choice([f"({one} {other})", f"({one} | {other})", f"({one})*", f"~({one})", one])
+
+
+def past(random: Random) -> str:
+    """A formula of ptltl."""
+    return _PTLTL.show(draw(random, 4, _PAST, _UNARY, EVENTS), random)
+
+
+def caret(random: Random) -> str:
+    """A formula of ptcaret, with an operator about calls."""
+    inner = _PTLTL.show(draw(random, 2, _PAST, _UNARY, CALLS), random)
+    other = _PTLTL.show(draw(random, 2, _PAST, _UNARY, CALLS), random)
+    return random.choice(
+        [f"(*a) ({inner})", f"<*a> ({inner})", f"[*a] ({inner})", f"@b ({inner})", f"<*s@b> ({inner})",
+         f"({inner}) Sa ({other})", f"({other}) -> <*a> ({inner})"]
+    )  # fmt: skip
+
+
+def metric(random: Random) -> str:
+    """A formula of mtl about the past."""
+
+    def part(depth: int) -> str:
+        if depth == 0:
+            return random.choice(EVENTS)
+        low = random.choice([0, 0, 1, 2])
+        bounds = random.choice(["", f"[{low}ms,{low + random.randrange(4)}ms]", f"[{low}ms,inf]"])
+        one, other = part(depth - 1), part(depth - 1)
+        return random.choice(
+            [f"once{bounds} ({one})", f"historically{bounds} ({one})", f"({one}) since{bounds} ({other})",
+             f"previously{bounds} ({one})", f"!({one})", f"({one}) and ({other})", f"({one}) -> ({other})"]
+        )  # fmt: skip
+
+    return part(3)
+
+
+def ahead(random: Random) -> str:
+    """A formula of mtl about the future."""
+    one, other = random.sample(EVENTS, 2)
+    bounds = f"[{random.choice([0, 1])}ms,{random.randrange(2, 6)}ms]"
+    return random.choice([
+        f"{one} => eventually{bounds} {other}", f"{one} => always{bounds} !{other}", f"!{one} or next{bounds} {other}",
+        f"{one} => (!{other} until{bounds} {one})", f"eventually{bounds} ({one} and next{bounds} {other})",
+    ])  # fmt: skip
+
+
+def pattern(random: Random) -> str:
+    """A pattern, with a time bound or without."""
+    scope = random.choice(["globally", "after a", "until b", "after a until b"])
+    body = random.choice(["no c", "some c", "c causes b", "c requires a", "c forbids c", "a causes c"])
+    return f"{scope}: {body}{random.choice(['', ' within 3ms'])}"
+
+
+def grammar(random: Random) -> str:
+    """A context-free grammar."""
+    return random.choice([
+        "S -> a S b | epsilon", "S -> a S b S | c", "S -> S S | a b | c", "S -> a S a | b S b | c",
+        "S -> A B, A -> a A | epsilon, B -> b B c | epsilon",
+    ])  # fmt: skip
+
+
+def rewriting(random: Random) -> str:
+    """A rewriting system."""
+    return random.choice([
+        "a b -> #epsilon . ^ b -> #fail .", "a a -> b . b b -> #fail . c -> #epsilon .",
+        "a c -> #epsilon . ^ c -> #fail . b b b -> #succeed .", "^ a $ -> a a . a a a a -> #fail . c -> #succeed .",
+    ])  # fmt: skip
+
+
+def future(random: Random) -> str:
+    """A formula of ltl."""
+    return random.choice([
+        "[] (a => o b)", "[] !(a and b) and <> c", "!b U a", "[](a => <> b)", "<> c", "[] (c => !a U b)",
+    ])  # fmt: skip
+
+
+MAKERS = {
+    "fsm": lambda random: machine(random, timed=False),
+    "tfsm": lambda random: machine(random, timed=True),
+    "ere": lambda random: expression(random, 4),
+    "ltl": future,
+    "ptltl": past,
+    "mtl": metric,
+    "mtl future": ahead,
+    "pattern": pattern,
+    "cfg": grammar,
+    "srs": rewriting,
+    "ptcaret": caret,
+}
+
+
+def gives(
+    made: CompiledProperty,
+    before: Run | None,
+    explanation: Sequence[Happened],
+    target: Happened,
+    category: str,
+) -> bool:
+    """Whether events give a category, as a reader would try it: with the last of them, or by the target's deadline."""
+    run = made.start(0) if before is None else copy.copy(before)
+    told: tuple[str, ...] = ()
+    for one in explanation:
+        while (deadline := run.deadline) is not None and deadline < one.time:
+            run.expire()
+        told = run.step(one.event, one.time)
+    if target.event >= 0:
+        return category in told
+    at_once: list[str] = []
+    while (deadline := run.deadline) is not None and deadline <= target.time:
+        categories = run.expire()
+        at_once += categories if deadline == target.time else ()
+    return category in at_once
+
+
+def explained(
+    made: CompiledProperty, random: Random, length: int
+) -> list[tuple[Explanation | None, Happened, str, Run | None]]:
+    """A random trace and each explanation of a verdict on it: of what, and (where it is cut) the run before it."""
+    run, history, now = made.start(0), history_of(made, 0), 0
+    found = []
+    copies: dict[int, Run] = {}
+
+    def note(event: int, time: int, number: int, categories: Sequence[str]) -> None:
+        happened = Happened(event, time, Sender(7, number, SEQ) if event >= 0 else NOBODY)
+        for category in dict.fromkeys(categories):
+            explanation = history.explain(category)
+            since = explanation.since if explanation is not None else None
+            found.append((explanation, happened, category, copies.get(since) if since is not None else None))
+
+    for number in range(length):
+        now += random.randrange(1, 3) * MILLISECOND
+        while (deadline := run.deadline) is not None and deadline < now:
+            copies.setdefault(deadline, copy.copy(run))
+            note(-1, deadline, 0, history.expire(run))
+        if isinstance(history, Steps):
+            copies[now] = copy.copy(run)
+        event = random.randrange(len(made.events))
+        note(event, now, number, history.step(run, event, now, Sender(7, number, SEQ)))
+    return found
+
+
+@pytest.mark.parametrize("logic", ["tfsm", "pattern"])
+def test_what_is_kept_of_a_clock_is_what_steps_keep(logic: str) -> None:
+    """In a room of fixed size, whatever the length of the trace."""
+    random, compared = seeded(43), 0
+    for _ in range(12):
+        made = compiled(logic, MAKERS[logic](random), EVENTS)
+        if not isinstance(made, ClockedProperty):
+            continue
+        ways = [(made.start(0), kept(made, 0)) for kept in (Steps, ClockedSteps)]
+        now = 0
+        for number in range(400):
+            now += random.randrange(1, 3) * MILLISECOND
+            event, told = random.randrange(len(made.events)), []
+            for run, history in ways:
+                said = []
+                while (deadline := run.deadline) is not None and deadline < now:
+                    said += [history.explain(one) for one in history.expire(run)]
+                categories = history.step(run, event, now, Sender(7, number, SEQ))
+                if number % 7 == 0:
+                    said += [history.explain(one) for one in categories]
+                told.append(said)
+            assert told[0] == told[1]
+            compared += len(told[0])
+    assert compared > 50
+
+
+@pytest.mark.parametrize("logic", MAKERS)
+def test_the_named_events_alone_give_the_verdict(logic: str) -> None:
+    """And none of them can be left out; they are messages that came, in their order."""
+    random = seeded(41)
+    count = cut = 0
+    for _ in range(40):
+        try:
+            made = compiled(
+                logic.split(maxsplit=1)[0], MAKERS[logic](random), CALLS if logic == "ptcaret" else EVENTS
+            )
+        except FormulaError:
+            continue
+        for explanation, target, category, before in explained(made, random, 30):
+            assert explanation is not None
+            assert explanation.since is None
+            assert explanation.fewest
+            assert gives(made, before, explanation.events, target, category)
+            numbers = [one.sender.number for one in explanation.events]
+            assert numbers == sorted(set(numbers))
+            for place in range(len(numbers)):
+                fewer = [*explanation.events[:place], *explanation.events[place + 1 :]]
+                assert not gives(made, before, fewer, target, category)
+            count += 1
+            cut += explanation.since is not None
+    assert count > 100
+
+
+@pytest.mark.parametrize("logic", MAKERS)
+def test_what_is_cut_says_so(logic: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With next to nothing kept the named events give the verdict to the property as it was at `since`."""
+    monkeypatch.setattr(explain, "KEPT", 2)
+    random = seeded(42)
+    whole = cut = 0
+    for _ in range(40):
+        try:
+            made = compiled(
+                logic.split(maxsplit=1)[0], MAKERS[logic](random), CALLS if logic == "ptcaret" else EVENTS
+            )
+        except FormulaError:
+            continue
+        for explanation, target, category, before in explained(made, random, 30):
+            assert explanation is not None
+            assert (before is None) is (explanation.since is None)
+            assert gives(made, before, explanation.events, target, category)
+            whole += explanation.since is None
+            cut += explanation.since is not None
+    assert whole > 20
+    if logic in ("fsm", "ere", "ltl"):
+        assert not cut
+    elif logic in ("tfsm", "mtl", "cfg", "srs", "ptcaret"):
+        assert cut > 5
+
+
+def test_a_long_way_is_told_whole() -> None:
+    """What came back to where it had been is no part of it; a way that is too long to be shortened says so."""
+    states = 400
+    text = " ".join(f"s{number} [ a -> s{number + 1}, b -> s{number} ]" for number in range(states))
+    made = compiled("fsm", f"{text} s{states} [ ]")
+    run, history = made.start(0), history_of(made, 0)
+    for number in range(states):
+        for event in (1, 1, 0):
+            history.step(run, event, number + 1, NOBODY)
+    explanation = history.explain(f"s{states}")
+    assert explanation is not None
+    assert not explanation.fewest
+    assert [one.event for one in explanation.events] == [0] * states
+    assert explanation.events[-1].state == f"s{states}"
+
+
+def test_the_latest_of_equal_explanations() -> None:
+    """Who asks why wants what happened now, and not what was as bad an hour ago."""
+    made = compiled("ere", "(a b)* c")
+    run, history = made.start(0), history_of(made, 0)
+    for number, event in enumerate((0, 1, 0, 1, 2)):
+        history.step(run, event, number + 1, Sender(1, number, SEQ))
+    explanation = history.explain("match")
+    assert explanation is not None
+    assert [one.sender.number for one in explanation.events] == [4]
+
+
+def test_a_verdict_of_now_is_not_explained_by_one_of_before() -> None:
+    """The last event is named unless the others do without it."""
+    made = compiled("ptltl", "!c and (a -> <*> b)")
+    run, history = made.start(0), history_of(made, 0)
+    for number, event in enumerate((2, 0)):
+        history.step(run, event, number + 1, Sender(1, number, SEQ))
+    explanation = history.explain("violation")
+    assert explanation is not None
+    assert [one.event for one in explanation.events] == [0]
+
+
+@pytest.mark.parametrize("logic", ["ptltl", "mtl", "ptcaret"])
+def test_sub_formulas_have_the_meaning_of_the_monitors(logic: str) -> None:
+    """The plain meaning that names what decides is the monitors' own, on random formulas and traces."""
+    random = seeded(43)
+    syntax = {"ptltl": ptltl.SYNTAX, "mtl": mtl.SYNTAX, "ptcaret": ptcaret.SYNTAX}[logic]
+    events = CALLS if logic == "ptcaret" else EVENTS
+    for _ in range(150):
+        made = compiled(logic, MAKERS[logic](random), events)
+        formula = read_formula(made.source, syntax)
+        run, times, trace, now = made.start(0), [], [], 0
+        for _ in range(12):
+            now += random.randrange(0, 3) * MILLISECOND
+            trace.append(random.randrange(3))
+            times.append(now)
+            holds = run.step(trace[-1], now) == ("validation",)
+            meaning = Meaning([events[event] for event in trace], times)
+            assert meaning.holds(formula, len(trace) - 1) is holds
+
+
+def test_what_decides_a_formula() -> None:
+    """Named are sub-formulas as they are written, with their values."""
+    made = compiled("mtl", "a -> once[0,500ms] b and !c")
+    run, history = made.start(0), history_of(made, 0)
+    for event, time in ((1, 1), (0, 700 * MILLISECOND)):
+        history.step(run, event, time, NOBODY)
+    explanation = history.explain("violation")
+    assert explanation is not None
+    assert [one.event for one in explanation.events] == [0]
+    assert deciding(made.source, explanation) == ["a is true", "once[0ns,500ms] b is false"]
+
+
+def test_what_was_long_ago_is_known_by_what_it_led_to() -> None:
+    """Where there are no tables the last events are kept; the one that decides is older, and that is said."""
+    made = compiled("mtl", "a -> !(once[0,10s] b)")
+    run, history = made.start(0), history_of(made, 0)
+    for number, event in enumerate((1, *[0] * 4 * explain.KEPT)):
+        history.step(run, event, number, NOBODY)
+    explanation = history.explain("violation")
+    assert explanation is not None
+    assert [one.event for one in explanation.events] == [0]
+    assert explanation.since is not None
+    assert explanation.since > 2 * explain.KEPT
+    assert deciding(made.source, explanation) == []
+
+
+@pytest.mark.parametrize("between", [10, 1500])
+@pytest.mark.parametrize(
+    ("formula", "last", "because"),
+    [("a => eventually[0,1s] b", 2, [0]), ("a => always[0,1s] !b", 1, [0, 1])],
+    ids=["by a deadline", "by an event"],
+)
+def test_a_long_trace_of_the_future(formula: str, last: int, because: list[int], between: int) -> None:
+    """The event that the formula was asked at explains it, with what decides it, however many came between the two."""
+    made = compiled("mtl", formula)
+    run, history, now = made.start(0), history_of(made, 0), 0
+    for event in [1, *[2] * 30, 0, *[2] * between, last]:
+        now += MILLISECOND // 10
+        told = history.step(run, event, now, NOBODY)
+    while run.deadline is not None:
+        told = history.expire(run)
+    assert "violation" in told
+    explanation = history.explain("violation")
+    assert explanation is not None
+    assert ([one.event for one in explanation.events], explanation.fewest) == (because, True)
+
+
+def test_a_verdict_of_a_slice_is_explained_by_its_own_events() -> None:
+    """Not by those of another binding, though they came between, and though most of them need no more than a table."""
+    text = """goals(int id) {
+        event start(int id) /start std_msgs/Int32 '{data:id}' { }
+        event end(int id) /end std_msgs/Int32 '{data:id}' { }
+        ere: (start end)*
+        @fail { ROS_WARN("twice"); }
+    }"""
+    monitors = MonitorSet.load({"goals.rv": text}, definitions())
+    monitors.start(0)
+    outcome = None
+    for number, (topic, value) in enumerate((("/start", 1), ("/start", 2), ("/end", 2), ("/start", 1))):
+        data = message("std_msgs/Int32", data=value)
+        outcome = monitors.process(topic, data, number, Sender(number + 1))
+    assert outcome is not None
+    [verdict] = outcome.verdicts
+    assert verdict.binding == {"id": 1}
+    assert verdict.why is not None
+    assert [one.sender.source for one in verdict.why.events] == [1, 4]
+
+
+def test_what_was_compared_and_which_statement_dropped() -> None:
+    """The values are those of the comparison, though the action changes them after it."""
+    text = """gun() {
+        int count = 0;
+        event fire(int x) /fire std_msgs/Int32 '{data:x}' when (x > 3 && count < 5) {
+            if (x == 7) {
+                count = 9; x = 1;
+                DROP;
+            }
+            count = count + 1;
+        }
+    }"""
+    monitors = MonitorSet.load({"gun.rv": text}, definitions())
+    monitors.start(0)
+    passed = monitors.process("/fire", message("std_msgs/Int32", data=5), 1)
+    assert passed.conditions == {"gun.rv:3:65": {"x": 5, "count": 0}}
+    assert passed.dropped_at is None
+    dropped = monitors.process("/fire", message("std_msgs/Int32", data=7), 2)
+    assert str(dropped.dropped_at) == "gun.rv:6:17"
+    assert dropped.conditions == {"gun.rv:3:65": {"x": 7, "count": 1}, "gun.rv:4:17": {"x": 7}}

@@ -1,0 +1,350 @@
+"""The parser takes ROSMOP's syntax as it occurs, and says of anything else where and why it cannot be."""
+
+# ruff: noqa: E501  the rows of tables
+
+import pytest
+
+from rosmop.form.positions import Position
+from rosmop.text import tree
+from rosmop.text.errors import SpecificationError
+from rosmop.text.parser import MAX_CHARACTERS, parse
+
+
+def parsed(text: str) -> tree.Specification:
+    """The only specification of a text."""
+    [found] = parse(text, "x.rv").specifications
+    return found
+
+
+def event(body: str = "", head: str = "event e() /t std_msgs/Empty '{}'") -> tree.Event:
+    """The event of a specification with one."""
+    [found] = parsed(f"s() {{ {head} {{ {body} }} }}").events
+    return found
+
+
+def refusal(text: str) -> tuple[int, int, str]:
+    """Line, column and text of the first error."""
+    with pytest.raises(SpecificationError) as caught:
+        parse(text, "x.rv")
+    finding = caught.value.findings[0]
+    return finding.position.line, finding.position.column, finding.text
+
+
+HEADS = [
+    ("a() {", "a", ()),
+    ("a {", "a", ()),
+    ("hold a() {", "a", ("hold",)),
+    ("one two a {", "a", ("one", "two")),
+    ('#include <math.h>\n#include "ros/ros.h"\nusing namespace std;\n\na() {', "a", ()),
+    ("#define X \\\n  1\na() {", "a", ()),
+    (
+        "#ifndef X\n#define X // once\n#include <x>\n#if Y(X)\n/* X */\n#endif\n#endif\n#pragma once\na() {",
+        "a",
+        (),
+    ),
+    ("// comment\n/* of * two\n lines **/ a() {", "a", ()),
+    ("\ufeffa() {", "a", ()),
+]
+
+
+@pytest.mark.parametrize(("head", "name", "modifiers"), HEADS)
+def test_the_head_of_a_specification(head: str, name: str, modifiers: tuple[str, ...]) -> None:
+    """Modifiers, parentheses or none, a C++ preamble and comments in front."""
+    found = parsed(f"{head} event e() /t std_msgs/Empty '{{}}' {{ }} }}")
+    assert found.name == name
+    assert tuple(modifier.parts[0] for modifier in found.modifiers) == modifiers
+
+
+def test_several_specifications_in_a_file() -> None:
+    """Any number, in order, with stray semicolons."""
+    text = "a() { event e() /t std_msgs/Empty '{}' { }; };\nb { event e() /t std_msgs/Empty '{}' { } }"
+    assert [found.name for found in parse(text, "x.rv").specifications] == ["a", "b"]
+
+
+def test_functions_and_declarations_may_stand_anywhere() -> None:
+    """As in the samples of ROSRV: declarations, init, events and functions mixed."""
+    found = parsed("""s() {
+        int a = 10; double b, c = 2.5; std::string const t = "x"; char d[20]; std::vector<std::vector<double>> v;
+        init() { a = 1; }
+        event e() /t std_msgs/Empty '{}' { raw(); }
+        raw() { a = 2; }
+        double half(double x) { return x / 2; }
+        event f() /t std_msgs/Empty '{}' { }
+        unsigned long long z;
+    }""")
+    assert [declarator.name for each in found.declarations for declarator in each.declarators] == list(
+        "abctdvz"
+    )
+    assert [function.name for function in found.functions] == ["raw", "half"]
+    assert [each.name for each in found.events] == ["e", "f"]
+    assert len(found.inits) == 1
+
+
+TRIGGERS = [
+    ("event e() /t std_msgs/Empty '{}'", ("/t", "std_msgs/Empty", None)),
+    ("event e() /a/b_1 std_msgs::Empty '{}'", ("/a/b_1", "std_msgs/Empty", None)),
+    ("event e() /t std_msgs/Empty'{}'", ("/t", "std_msgs/Empty", None)),
+    ("event e() /t std_msgs/Empty \u2018{}\u2019", ("/t", "std_msgs/Empty", None)),
+    ("creation event e() /t std_msgs/Empty '{}'", ("/t", "std_msgs/Empty", None)),
+    ("static /* the only one */ event e() /t std_msgs/Empty '{}'", ("/t", "std_msgs/Empty", None)),
+    ("creation // first\n unsynchronized event e() /t std_msgs/Empty '{}'", ("/t", "std_msgs/Empty", None)),
+    ("event e() /t std_msgs/Empty // which\n '{}'", ("/t", "std_msgs/Empty", None)),
+    ("event e() /t std_msgs/Empty/* which */'{}'", ("/t", "std_msgs/Empty", None)),
+    ("event e() /t std_msgs::Empty /* one */ // two\n '{}'", ("/t", "std_msgs/Empty", None)),
+    ("event e() service /s std_srvs/Empty /**/ request '{}'", ("/s", "std_srvs/Empty", "request")),
+    ("event e() service /s std_srvs::Empty /* a * b */ request '{}'", ("/s", "std_srvs/Empty", "request")),
+    ("event e() service /s std_srvs/Empty request '{}'", ("/s", "std_srvs/Empty", "request")),
+    ("event e() service /s std_srvs::Empty response '{}'", ("/s", "std_srvs/Empty", "response")),
+]
+
+
+@pytest.mark.parametrize(("head", "expected"), TRIGGERS)
+def test_what_an_event_waits_for(head: str, expected: tuple[str, str, str | None]) -> None:
+    """Topics and services with both spellings of types, and typographic quotes."""
+    trigger = event(head=head).trigger
+    assert isinstance(trigger, tree.MessageTrigger)
+    assert (trigger.topic, trigger.type, trigger.part) == expected
+
+
+DURATIONS = [
+    ("100ms", 10**8),
+    ("100 ms", 10**8),
+    ("0.5s", 5 * 10**8),
+    ("2m", 120 * 10**9),
+    ("3", 3 * 10**9),
+    (".5 s", 5 * 10**8),
+    ("1h", 3600 * 10**9),
+    ("2000us", 2 * 10**6),
+]
+
+
+@pytest.mark.parametrize(("text", "nanoseconds"), DURATIONS)
+def test_durations(text: str, nanoseconds: int) -> None:
+    """With or without a space; a bare number is seconds."""
+    trigger = event(head=f"event e() every {text}").trigger
+    assert isinstance(trigger, tree.TimerTrigger)
+    assert trigger.period_ns == nanoseconds
+
+
+def test_a_comma_may_end_a_pattern() -> None:
+    """`'{data:v,}'`, nested ones too, as ROSMOP takes it."""
+    paths = []
+    for comma in (",", ""):
+        pattern = f"'{{a:x, b:{{c:y{comma}}}{comma}}}'"
+        trigger = event(head=f"event e(int x, int y) /t p/T {pattern}").trigger
+        assert isinstance(trigger, tree.MessageTrigger)
+        paths.append([[step.name for step in binding.path] for binding in trigger.pattern])
+    assert paths == [[["a"], ["b", "c"]]] * 2
+
+
+def test_patterns_are_paths() -> None:
+    """Nested patterns and dotted paths come to the same, with indexes and constants."""
+    head = "event e(int a, int b) /t p/T '{x.y[2]:a, z:{w:{v:b}, c:-1.5}, s: \"on\", k: p::T::K, t: true}'"
+    trigger = event(head=head).trigger
+    assert isinstance(trigger, tree.MessageTrigger)
+    found = [
+        (".".join(step.name + (f"[{step.index}]" if step.index is not None else "") for step in binding.path),
+         binding.variable, type(binding.constant).__name__)
+        for binding in trigger.pattern
+    ]  # fmt: skip
+    assert found == [
+        ("x.y[2]", "a", "NoneType"), ("z.w.v", "b", "NoneType"), ("z.c", None, "Unary"), ("s", None, "Text"),
+        ("k", None, "Name"), ("t", None, "Name"),
+    ]  # fmt: skip
+
+
+def test_the_older_brackets_of_actions() -> None:
+    """`<< … >>` around an action, as in the oldest samples."""
+    found = parsed("s() { event e() /t std_msgs/Empty '{}' << int a = 1 << 2; >> }").events[0]
+    assert len(found.action.statements) == 1
+
+
+def test_properties() -> None:
+    """Logic, formula as written, its position, and the handlers."""
+    found = parsed("""s() {
+    event e() /t std_msgs/Empty '{}' { }
+    ERE :  (e e)* // not @this
+       e
+    @match { __RESET; } @fail { }
+    fsm: s0 [ e -> s0 ] @s0 { }
+    }""")
+    first, second = found.properties
+    assert (first.logic, first.formula.split(), second.formula) == (
+        "ERE",
+        ["(e", "e)*", "//", "not", "@this", "e"],
+        "s0 [ e -> s0 ]",
+    )
+    assert first.formula_position == Position("x.rv", 3, 12)
+    assert [handler.category for handler in first.handlers] == ["match", "fail"]
+
+
+@pytest.mark.parametrize("name", ["auto", "new", "break", "try", "default", "NULL"])
+def test_a_category_may_be_a_word_of_cpp(name: str) -> None:
+    """States have names of their own; what C++ does with the word does not matter there."""
+    found = parsed(
+        f"s() {{ event e() /t std_msgs/Empty '{{}}' {{ }} fsm: {name} [ e -> {name} ] @{name} {{ }} }}"
+    )
+    assert [handler.category for handler in found.properties[0].handlers] == [name]
+
+
+NAMES = ["event", "init", "service", "every", "when", "request", "response", "hold"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_words_of_the_language_are_names_where_they_mean_nothing(name: str) -> None:
+    """A variable in an action may have the name of a keyword of specifications."""
+    assert len(event(f"int {name} = 1; {name} = {name} + 1;").action.statements) == 2
+
+
+STATEMENTS = [
+    "a * b;", "a & b;", "a < b;", "a / b;", "std::string s;", "geometry_msgs/Twist t;", "geometry_msgs::Twist t = MESSAGE;",
+    "std::vector<geometry_msgs/Twist> v;", "std::vector<int> v(3, 0), w{1, 2};", "unsigned char c = 'x';", "x = (int) y;",
+    "x = (y) + 1;", "if (a) if (b) c; else d;", "for (;;) { }", "for (a::b c : d) { }", "for (a::b & c : d) { }",
+    "PUBLISH(/t, std_msgs/String /* why */, s);", "std_msgs/String /* a */ s;",
+    "x = (uint8_t) y;", "x = (size_t)3;", "x = (int64_t)x * 1000000;", "x = (std::int8_t) 200;", "x = (std :: size_t)(y);",
+    "std::vector<std::vector<std::string>> v;",
+    "v = std::vector<std::vector<std::string>>(3);", "auto v = std::vector<std::vector<double> >{{1.0}};", "x = (int8_t) (uint16_t) -y;", "f(size_t(3));",
+    "x = c ? x & mask : 0;", "x = c ? a&b:d;", "switch (x) { case a & b: y; }", "for (int i = c ? a & b : 0; i; ) { }",
+    "for (const auto& a : v) { }", "for (const std::vector<int> & /* each */ a : v) x = a ? b & c : d;", "for (auto &a: v) { }",
+    "PUBLISH(/t, std_msgs/String, s);", 'PUBLISH("/t", "std_msgs::String", s);', "DROP;", "return;", "delete[] p;",
+    "a.b[1].c().d = e ? f : g, h;", "a = b = c;", "a <<= 1; b >>= 2;", "x = -+!~y;", "a++; ++a; a--; --a;", ";;;", "do x; while (y);",
+    "switch (a) { case 1: case 2: { b; } break; default: c; }", "std::cout << a << std::endl;", "double m[2] = {1, 2};",
+    "const double k(3.0);", "auto x = std::numeric_limits<double>::max();", "x = \u201ctypographic\u201d;", "long long int q;",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("statement", STATEMENTS)
+def test_a_statement_is_read(statement: str) -> None:
+    """Statements of C++ as they occur in specifications."""
+    assert event(statement).action.statements
+
+
+REFUSALS = [
+    ("", 1, 1, "there is no specification in this file"),
+    ("// nothing", 1, 1, "there is no specification in this file"),
+    ("a() {", 1, 6, "found the end of the file, expected a declaration, an `event`"),
+    ("a() { int x }", 1, 13, "found `}`, expected"),
+    (
+        "a() {\n evnt e() /t p/T '{}' { } }",
+        2,
+        2,
+        "`evnt e()` is not part of the language; an event begins with `event`: write `event e(…)`",
+    ),
+    ("a() {\n events e(int x) every 1s { } }", 2, 2, "an event begins with `event`: write `event e(…)`"),
+    (
+        "a() {\n dL: { x > 0 } }",
+        2,
+        6,
+        "found `{`, expected a formula; a property is `logic: formula @category",
+    ),
+    ("a() {\n int x;\n\n  \n", 2, 8, "found the end of the file, expected a declaration, an `event`"),
+    ("a() { std::set<int> m; }", 1, 7, "`std::set<int> m` is not part of the language; use a `std::vector`"),
+    ("a() { double d[2][3]; }", 1, 14, "there are no arrays of arrays; use a `std::vector` of vectors"),
+    ("a() { event x() /t std_msgs/String {} {} }", 1, 36, "found `{`, expected a quote `'`"),
+    (
+        "a() { event x() /t String '{}' { } }",
+        1,
+        20,
+        "found `String`, expected a message type such as `std_msgs/String`",
+    ),
+    ("a() { event x() '{}' { } }", 1, 17, "found `'`, expected"),
+    ("a() { int n\nevent x() /t p/T '{}' { } }", 1, 12, "expected `;` behind this, found `event` in line 2"),
+    ("a() { static int n\nevent x() /t p/T '{}' { } }", 1, 19, "expected `;` behind this, found `event`"),
+    ("a() { int n, m\ncreation event x() /t p/T '{}' { } }", 1, 15, "expected `;` behind this"),
+    ("a() { event x() /t p/T " + "/" * 5000 + "\n", 1, 20, "expected a message type"),
+    (
+        "a() { event x() every 3 parsec { } }",
+        1,
+        23,
+        "`parsec` is no unit of time; write one of ns, us, ms, s, m, min, h",
+    ),
+    ("a() { event x() every 1us { } }", 1, 23, "a period is from 1 ms to 31 years"),
+    (
+        "a() { event x() /t std_msgs/Empty '{}' { }\n ere: x\n { } }",
+        3,
+        2,
+        "found `{` after the formula, expected a handler `@category { … }`",
+    ),
+    ("a() {\n@fail { } }", 2, 1, "a handler belongs to a property"),
+    ("#if 0\na() { }\n#endif\n", 1, 1, "`#if`: there is no preprocessor; leave what you want there"),
+    (
+        "a() {\n # ifdef X\n  int x;\n #else\n  int y;\n#endif\n}",
+        2,
+        2,
+        "`#ifdef`: there is no preprocessor; leave what you want there, without conditions",
+    ),
+    ("#ifdef A\n#endif\n#ifdef B\n#ifdef C\n#endif\na() { }", 3, 1, "`#ifdef`: there is no preprocessor"),
+    (
+        "a() { event x() every 1s { if (y > MOST) return; } }\n#define MOST 0.5\n",
+        2,
+        1,
+        "`#define MOST`: there is no preprocessor; write `const double MOST = …;`",
+    ),
+    ("\ufeff#if 0\na() { }\n#endif\n", 1, 2, "`#if`: there is no preprocessor"),
+    ("/* */ #if 0\na() { }\n#endif\n", 1, 7, "`#if`: there is no preprocessor"),
+    ("#define sin(x) cos(x)\na() { double f() { return sin(1); } }", 1, 1, "`#define sin`"),
+    ("a() { bool f() { return a and b; } }", 1, 27, "`and` is not part of the language; write `&&`"),
+    ("a() { bool f() { return not b; } }", 1, 25, "`not` is not part of the language; write `!`"),
+    ("a() { /* what", 1, 7, "this comment does not end; write `*/` behind it"),
+    ("class A { };", 1, 1, "`class` is not part of the language; types cannot be declared"),
+    ("a() { struct b { int c; }; }", 1, 7, "`struct` is not part of the language"),
+    ("a() { event x() /t p/T '{data:}' { } }", 1, 31, "found `}`, expected"),
+    ("a() { event x() /t p/T '{a[x]:b}' { } }", 1, 28, "found `x`, expected a number"),
+    ("a() { event x() /t p/T '{a[1.5]:b}' { } }", 1, 28, "`1.5` is no index; write a whole number"),
+]
+
+
+@pytest.mark.parametrize(("text", "line", "column", "reason"), REFUSALS)
+def test_a_refusal(text: str, line: int, column: int, reason: str) -> None:
+    """What is not of the grammar is refused at its place, with what was found and what to write."""
+    found = refusal(text)
+    assert found[:2] == (line, column)
+    assert reason in found[2]
+
+
+IN_ACTIONS = [
+    ("x->y = 1;", 1, "`x->y` is not part of the language; there are no pointers; write `x.y`"),
+    ("if x { }", 4, "found `x`, expected `(`"),
+    ("c ? &x : 0;", 5, "there are no addresses; pass the variable itself"),
+    ("double d[2][3];", 8, "there are no arrays of arrays; use a `std::vector` of vectors"),
+    ("p = &x;", 5, "there are no addresses; pass the variable itself"),
+    ("y = 3 4;", 7, "found `4`, expected `;` or `,` or an operator"),
+    ('y = "abc;', 5, "a string ends on the line it begins on"),
+    ("y = 'abc';", 5, 'a character is one; write a string in double quotes, `"abc"`'),
+    (r'y = "\q";', 5, r"`\q` is no escape; write `\\` for a backslash"),
+    ("goto a;", 1, "`goto` is not part of the language; there are no jumps"),
+    ("try { } catch (int e) { }", 1, "`try` is not part of the language; there are no exceptions"),
+    ("auto f = [](int a) { };", 10, "there are no lambda functions; declare a helper function"),
+    ("std::list<int> m;", 1, "`std::list<int> m` is not part of the language; use a `std::vector`"),
+    ("x = nullptr;", 5, "`nullptr` is not part of the language; there are no pointers"),
+    ("enum A { B };", 1, "`enum` is not part of the language"),
+    ("else x = 1;", 1, "`else` is a word of the language: it cannot stand here, and is no name"),
+    ("x = 1", 6, "expected `;` behind this, found `}` in line 3"),
+    ("new int[3];", 1, "`new int[…]` is not part of the language; write a `std::vector`"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("body", "column", "reason"), IN_ACTIONS)
+def test_a_refusal_in_an_action(body: str, column: int, reason: str) -> None:
+    """C++ that is not part of the language is named, with what to write instead."""
+    line, found, text = refusal(f"a() {{ event x() /t std_msgs/String '{{}}' {{\n{body}\n}} }}")
+    assert (line, found) == (2, column)
+    assert reason in text
+
+
+def test_positions_count_characters_and_lines() -> None:
+    """Columns count from 1, a tab and a letter outside ASCII are one character each."""
+    text = "s() {\n\tevent e() /t std_msgs/Empty '{}' {\n\t\tx = \"\u00e4\"; ? } }"
+    assert refusal(text)[:2] == (3, 12)
+
+
+def test_a_file_has_a_limit() -> None:
+    """A file beyond the limit is refused before it is read."""
+    assert "split it into several" in refusal("a" * (MAX_CHARACTERS + 1))[2]
+
+
+def test_trees_that_differ_only_in_place_are_equal() -> None:
+    """So that a specification that was moved in its file is still the same."""
+    text = "s() { int a = 1; event e(int x) /t p/T '{a.b[1]:x, c:2}' when (x) { a++; } ere: e @match { } }"
+    assert parsed(text) == parsed("\n\n  " + text.replace(" when", "\n   when"))
+    assert parsed(text) != parsed(text.replace("a = 1", "a = 2"))

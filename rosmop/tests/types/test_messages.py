@@ -1,0 +1,20 @@
+"""Tests of what is said about names that do not exist."""
+
+import time
+
+from rosmop.types.messages import nearest
+
+
+def test_the_nearest_name() -> None:
+    """A name that is nearly right is told the right one; where nothing is near, the few there are."""
+    assert nearest("positon", ["name", "position"]) == "; did you mean `position`?"
+    assert nearest("xyz", ["name", "position"]) == "; there are: name, position"
+
+
+def test_thousands_of_names_and_mistakes_cost_little() -> None:
+    """A file full of names and of mistakes keeps its compiler busy for no longer than many short ones."""
+    known = [f"function{number}" for number in range(100_000)]
+    began = time.process_time()
+    for number in range(5):
+        nearest(f"funktion{number}", known)
+    assert time.process_time() - began < 1

@@ -1,0 +1,227 @@
+"""The grammar of ``.rv`` files, for lark's LALR(1) parser with its contextual lexer.
+
+The lexer knows which tokens may follow, so `/landshark/scan` is a topic where a topic may stand and two
+divisions elsewhere, and `event` or `service` are still names of variables inside an action. Where C++ needs to
+know what a name is to tell a declaration from an expression, two names in a row are a declaration.
+"""
+
+from rosmop.logics.catalogue import LOGICS
+
+_GAP = r"(?:\s|\/\/[^\n]*\n|\/\*(?:[^*]|\*(?!\/))*\*\/)"
+"""What may stand between two tokens: blanks and comments. It matches in one way only, so nothing is tried twice."""
+
+_WORD = "(?:creation|static|unsynchronized|decentralized|perthread|suffix)"
+"""What MOP writes before `event`."""
+
+_AT = r"@(?=(?:bc?|c)(?!\w))(?!\w+<GAP>*\{)"
+"""The `@` of an operator of `ptcaret`, which begins no handler."""
+
+_GRAMMAR = r"""
+file: (specification | using | ";")*
+using: "using" "namespace" NAME ";"
+
+specification: NAME+ ["(" [parameters] ")"] "{" item* "}"
+?item: shared ";" | function | prototype | init | event | property | ";" -> nothing
+
+function: type NAME "(" [parameters] ")" block
+        | NAME "(" [parameters] ")" block         -> procedure
+prototype: type NAME "(" [parameters] ")" ";"
+init: "init" "(" [parameters] ")" block
+parameters: parameter ("," parameter)*
+         | BUILTIN+                               -> unnamed_parameters
+parameter: type NAME
+         | type "&" NAME                          -> reference_parameter
+         | type "[" "]" NAME                      -> array_parameter
+         | type "[" "]" "&" NAME                  -> array_reference_parameter
+         | type NAME "[" "]"                      -> array_parameter_behind
+
+event: MODIFIER* "event" NAME "(" [parameters] ")" trigger action
+?action: block | "<<" statement* ">>"              -> block
+trigger: TOPIC MESSAGE_TYPE pattern ["when" "(" expression ")"]
+       | SERVICE TOPIC MESSAGE_TYPE SERVICE_PART pattern ["when" "(" expression ")"] -> service_trigger
+       | EVERY DURATION                         -> timer
+pattern: QUOTE "{" [fields] "}" QUOTE
+fields: field ("," field)* [","]
+field: path ":" NAME                              -> bind
+     | path ":" constant                          -> constrain
+     | path ":" "{" [fields] "}"                  -> nest
+path: path_step ("." path_step)*
+path_step: NAME ["[" NUMBER "]"]
+?constant: NUMBER -> number
+         | "-" NUMBER -> negative
+         | "+" NUMBER -> number
+         | string | character
+         | NAME ("::" NAME)+                      -> name
+
+property: NAME ":" FORMULA handler*
+handler: AT CATEGORY block
+
+// Types
+type: qualifier* core qualifier*
+core: BUILTIN+
+    | BUILTIN+ "*"                                -> pointer
+    | scoped                                      -> named
+    | MESSAGE_TYPE                                -> message
+    | vector
+    | "auto"                                      -> automatic
+vector: VECTOR "<" type ">"
+    | VECTOR "<" VECTOR "<" type ">>"             -> vector_of_vectors
+!qualifier: "const" | "constexpr" | "static" | "volatile" | "inline"
+scoped: ["::"] NAME ("::" NAME)*
+
+// Statements
+block: "{" statement* "}"
+?statement: block
+    | declaration ";"
+    | expression ";"                              -> evaluate
+    | ";"                                         -> nothing
+    | IF "(" expression ")" statement ["else" statement]          -> if_
+    | WHILE "(" expression ")" statement                          -> while_
+    | DO statement "while" "(" expression ")" ";"                 -> do_
+    | FOR "(" for_start [expression] ";" [expression] ")" statement -> for_
+    | FOR "(" type NAME ":" expression ")" statement              -> range_for
+    | RANGE_FOR "(" type "&" NAME ":" expression ")" statement    -> range_for_reference
+    | SWITCH "(" expression ")" "{" case* "}"                     -> switch
+    | BREAK ";"                                   -> break_
+    | CONTINUE ";"                                -> continue_
+    | RETURN [expression] ";"                     -> return_
+    | DROP ";"                                    -> drop
+    | RESET ";"                                   -> reset
+    | DELETE ["[" "]"] expression ";"             -> delete
+    | PUBLISH "(" (TOPIC | STRING) "," (MESSAGE_TYPE | STRING) "," assignment ")" ";" -> publish
+?for_start: declaration ";" | expression ";" -> evaluate | ";" -> nothing
+case: CASE conditional ":" statement*
+    | DEFAULT ":" statement*                      -> default
+declaration: type declarator ("," declarator)*
+shared: type plain_declarator ("," declarator)*   -> declaration
+      | type made ("," declarator)*               -> declaration
+made: NAME "(" literals ")"                       -> constructed
+literals: literal ("," literal)*                  -> arguments
+?literal: NUMBER -> number
+        | MINUS number                            -> prefix
+        | string | character
+        | scoped -> name
+number: NUMBER
+?declarator: plain_declarator
+    | NAME "(" arguments ")"                      -> constructed
+plain_declarator: NAME
+    | NAME "=" initializer                        -> initialized
+    | NAME "{" [elements] "}"                     -> braced
+    | NAME "[" [expression] "]"                   -> sized
+    | NAME "[" [expression] "]" "=" "{" [elements] "}"            -> sized_initialized
+    | NAME "[" [expression] "]" "=" assignment    -> sized_assigned
+?initializer: assignment | elements_in_braces
+elements_in_braces: LBRACE [elements] "}"
+elements: initializer ("," initializer)* [","]
+
+// Expressions, loosest first
+?expression: assignment | assignment ("," assignment)+ -> sequence
+?assignment: conditional
+    | unary ASSIGN assignment                     -> assign
+    | unary "=" initializer                       -> set
+?conditional: or | or "?" expression ":" assignment
+?or: and | or OR and                              -> binary
+?and: bit_or | and AND bit_or                     -> binary
+?bit_or: bit_xor | bit_or "|" bit_xor             -> bit_or_
+?bit_xor: bit_and | bit_xor "^" bit_and           -> bit_xor_
+?bit_and: equality | bit_and "&" equality         -> bit_and_
+?equality: relation | equality EQUALITY relation  -> binary
+?relation: shift | relation RELATION shift        -> binary
+    | relation "<" shift                          -> less
+    | relation ">" shift                          -> greater
+?shift: sum | shift "<<" sum                      -> shift_left
+    | shift ">>" sum                              -> shift_right
+?sum: product | sum "+" product                   -> add
+    | sum "-" product                             -> subtract
+?product: unary | product "*" unary               -> multiply
+    | product "/" unary                           -> divide
+    | product "%" unary                           -> remainder
+?unary: postfix
+    | NOT unary                                   -> prefix
+    | MINUS unary                                 -> prefix
+    | PLUS unary                                  -> prefix
+    | INCREMENT unary                             -> step_before
+    | LPAR BUILTIN+ ")" unary                     -> cast
+    | LPAR FIXED ")" unary                        -> cast
+?postfix: primary
+    | postfix "[" expression "]"                  -> index
+    | postfix "." NAME                            -> member
+    | postfix "(" [arguments] ")"                 -> call
+    | postfix INCREMENT                           -> step_after
+?primary: NUMBER -> number
+    | string | character
+    | scoped -> name
+    | LPAR expression ")"                         -> parenthesis
+    | BUILTIN+ "(" [arguments] ")"                -> convert
+    | vector "(" [arguments] ")"                  -> construct_vector
+    | vector "{" [elements] "}"                   -> construct_elements
+    | CAST "<" type ">" "(" expression ")"        -> static_cast
+    | NEW BUILTIN+ "[" expression "]"             -> new
+    | LIMITS "<" type ">" "::" NAME "(" ")"       -> limit
+arguments: argument ("," argument)*
+?argument: assignment | elements_in_braces
+string: STRING+
+character: CHARACTER
+
+// Tokens
+NAME: /[A-Za-z_][A-Za-z_0-9]*/
+MODIFIER.5: /<WORD>(?=<GAP>+(<WORD><GAP>+)*event<GAP>+[A-Za-z_])/
+CATEGORY: /[A-Za-z_][A-Za-z_0-9]*/
+BUILTIN.3: /(void|bool|char|short|int|long|float|double|signed|unsigned)(?!\w)/
+FIXED.4: /(std\s*::\s*)?(u?int(8|16|32|64)_t|size_t)(?=\s*\))/
+VECTOR.3: /(std\s*::\s*)?vector(?=\s*<)/
+LIMITS.3: /(std\s*::\s*)?numeric_limits(?=\s*<)/
+CAST: "static_cast"
+NEW: "new"
+DELETE: "delete"
+IF: "if"
+WHILE: "while"
+DO: "do"
+FOR: "for"
+RANGE_FOR.4: /for(?=<GAP>*\([^;()?=]*&<GAP>*[A-Za-z_]\w*<GAP>*:(?!:))/
+SWITCH: "switch"
+CASE: "case"
+DEFAULT: "default"
+BREAK: "break"
+CONTINUE: "continue"
+RETURN: "return"
+DROP: "DROP"
+RESET: "__RESET"
+PUBLISH: "PUBLISH"
+SERVICE.5: /service(?!\w)/
+EVERY.5: /every(?!\w)/
+SERVICE_PART.5: /(request|response)(?!\w)/
+TOPIC.2: /[~\/]?[A-Za-z_][\w]*(\/\w+)*\/?/
+MESSAGE_TYPE.4: /[A-Za-z]\w*\/[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`{>\],&]|<GAP>+[A-Za-z_])/
+    | /[A-Za-z]\w*::[A-Za-z]\w*(?=<GAP>*['\u2018\u2019\u00b4`,]|<GAP>+(request|response)(?!\w))/
+DURATION: /(\d+(\.\d*)?|\.\d+)\s*[A-Za-z]*/
+QUOTE: /['\u2018\u2019\u00b4`]/
+FORMULA.9: /(?:(?!<NEXT>)[^@{}\/]|<AT>|\/(?![\/*])|\/\/[^\n]*|\/\*(?:[^*]|\*(?!\/))*\*\/)+/
+AT: "@"
+NUMBER: /(0[xX][0-9A-Fa-f]+|(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?)[uUlLfF]*/
+STRING: /"(\\.|[^"\\\n])*"|“(\\.|[^”\\\n])*”/
+CHARACTER: /'(\\[0-7]{1,3}|\\x[0-9A-Fa-f]{1,2}|\\[^\n]|[^'\\\n])'/
+ASSIGN: /([+\-*\/%&|^]|<<|>>)=/
+OR: "||"
+AND: "&&"
+EQUALITY: /[=!]=/
+RELATION: /[<>]=/
+NOT: /[!~]/
+MINUS: "-"
+PLUS: "+"
+INCREMENT.3: /\+\+|--/
+LPAR: "("
+LBRACE: "{"
+COMMENT.10: /\/\/[^\n]*|\/\*(?:[^*]|\*(?!\/))*\*\//
+PREAMBLE.10: /#(\\\r?\n|[^\n])*/
+%ignore /[ \t\r\n\f\v\ufeff]+/
+%ignore COMMENT
+%ignore PREAMBLE
+"""
+
+_NEXT = rf"(?<!\w)(?:(?i:{'|'.join(LOGICS)}|dl)\s*:(?!:)|(?:{_WORD}\s+)*event\s+[A-Za-z_]\w*\s*\()"
+"""Where a formula ends that no handler follows: another property, or an event."""
+
+GRAMMAR = (
+    _GRAMMAR.replace("<NEXT>", _NEXT).replace("<AT>", _AT).replace("<GAP>", _GAP).replace("<WORD>", _WORD)
+)

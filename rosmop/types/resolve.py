@@ -1,0 +1,118 @@
+"""Type names of the text to types."""
+
+from rosmop.form.positions import Position
+from rosmop.text import tree
+from rosmop.text.errors import SpecificationError
+from rosmop.text.foreign import instead
+from rosmop.types import kinds
+from rosmop.types.kinds import Type
+from rosmop.types.messages import Messages, UnknownNameError, nearest
+
+_SIGNED = {"char": kinds.CHAR, "short": kinds.INT16, "int": kinds.INT, "long": kinds.LONG}
+_UNSIGNED = {"char": kinds.UINT8, "short": kinds.UINT16, "int": kinds.UINT, "long": kinds.ULONG}
+_NAMED: dict[tuple[str, ...], Type] = {
+    ("string",): kinds.STRING,
+    ("ros", "Time"): kinds.TIME,
+    ("ros", "Duration"): kinds.DURATION,
+    ("size_t",): kinds.ULONG,
+    ("int8_t",): kinds.INT8,
+    ("uint8_t",): kinds.UINT8,
+    ("int16_t",): kinds.INT16,
+    ("uint16_t",): kinds.UINT16,
+    ("int32_t",): kinds.INT,
+    ("uint32_t",): kinds.UINT,
+    ("int64_t",): kinds.LONG,
+    ("uint64_t",): kinds.ULONG,
+}
+_CPP_NAMES = {  # of the types of fields, as .msg files name them
+    **{f"{sign}int{bits}": f"{sign}int{bits}_t" for sign in ("", "u") for bits in (8, 16, 32, 64)},
+    "float32": "float",
+    "float64": "double",
+    "byte": "int8_t",
+    "time": "ros::Time",
+    "duration": "ros::Duration",
+}
+_SHORT_NAMES = {short: f"unsigned {short[1:]}" for short in ("uint", "ushort", "ulong")}  # of glibc
+
+
+def named_type(parts: tuple[str, ...]) -> Type | None:
+    """The type of a name that is one without looking at messages: `std::string`, `size_t`, `ros::Time`."""
+    return _NAMED.get(parts[1:] if parts[0] == "std" and len(parts) > 1 else parts)
+
+
+def resolve(name: tree.TypeName, messages: Messages) -> Type:
+    """The type that a name of the text stands for (`auto` is not one); raises `SpecificationError`."""
+    if name.element is not None:
+        element = resolve(name.element, messages)
+        if element in (kinds.VOID, kinds.CHARACTERS):
+            raise SpecificationError.at(name.position, f"there are no vectors of {element}")
+        return kinds.Vector(element)
+    built_in = _built_in(name)
+    if name.pointer:
+        if built_in != kinds.CHAR:
+            raise SpecificationError.at(
+                name.position, f"there are no pointers but `char *`; write `{' '.join(name.name)}`"
+            )
+        return kinds.CHARACTERS
+    return built_in or named_type(name.name) or _message(name, messages)
+
+
+def _built_in(name: tree.TypeName) -> Type | None:
+    words = list(name.name)
+    if words == ["void"]:
+        return kinds.VOID
+    if words == ["bool"]:
+        return kinds.BOOL
+    if words in (["float"], ["double"], ["long", "double"]):
+        return kinds.FLOAT if words == ["float"] else kinds.DOUBLE
+    if not set(words) <= {"char", "short", "int", "long", "signed", "unsigned"}:
+        if len(words) > 1 and words[0] in ("unsigned", "signed", "long", "short"):
+            raise SpecificationError.at(name.position, f"`{' '.join(words)}` is no type")
+        return None
+    signs = [word for word in words if word in ("signed", "unsigned")]
+    sizes = [word for word in words if word in ("char", "short", "long")]
+    known: tuple[list[str], ...] = ([], ["char"], ["short"], ["long"], ["long", "long"])
+    too_many = words.count("int") > 1 or len(signs) > 1 or ("char" in words and "int" in words)
+    if sizes not in known or too_many:
+        raise SpecificationError.at(name.position, f"`{' '.join(words)}` is no type")
+    if words == ["signed", "char"]:
+        return kinds.INT8
+    table = _UNSIGNED if signs == ["unsigned"] else _SIGNED
+    return table[sizes[0] if sizes else "int"]
+
+
+def _message(name: tree.TypeName, messages: Messages) -> Type:
+    text = "::".join(name.name)
+    if text in _CPP_NAMES:
+        raise SpecificationError.at(
+            name.position,
+            f"there is no type `{text}`; ROS's {text} is `{_CPP_NAMES[text]}` in C++: write that",
+        )
+    if text in _SHORT_NAMES:
+        raise SpecificationError.at(name.position, f"there is no type `{text}`; write `{_SHORT_NAMES[text]}`")
+    if len(name.name) != 2 or name.name[0] == "std":
+        raise SpecificationError.at(name.position, f"there is no type `{text}`{_meant(name.name, messages)}")
+    return record(name.position, "/".join(name.name), messages)
+
+
+def _meant(parts: tuple[str, ...], messages: Messages) -> str:
+    """The tail of the refusal of a type that is none, nor of the form of a message type."""
+    told = instead(parts)
+    if told is not None:
+        return f"; {told}"
+    named = [known for known in messages.definitions.message_types if known.endswith(f"/{parts[-1]}")]
+    if named and len(parts) == 1:
+        return f"; did you mean `{named[0].replace('/', '::')}`?"
+    hint = nearest(parts[-1], ["bool", "int", "double", "float", "char", "string", "size_t"])
+    return hint if "did you mean" in hint else "; write a C++ type or a message type `package::Type`"
+
+
+def record(position: Position, name: str, messages: Messages) -> kinds.Record:
+    """The message type of this name; raises `SpecificationError`."""
+    try:
+        messages.definition(name)
+    except UnknownNameError as error:
+        told = instead(name.split("/")) if name not in messages.definitions.message_types else None
+        text = f"there is no `{name.replace('/', '::')}`; {told}" if told else str(error)
+        raise SpecificationError.at(position, text) from None
+    return kinds.Record(name)

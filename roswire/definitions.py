@@ -1,0 +1,212 @@
+"""Message and service types: definitions by name, their md5sums, full texts and layouts.
+
+Definitions come as text: ROS's own (`standard.py`), an operator's `.msg` and `.srv` files, or the
+`message_definition` of a publisher's connection header. What is asked of a type is worked out once and kept.
+
+A type that contains itself, or nests deeper than `MAX_DEPTH`, is refused; work and memory are bounded by the
+size of the text and by the limits of `message_text` and `layout`.
+"""
+
+import difflib
+import hashlib
+import re
+from collections.abc import Callable, Mapping
+from typing import Self, TypeVar
+
+from roswire.errors import DefinitionError
+from roswire.layout import Layout, LayoutBuilder, LayoutTooLargeError
+from roswire.message_text import (
+    BUILTINS,
+    PRIMITIVES,
+    Field,
+    MessageDefinition,
+    ServiceDefinition,
+    parse_message,
+    parse_service,
+    split_full_text,
+)
+
+MAX_DEPTH = 64
+"""Messages nested in each other."""
+
+_FILE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:(msg|srv)/)?([A-Za-z][A-Za-z0-9_]*)\.(msg|srv)\Z")
+_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*\Z")
+_RULE = "=" * 80
+
+_Answer = TypeVar("_Answer")
+
+
+class Definitions:
+    """A set of message and service types that refer to each other; it never changes."""
+
+    def __init__(
+        self,
+        messages: Mapping[str, MessageDefinition],
+        services: Mapping[str, ServiceDefinition] | None = None,
+    ) -> None:
+        self._services = dict(services or {})
+        self._messages = dict(messages)
+        for service in self._services.values():
+            self._messages[service.request.name] = service.request
+            self._messages[service.response.name] = service.response
+        self._md5sums: dict[str, str] = {}
+        self._layouts: dict[str, Layout] = {}
+
+    @classmethod
+    def from_files(cls, files: Mapping[str, str]) -> Self:
+        """Parse files by name: `pkg/T.msg`, `pkg/msg/T.msg`, `pkg/T.srv` or `pkg/srv/T.srv`, to their text.
+
+        Raises `DefinitionError` with the file and line.
+        """
+        messages: dict[str, MessageDefinition] = {}
+        services: dict[str, ServiceDefinition] = {}
+        for file, text in files.items():
+            found = _FILE.match(file)
+            if found is None or found[2] not in (None, found[4]):
+                raise DefinitionError("write pkg/T.msg, pkg/msg/T.msg, pkg/T.srv or pkg/srv/T.srv", file)
+            name = f"{found[1]}/{found[3]}"
+            if name in (services if found[4] == "srv" else messages):
+                raise DefinitionError(f"{name} is defined in two files", file)
+            if found[4] == "srv":
+                services[name] = parse_service(name, text, file)
+            else:
+                messages[name] = parse_message(name, text, file)
+        return cls(messages, services)
+
+    @classmethod
+    def from_full_text(cls, name: str, text: str) -> Self:
+        """Parse the full text of the message type `name`, as a connection header has it.
+
+        The types it is made of must be in the text too. Raises `DefinitionError`.
+        """
+        messages: dict[str, MessageDefinition] = {}
+        for section, body, line in split_full_text(name, text):
+            if _TYPE.match(section) is None:
+                raise DefinitionError(f"{section[:80]!a} is no message type; write package/Type", name, line)
+            if section in messages:
+                raise DefinitionError(f"{section} is defined twice", name, line)
+            messages[section] = parse_message(section, body, name, line)
+        return cls(messages)
+
+    def extended(self, other: "Definitions") -> "Definitions":
+        """Return these types and those of `other`, which win where both have one."""
+        return Definitions(self._messages | other._messages, self._services | other._services)
+
+    @property
+    def message_types(self) -> list[str]:
+        """The names of all message types, requests and responses included."""
+        return sorted(self._messages)
+
+    @property
+    def service_types(self) -> list[str]:
+        """The names of all service types."""
+        return sorted(self._services)
+
+    def message(self, name: str) -> MessageDefinition:
+        """Return a message type; raises `DefinitionError` with similar names if there is none."""
+        return _lookup(name, self._messages, "message")
+
+    def service(self, name: str) -> ServiceDefinition:
+        """Return a service type; raises `DefinitionError` with similar names if there is none."""
+        return _lookup(name, self._services, "service")
+
+    def md5sum(self, name: str) -> str:
+        """Return the md5sum by which ROS compares the message type `name` between nodes."""
+        return self._md5sum(name, ())
+
+    def service_md5sum(self, name: str) -> str:
+        """Return the md5sum by which ROS compares the service type `name` between nodes."""
+        service = self.service(name)
+        return _fingerprint(self._md5_text(service.request, ()) + self._md5_text(service.response, ()))
+
+    def full_text(self, name: str) -> str:
+        """Return the text of a message type and of all types it is made of, as connection headers have it."""
+        self.md5sum(name)  # all types are there, and none contains itself
+        order: dict[str, MessageDefinition] = {}
+        waiting = [name]
+        while waiting:
+            current = waiting.pop()
+            if current in order:
+                continue
+            order[current] = message = self.message(current)
+            waiting += [field.type for field in reversed(message.fields) if field.type not in BUILTINS]
+        own, *parts = order.values()
+        return "\n".join([own.text, *(f"{_RULE}\nMSG: {part.name}\n{part.text}" for part in parts)])
+
+    def layout(self, name: str) -> Layout:
+        """Return how messages of the type `name` lie in their bytes; raises `DefinitionError`."""
+        return self._layout(name, ())
+
+    # `outer` is always the types that are being worked out, outermost first.
+
+    def _md5sum(self, name: str, outer: tuple[str, ...]) -> str:
+        if name not in self._md5sums:
+            self._md5sums[name] = _fingerprint(self._md5_text(self.message(name), _inside(outer, name)))
+        return self._md5sums[name]
+
+    def _md5_text(self, message: MessageDefinition, outer: tuple[str, ...]) -> str:
+        lines = [f"{constant.type} {constant.name}={constant.text}" for constant in message.constants]
+        for field in message.fields:
+            nested = self._nested(message, field, outer, self._md5sum)
+            lines.append(f"{nested or field.notation} {field.name}")
+        return "\n".join(lines).strip()
+
+    def _layout(self, name: str, outer: tuple[str, ...]) -> Layout:
+        if name not in self._layouts:
+            message = self.message(name)
+            try:
+                self._layouts[name] = self._build_layout(message, _inside(outer, name))
+            except LayoutTooLargeError as error:
+                raise DefinitionError(str(error), name) from None
+        return self._layouts[name]
+
+    def _build_layout(self, message: MessageDefinition, outer: tuple[str, ...]) -> Layout:
+        builder = LayoutBuilder()
+        for field in message.fields:
+            nested = self._nested(message, field, outer, self._layout)
+            if field.type in PRIMITIVES and (field.length is not None or not field.is_array):
+                builder.add_primitive(field.name, field.type, field.length)
+            elif field.is_array:
+                builder.add_array(field.name, field.type, field.length, nested)
+            elif nested is not None:
+                builder.add_message(field.name, nested)
+            else:
+                builder.add_string(field.name)
+        return builder.finish()
+
+    def _nested(
+        self,
+        owner: MessageDefinition,
+        field: Field,
+        outer: tuple[str, ...],
+        ask: Callable[[str, tuple[str, ...]], _Answer],
+    ) -> _Answer | None:
+        """Return the answer of `ask` for the type of a field, None if it is built in."""
+        if field.type in BUILTINS:
+            return None
+        if field.type not in self._messages:
+            raise DefinitionError(
+                f"field {field.name} has the type {field.type}, which is not defined", owner.name
+            )
+        return ask(field.type, outer)
+
+
+def _inside(outer: tuple[str, ...], name: str) -> tuple[str, ...]:
+    if name in outer:
+        raise DefinitionError(" contains ".join([*outer[outer.index(name) :], name]), name)
+    if len(outer) >= MAX_DEPTH:
+        raise DefinitionError(f"messages nested deeper than {MAX_DEPTH}", outer[0])
+    return (*outer, name)
+
+
+def _lookup(name: str, types: Mapping[str, _Answer], what: str) -> _Answer:
+    try:
+        return types[name]
+    except KeyError:
+        similar = difflib.get_close_matches(name[:200], types, 3, 0.7)
+        hint = f"; did you mean {' or '.join(similar)}?" if similar else ""
+        raise DefinitionError(f"no such {what} type{hint}", name[:200]) from None
+
+
+def _fingerprint(text: str) -> str:
+    return hashlib.md5(text.encode("utf-8", "surrogateescape"), usedforsecurity=False).hexdigest()

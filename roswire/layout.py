@@ -1,0 +1,175 @@
+"""How a message lies in its bytes: what a compiler needs to read a few fields without decoding the rest.
+
+A serialised ROS 1 message is its fields one after another, little-endian, without padding. A layout flattens
+the nested messages: all leaves of fixed size that follow each other form one `FixedPart`, in which every leaf
+has an offset; strings and arrays of variable size stand between them. In a layout two fixed parts are never
+neighbours, so whatever precedes the first string or array is at a known place in every message.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+from roswire.message_text import PRIMITIVES
+
+MAX_ITEMS = 20_000
+"""Leaves, strings and arrays in one layout; nested definitions can ask for exponentially many."""
+
+MAX_SIZE = 1 << 32
+"""Bytes of one fixed part or array of fixed length; a TCPROS message is never longer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """A value of fixed size in a `FixedPart`.
+
+    `type` is a primitive, or, for arrays only, a message type of fixed size with its `layout`. `count` is the
+    number of elements of a fixed array, None for a scalar. `offset` and `size` are bytes in the part.
+    """
+
+    path: str
+    type: str
+    offset: int
+    size: int
+    count: int | None = None
+    layout: "Layout | None" = None
+
+
+@dataclass(frozen=True, slots=True)
+class FixedPart:
+    """Leaves that follow each other; `size` is their bytes together."""
+
+    size: int
+    leaves: tuple[Leaf, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class StringPart:
+    """A string: its length (4 bytes), then its bytes."""
+
+    path: str
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayPart:
+    """An array that is of variable length or whose elements are of variable size.
+
+    `count` is the number of elements of a fixed array; with None the number (4 bytes) stands in front.
+    `element_size` is the bytes of an element, None if they vary; `layout` is for elements that are messages.
+    """
+
+    path: str
+    type: str
+    count: int | None
+    element_size: int | None
+    layout: "Layout | None" = None
+
+
+Part = FixedPart | StringPart | ArrayPart
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a field is: the index of its part, and the leaf, string or array it is."""
+
+    part: int
+    item: Leaf | StringPart | ArrayPart
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The parts of a message in order.
+
+    `size` is the bytes of every such message, None if they vary; `minimum` the bytes of the shortest.
+    `places` finds the items by path (`pose.position.x`); the elements of an array are in the array's layout.
+    """
+
+    parts: tuple[Part, ...]
+    size: int | None
+    minimum: int
+    places: Mapping[str, Place] = field(repr=False, compare=False)
+
+
+class LayoutTooLargeError(Exception):
+    """The layout would have more items or bytes than a message can have."""
+
+
+class LayoutBuilder:
+    """Takes the fields of a message in order; `finish` returns the layout."""
+
+    def __init__(self) -> None:
+        self._parts: list[Part] = []
+        self._leaves: list[Leaf] = []  # of the fixed part that is open
+        self._offset = 0
+        self._items = 0
+
+    def add_primitive(self, path: str, type_name: str, count: int | None) -> None:
+        """Add a value of a primitive type, or a fixed array of `count` of them."""
+        size = PRIMITIVES[type_name][1] * (1 if count is None else count)
+        self._add_leaf(Leaf(path, type_name, self._offset, size, count))
+
+    def add_string(self, path: str) -> None:
+        """Add a string."""
+        self._add_part(StringPart(path))
+
+    def add_array(self, path: str, type_name: str, count: int | None, layout: Layout | None) -> None:
+        """Add an array; `layout` is that of its elements if they are messages."""
+        size = PRIMITIVES[type_name][1] if type_name in PRIMITIVES else None
+        if layout is not None:
+            size = layout.size
+        if count is not None and size is not None:
+            self._add_leaf(Leaf(path, type_name, self._offset, size * count, count, layout))
+        else:
+            self._add_part(ArrayPart(path, type_name, count, size, layout))
+
+    def add_message(self, path: str, layout: Layout) -> None:
+        """Add the items of a nested message; their paths get `path` in front."""
+        for part in layout.parts:
+            if isinstance(part, FixedPart):
+                for leaf in part.leaves:
+                    self._add_leaf(replace(leaf, path=f"{path}.{leaf.path}", offset=self._offset))
+            else:
+                self._add_part(replace(part, path=f"{path}.{part.path}"))
+
+    def finish(self) -> Layout:
+        """Return the layout of what was added."""
+        self._close()
+        places: dict[str, Place] = {}
+        for index, part in enumerate(self._parts):
+            for item in part.leaves if isinstance(part, FixedPart) else (part,):
+                places[item.path] = Place(index, item)
+        minimum = sum(map(_minimum, self._parts))
+        fixed = all(isinstance(part, FixedPart) for part in self._parts)
+        return Layout(tuple(self._parts), minimum if fixed else None, minimum, places)
+
+    def _add_leaf(self, leaf: Leaf) -> None:
+        self._count()
+        self._leaves.append(leaf)
+        self._offset += leaf.size
+        if self._offset > MAX_SIZE:
+            raise LayoutTooLargeError(f"more than {MAX_SIZE} bytes")
+
+    def _add_part(self, part: StringPart | ArrayPart) -> None:
+        self._count()
+        self._close()
+        self._parts.append(part)
+        if _minimum(part) > MAX_SIZE:
+            raise LayoutTooLargeError(f"more than {MAX_SIZE} bytes")
+
+    def _count(self) -> None:
+        self._items += 1
+        if self._items > MAX_ITEMS:
+            raise LayoutTooLargeError(f"more than {MAX_ITEMS} fields, those of nested messages included")
+
+    def _close(self) -> None:
+        if self._leaves:
+            self._parts.append(FixedPart(self._offset, tuple(self._leaves)))
+            self._leaves = []
+            self._offset = 0
+
+
+def _minimum(part: Part) -> int:
+    if isinstance(part, FixedPart):
+        return part.size
+    if isinstance(part, StringPart) or part.count is None:
+        return 4
+    return part.count * (part.layout.minimum if part.layout is not None else 4)

@@ -1,0 +1,139 @@
+"""ROS graph names: the one spelling that ROSMaster would act on, or a refusal.
+
+ROSMaster resolves the names of topics, services, nodes and parameters against the `caller_id`, folds `//` and
+drops a trailing slash, but checks almost no characters. A decision must be made on the name it will act on.
+
+Invariants:
+
+1. `resolve` returns what ROSMaster's own `resolve_name` makes of the same arguments, or raises.
+2. A returned name is canonical: it starts with `/`, has no empty segment, and resolves to itself.
+3. Two different returned names are different things to ROSMaster and look different: ASCII only, no control
+   characters. Nothing is repaired or folded but slashes.
+4. A `caller_id` is never resolved by ROSMaster, so it must be canonical as it comes.
+"""
+
+import re
+
+from roswire.errors import InvalidNameError, quoted
+
+MAX_NAME_LENGTH = 1024
+"""Characters in one name; the longest that robots use are far below a quarter of it."""
+
+_NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*\Z")
+_CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]+)+\Z")
+_TOOL = re.compile(r"(?:/[A-Za-z0-9_-]+)+\Z")
+_TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*\Z")
+# Parameters come from YAML files, where `/arm/joint-1.left/gains` and `/analyzers/Base Driver` are common.
+_PARAMETER = re.compile(
+    r"(?:~|[A-Za-z0-9_/])(?:[A-Za-z0-9_/.:@#%+,=()\[\]<>&$!;'-]|(?<=[^/~ ]) (?=[^/ ]))*\Z"
+)
+_SLASHES = re.compile("/{2,}")
+
+
+def resolve(name: str, caller_id: str) -> str:
+    """Return the canonical global name of the topic, service or node that `name` is for `caller_id`.
+
+    `/a` is global, `~a` private to the caller, `a` relative to the caller's namespace. An empty `caller_id`
+    is the global namespace, as for ROSMaster. Raises `InvalidNameError` for a name outside the ROS grammar,
+    for the global namespace itself, and for a relative name of a caller that has no valid name.
+    """
+    resolved = _resolve(name, caller_id, _NAME)
+    if resolved == "/":
+        raise InvalidNameError(f"{quoted(name)} is the global namespace: give the name of something in it")
+    return resolved
+
+
+def resolve_namespace(name: str, caller_id: str) -> str:
+    """Like `resolve`, for arguments that may be a whole namespace (`subgraph`): `/` is allowed."""
+    return _resolve(name, caller_id, _NAME)
+
+
+def resolve_parameter(name: str, caller_id: str) -> str:
+    """Like `resolve_namespace`, for parameter keys: their segments may hold printable ASCII as YAML keys do.
+
+    Not allowed are `~` (but in front), `*`, `?`, quotes, backslash, and spaces at the ends of a segment.
+    """
+    return _resolve(name, caller_id, _PARAMETER)
+
+
+def check_caller_id(caller_id: str) -> str:
+    """Return `caller_id` unchanged; raises `InvalidNameError` unless it is a canonical global name."""
+    if _CANONICAL.match(caller_id) is None or len(caller_id) > MAX_NAME_LENGTH:
+        raise InvalidNameError(
+            f"caller_id {quoted(caller_id)} is not a global ROS name: write it as /name or /namespace/name, "
+            f"with letters, digits and '_', no '//', no '/' at the end, at most {MAX_NAME_LENGTH} characters"
+        )
+    return caller_id
+
+
+def check_tool_id(caller_id: str) -> str:
+    """Like `check_caller_id`, for callers that are no nodes: `rosparam` calls itself `/rosparam-4711`."""
+    if _TOOL.match(caller_id) is None or len(caller_id) > MAX_NAME_LENGTH:
+        return check_caller_id(caller_id)
+    return caller_id
+
+
+def is_global_name(name: str) -> bool:
+    """Whether `name` is a canonical global name (`/a/b`; not `/`, not `//a`, not `a`)."""
+    return len(name) <= MAX_NAME_LENGTH and _CANONICAL.match(name) is not None
+
+
+def is_relative_member(name: str) -> bool:
+    """Whether a member `name` of a namespace of parameters is below it: no `/a`, no `~a`, no empty segment."""
+    return not name.startswith("~") and all(name.split("/"))
+
+
+def is_valid_type_name(name: str) -> bool:
+    """Whether `name` is a message or service type (`package/Type`) or `*`, any type."""
+    return name == "*" or (len(name) <= MAX_NAME_LENGTH and _TYPE_NAME.match(name) is not None)
+
+
+def namespace(name: str) -> str:
+    """Return the namespace of a canonical name, with a trailing slash: `/a/` for `/a/b`, `/` for `/a`."""
+    return name[: name.rstrip("/").rfind("/") + 1] or "/"
+
+
+def join(namespace: str, name: str) -> str:
+    """Return `name` in `namespace`; a global or private name stays as it is."""
+    if name.startswith(("/", "~")) or not namespace:
+        return name
+    return f"{namespace}{name}" if namespace.endswith("/") else f"{namespace}/{name}"
+
+
+def _resolve(name: str, caller_id: str, grammar: re.Pattern[str]) -> str:
+    if len(name) > MAX_NAME_LENGTH or grammar.match(name) is None:
+        raise InvalidNameError(_refusal(name, grammar))
+    first = name[0]
+    if first == "/":
+        resolved = name
+    else:
+        if caller_id:
+            check_tool_id(caller_id)
+        resolved = f"{caller_id}/{name[1:]}" if first == "~" else namespace(caller_id) + name
+        if len(resolved) > MAX_NAME_LENGTH or grammar.match(resolved) is None:
+            raise InvalidNameError(
+                f"name {quoted(name)} of {quoted(caller_id)}: {_refusal(resolved, grammar)}"
+            )
+    if "//" in resolved:
+        resolved = _SLASHES.sub("/", resolved)
+    return resolved.rstrip("/") or "/"
+
+
+def _refusal(name: str, grammar: re.Pattern[str]) -> str:
+    if not name:
+        return "empty name: a ROS name has at least one character"
+    if len(name) > MAX_NAME_LENGTH:
+        return f"name {quoted(name)} has {len(name)} characters; at most {MAX_NAME_LENGTH} are allowed"
+    for position, character in enumerate(name):
+        if character != "~" and grammar.match(f"/a{character}a") is None:
+            allowed = (
+                "printable ASCII without quotes, '*', '?' and '\\'; such a member is read and set with its namespace"
+                if grammar is _PARAMETER
+                else "letters, digits, '_', '/'"
+            )
+            return f"name {quoted(name)}: character {position + 1} is {character!a}; allowed are {allowed}"
+    if grammar is _PARAMETER:
+        return (
+            f"name {quoted(name)}: '~' stands in front only, and no part of a key starts or ends with a space"
+        )
+    return f"name {quoted(name)}: a ROS name starts with a letter, '/' or '~', and '~' stands nowhere else"

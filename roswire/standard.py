@@ -1,0 +1,102 @@
+"""The definitions that ROS Noetic ships: messages from the type store of `rosbags`, and the common services.
+
+The store has no services, no messages of actions, and not the message of `/tf`; the common ones are written here.
+"""
+
+from rosbags.typesys import Stores, get_typestore
+
+from roswire.definitions import Definitions
+
+_ADDITIONAL = {
+    "std_srvs/Empty.srv": "---\n",
+    "std_srvs/SetBool.srv": "bool data\n---\nbool success\nstring message\n",
+    "std_srvs/Trigger.srv": "---\nbool success\nstring message\n",
+    "roscpp/Empty.srv": "---\n",
+    "roscpp/GetLoggers.srv": "---\nLogger[] loggers\n",
+    "roscpp/SetLoggerLevel.srv": "string logger\nstring level\n---\n",
+    "nav_msgs/GetMap.srv": "---\nOccupancyGrid map\n",
+    "nav_msgs/GetPlan.srv": (
+        "geometry_msgs/PoseStamped start\ngeometry_msgs/PoseStamped goal\nfloat32 tolerance\n---\nPath plan\n"
+    ),
+    "nav_msgs/SetMap.srv": (
+        "OccupancyGrid map\ngeometry_msgs/PoseWithCovarianceStamped initial_pose\n---\nbool success\n"
+    ),
+    "nav_msgs/LoadMap.srv": (
+        "string map_url\n---\n"
+        "uint8 RESULT_SUCCESS=0\n"
+        "uint8 RESULT_MAP_DOES_NOT_EXIST=1\n"
+        "uint8 RESULT_INVALID_MAP_DATA=2\n"
+        "uint8 RESULT_INVALID_MAP_METADATA=3\n"
+        "uint8 RESULT_UNDEFINED_FAILURE=255\n"
+        "OccupancyGrid map\nuint8 result\n"
+    ),
+    "sensor_msgs/SetCameraInfo.srv": "CameraInfo camera_info\n---\nbool success\nstring status_message\n",
+    "tf/tfMessage.msg": "geometry_msgs/TransformStamped[] transforms\n",
+    "tf2_msgs/TFMessage.msg": "geometry_msgs/TransformStamped[] transforms\n",
+    "ackermann_msgs/AckermannDrive.msg": (
+        "float32 steering_angle\nfloat32 steering_angle_velocity\n"
+        "float32 speed\nfloat32 acceleration\nfloat32 jerk\n"
+    ),
+    "ackermann_msgs/AckermannDriveStamped.msg": "Header header\nAckermannDrive drive\n",
+    "move_base_msgs/RecoveryStatus.msg": (
+        "geometry_msgs/PoseStamped pose_stamped\nuint16 current_recovery_number\n"
+        "uint16 total_number_of_recoveries\nstring recovery_behavior_name\n"
+    ),
+    "control_msgs/GripperCommand.msg": "float64 position\nfloat64 max_effort\n",
+    "control_msgs/JointTolerance.msg": (
+        "string name\nfloat64 position\nfloat64 velocity\nfloat64 acceleration\n"
+    ),
+}
+_GRIPPER = "float64 position\nfloat64 effort\nbool stalled\nbool reached_goal\n"
+_FOLLOWED = "Header header\nstring[] joint_names\n" + "".join(
+    f"trajectory_msgs/JointTrajectoryPoint {name}\n" for name in ("desired", "actual", "error")
+)
+_FOLLOW_CODES = ("SUCCESSFUL", "INVALID_GOAL", "INVALID_JOINTS", "OLD_HEADER_TIMESTAMP",
+                 "PATH_TOLERANCE_VIOLATED", "GOAL_TOLERANCE_VIOLATED")  # fmt: skip
+_ACTIONS = {
+    "move_base_msgs/MoveBase": (
+        "geometry_msgs/PoseStamped target_pose\n",
+        "",
+        "geometry_msgs/PoseStamped base_position\n",
+    ),
+    "control_msgs/FollowJointTrajectory": (
+        "trajectory_msgs/JointTrajectory trajectory\nJointTolerance[] path_tolerance\n"
+        "JointTolerance[] goal_tolerance\nduration goal_time_tolerance\n",
+        "int32 error_code\n"
+        + "".join(f"int32 {name}={-number}\n" for number, name in enumerate(_FOLLOW_CODES))
+        + "string error_string\n",
+        _FOLLOWED,
+    ),
+    "control_msgs/GripperCommand": ("GripperCommand command\n", _GRIPPER, _GRIPPER),
+}
+"""Goal, result and feedback of actions; `actionlib` sends them in messages that are made of these."""
+
+_NOT_ROS_1 = "builtin_interfaces"  # the store keeps `time` and `duration` as messages of ROS 2
+
+
+def standard_definitions() -> Definitions:
+    """Return the definitions of ROS's own message packages and services."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    files = _ADDITIONAL | _messages_of_actions()
+    for name in store.fielddefs:
+        package, _, type_name = name.split("/")
+        if package != _NOT_ROS_1:
+            files[f"{package}/{type_name}.msg"] = store.gendefhash(name, {})[0]
+    return Definitions.from_files(files)
+
+
+def _messages_of_actions() -> dict[str, str]:
+    """The messages that genaction makes of each action."""
+    files = {}
+    for name, parts in _ACTIONS.items():
+        short = name.partition("/")[2]
+        whole = ""
+        for kind, text in zip(("Goal", "Result", "Feedback"), parts, strict=True):
+            files[f"{name}{kind}.msg"] = text
+            stamp = "GoalID goal_id" if kind == "Goal" else "GoalStatus status"
+            files[f"{name}Action{kind}.msg"] = (
+                f"Header header\nactionlib_msgs/{stamp}\n{short}{kind} {kind.lower()}\n"
+            )
+            whole += f"{short}Action{kind} action_{kind.lower()}\n"
+        files[f"{name}Action.msg"] = whole
+    return files

@@ -1,0 +1,205 @@
+"""TCPROS without I/O: connection headers, message frames and service replies.
+
+A connection starts with one header each way: a length, then fields `name=value`, each with its own length.
+Then come frames: a length and a body. A service reply has one byte in front of its frame: 1 for success, 0
+for an error, whose text is the body. All lengths are little-endian and of 32 bits.
+
+Invariants:
+
+1. A length is checked against its limit, and a field's against its header, before any byte of it is kept.
+2. A header that is accepted has each field once, and every field has a name.
+3. Header text is UTF-8. Only `message_definition` may hold other bytes (roscpp copies comments as they stand
+   in the `.msg` file); they survive decoding and encoding as surrogate escapes.
+"""
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from roswire.errors import LimitExceededError, ProtocolError
+
+HEADER_LIMIT = 65536
+"""Bytes in one connection header; the largest message definitions of MoveIt fill about half of it."""
+
+MESSAGE_LIMIT = 256 << 20
+"""Bytes in one message, request or response."""
+
+_LENGTH = struct.Struct("<I")
+_ANY_BYTES = frozenset({"message_definition"})
+
+
+def encode_header(fields: Mapping[str, str]) -> bytes:
+    """Write a connection header, length included, with the fields in the order given."""
+    lines = [f"{name}={value}".encode("utf-8", "surrogateescape") for name, value in fields.items()]
+    body = b"".join([_LENGTH.pack(len(line)) + line for line in lines])
+    return _LENGTH.pack(len(body)) + body
+
+
+def encode_frame(body: bytes | bytearray | memoryview) -> bytes:
+    """Write one message, service request or response: its length and itself."""
+    return _LENGTH.pack(len(body)) + body
+
+
+def encode_service_reply(body: bytes | bytearray | memoryview) -> bytes:
+    """Write the reply of a service call that succeeded; `body` is the serialised response."""
+    return b"\x01" + encode_frame(body)
+
+
+def encode_service_error(text: str) -> bytes:
+    """Write the reply of a service call that failed; the caller shows `text`."""
+    return b"\x00" + encode_frame(text.encode("utf-8", "replace"))
+
+
+def decode_header(body: bytes) -> dict[str, str]:
+    """Parse the fields of a connection header, its own length already taken off; raises `ProtocolError`."""
+    fields: dict[str, str] = {}
+    position = 0
+    while position < len(body):
+        if len(body) - position < _LENGTH.size:
+            raise ProtocolError(
+                f"connection header: {len(body) - position} bytes left over at byte {position}"
+            )
+        (size,) = _LENGTH.unpack_from(body, position)
+        position += _LENGTH.size
+        if size > len(body) - position:
+            raise ProtocolError(
+                f"connection header: the field at byte {position} says {size} bytes; "
+                f"{len(body) - position} are left"
+            )
+        name, value = _decode_field(body[position : position + size], position)
+        if name in fields:
+            raise ProtocolError(f"connection header: field {name!a} occurs twice")
+        fields[name] = value
+        position += size
+    return fields
+
+
+class HeaderParser:
+    """Takes bytes as they arrive until the connection header is whole; what follows it is in `rest`.
+
+    `limit` is the largest header, in bytes, that is accepted.
+    """
+
+    def __init__(self, limit: int = HEADER_LIMIT) -> None:
+        self.rest = b""
+        self._limit = limit
+        self._buffer = bytearray()
+        self._done = False
+
+    def feed(self, data: bytes) -> dict[str, str] | None:
+        """Take `data`; return the fields once the header is whole, None before.
+
+        Raises `LimitExceededError` as soon as the announced length is beyond the limit, `ProtocolError` for a
+        malformed header, and RuntimeError when the header has been returned already.
+        """
+        if self._done:
+            raise RuntimeError("the header is complete; what followed it is in .rest")
+        buffer = self._buffer
+        buffer += data
+        if len(buffer) < _LENGTH.size:
+            return None
+        (size,) = _LENGTH.unpack_from(buffer)
+        if size > self._limit:
+            raise LimitExceededError(
+                f"connection header of {size} bytes; at most {self._limit} are allowed "
+                "(is this a TCPROS peer?)"
+            )
+        end = _LENGTH.size + size
+        if len(buffer) < end:
+            return None
+        self._done = True
+        self.rest = bytes(buffer[end:])
+        fields = decode_header(bytes(buffer[_LENGTH.size : end]))
+        self._buffer = bytearray()
+        return fields
+
+
+class FrameParser:
+    """Takes bytes as they arrive and returns whole frames (service requests); `limit` is in bytes each."""
+
+    def __init__(self, limit: int = MESSAGE_LIMIT) -> None:
+        self._limit = limit
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Take `data`; return the bodies that are complete now. Raises `LimitExceededError`."""
+        buffer = self._buffer
+        buffer += data
+        frames = []
+        position = 0
+        while len(buffer) - position >= _LENGTH.size:
+            (size,) = _LENGTH.unpack_from(buffer, position)
+            _check_frame(size, self._limit)
+            end = position + _LENGTH.size + size
+            if len(buffer) < end:
+                break
+            frames.append(bytes(buffer[position + _LENGTH.size : end]))
+            position = end
+        del buffer[:position]
+        return frames
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceReply:
+    """The reply of a service: the serialised response, or, when not `ok`, the text of the error."""
+
+    ok: bool
+    body: bytes
+
+
+class ServiceReplyParser:
+    """Takes bytes as they arrive and returns whole service replies; `limit` is in bytes each."""
+
+    def __init__(self, limit: int = MESSAGE_LIMIT) -> None:
+        self._limit = limit
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> list[ServiceReply]:
+        """Take `data`; return the replies that are complete now.
+
+        Raises `ProtocolError` when the first byte is neither 0 nor 1, `LimitExceededError` for the length.
+        """
+        buffer = self._buffer
+        buffer += data
+        replies = []
+        position = 0
+        while position < len(buffer):
+            ok = buffer[position]
+            if ok > 1:
+                raise ProtocolError(f"service reply: the first byte is {ok}; it is 1 (success) or 0 (error)")
+            start = position + 1 + _LENGTH.size
+            if len(buffer) < start:
+                break
+            (size,) = _LENGTH.unpack_from(buffer, position + 1)
+            _check_frame(size, self._limit)
+            if len(buffer) < start + size:
+                break
+            replies.append(ServiceReply(ok == 1, bytes(buffer[start : start + size])))
+            position = start + size
+        del buffer[:position]
+        return replies
+
+
+def _check_frame(size: int, limit: int) -> None:
+    if size > limit:
+        raise LimitExceededError(f"frame of {size} bytes; at most {limit} are allowed")
+
+
+def _decode_field(field: bytes, position: int) -> tuple[str, str]:
+    raw_name, equals, raw_value = field.partition(b"=")
+    if not equals:
+        raise ProtocolError(f"connection header: the field at byte {position} has no '=': {field[:40]!r}")
+    try:
+        name = raw_name.decode("ascii")
+    except UnicodeDecodeError:
+        name = ""
+    if not name or not name.isprintable() or name != name.strip():
+        raise ProtocolError(
+            f"connection header: the field at byte {position} has no valid name: {raw_name[:40]!r}"
+        )
+    try:
+        return name, raw_value.decode("utf-8", "surrogateescape" if name in _ANY_BYTES else "strict")
+    except UnicodeDecodeError as error:
+        raise ProtocolError(
+            f"connection header: field {name!a} is not UTF-8 (byte {error.start} of its value)"
+        ) from None

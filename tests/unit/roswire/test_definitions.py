@@ -1,0 +1,142 @@
+"""Definitions: md5sums and full texts are those of ROS; what cannot be used is refused with the reason."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
+
+RULE = "=" * 80
+Types = dict[str, dict[str, Any]]
+
+
+def test_md5sums_of_full_texts_are_those_of_genpy(genpy_types: Types) -> None:
+    """The full text of every installed message gives the md5sum that nodes compare."""
+    for name, entry in genpy_types.items():
+        if entry["kind"] == "msg":
+            assert Definitions.from_full_text(name, entry["text"]).md5sum(name) == entry["md5sum"], name
+
+
+def test_full_texts_come_back_as_they_were(genpy_types: Types) -> None:
+    """The full text that is made of definitions is byte for byte what ROS's generators write."""
+    for name, entry in genpy_types.items():
+        if entry["kind"] == "msg":
+            assert Definitions.from_full_text(name, entry["text"]).full_text(name) == entry["text"], name
+
+
+def test_files_are_found_by_both_forms_of_their_names() -> None:
+    """pkg/T.msg and pkg/msg/T.msg are the same type, likewise services."""
+    files = {"a/B.msg": "C c\n", "a/msg/C.msg": "int32 x\n", "a/D.srv": "B b\n---\n", "a/srv/E.srv": "---\n"}
+    definitions = Definitions.from_files(files)
+    assert definitions.message_types == [
+        "a/B",
+        "a/C",
+        "a/DRequest",
+        "a/DResponse",
+        "a/ERequest",
+        "a/EResponse",
+    ]
+    assert definitions.service_types == ["a/D", "a/E"]
+    assert definitions.full_text("a/B") == f"C c\n\n{RULE}\nMSG: a/C\nint32 x\n"
+    assert definitions.service("a/D").request is definitions.message("a/DRequest")
+    assert definitions.service_md5sum("a/E") == "d41d8cd98f00b204e9800998ecf8427e"
+
+
+@pytest.mark.parametrize(
+    "file", ["B.msg", "a/srv/B.msg", "a/b/B.msg", "a/B.txt", "../a/B.msg", "a/B.msg\n", "/a/B.msg", ""]
+)
+def test_other_file_names_are_refused(file: str) -> None:
+    """A file name says package and type, or is refused with the forms that do."""
+    with pytest.raises(DefinitionError, match=r"write pkg/T\.msg"):
+        Definitions.from_files({file: ""})
+
+
+def test_a_type_has_one_definition() -> None:
+    """Two files or two sections for one type are refused."""
+    with pytest.raises(DefinitionError, match="a/B is defined in two files"):
+        Definitions.from_files({"a/B.msg": "", "a/msg/B.msg": ""})
+    with pytest.raises(DefinitionError, match="a/C is defined twice"):
+        Definitions.from_full_text("a/B", f"C c\n{RULE}\nMSG: a/C\n{RULE}\nMSG: a/C\n")
+    with pytest.raises(DefinitionError, match="'C' is no message type"):
+        Definitions.from_full_text("a/B", f"C c\n{RULE}\nMSG: C\n")
+
+
+def test_extending_lets_the_new_types_win(standard: Definitions) -> None:
+    """An operator's own version of a standard type counts, also inside other types."""
+    own = Definitions.from_files({"geometry_msgs/Point.msg": "float32 x\n"})
+    both = standard.extended(own)
+    assert both.md5sum("geometry_msgs/Point") == own.md5sum("geometry_msgs/Point")
+    assert both.md5sum("geometry_msgs/Pose") != standard.md5sum("geometry_msgs/Pose")
+    assert standard.md5sum("geometry_msgs/Pose") == "e45d45a5a1ce597b249e23fb30fc871f"
+    assert both.service_md5sum("std_srvs/SetBool") == standard.service_md5sum("std_srvs/SetBool")
+
+
+def test_unknown_types_are_named_with_similar_ones(standard: Definitions) -> None:
+    """A type that is not there is an error that helps."""
+    with pytest.raises(
+        DefinitionError, match=r"std_msgs/Strin: no such message type; did you mean .*std_msgs/String"
+    ):
+        standard.md5sum("std_msgs/Strin")
+    with pytest.raises(DefinitionError, match="no such service type; did you mean std_srvs/SetBool"):
+        standard.service_md5sum("std_srvs/SetBol")
+    with pytest.raises(DefinitionError, match="a/B: field c has the type a/C, which is not defined"):
+        Definitions.from_files({"a/B.msg": "C c"}).md5sum("a/B")
+
+
+def test_types_that_contain_themselves_are_refused() -> None:
+    """A circle of types is refused and named, whatever is asked of them, and the others still work."""
+    definitions = Definitions.from_files({"a/B.msg": "C[] c", "a/C.msg": "B[] b", "a/D.msg": "int8 x"})
+    for ask in (definitions.md5sum, definitions.layout, definitions.full_text):
+        with pytest.raises(DefinitionError, match="a/B contains a/C contains a/B"):
+            ask("a/B")
+    assert definitions.layout("a/D").size == 1
+
+
+def test_nesting_is_bounded() -> None:
+    """Types nested deeper than any robot's are refused, at the bound they are not."""
+    files = {f"a/T{level}.msg": f"T{level + 1} x" for level in range(64)} | {"a/T64.msg": "int8 x"}
+    definitions = Definitions.from_files(files)
+    with pytest.raises(DefinitionError, match="deeper than 64"):
+        definitions.md5sum("a/T0")
+    assert definitions.md5sum("a/T1")
+    assert definitions.layout("a/T1").size == 1
+
+
+def test_layouts_do_not_explode() -> None:
+    """Definitions whose flattened form is exponentially large or beyond any message are refused at once."""
+    files = {f"a/T{level}.msg": f"T{level + 1} x\nT{level + 1} y" for level in range(40)} | {
+        "a/T40.msg": "int8 x"
+    }
+    definitions = Definitions.from_files(files)
+    with pytest.raises(DefinitionError, match="more than 20000 fields"):
+        definitions.layout("a/T0")
+    assert len(definitions.md5sum("a/T0")) == 32
+    huge = Definitions.from_files(
+        {"a/B.msg": "C[9999999999] c", "a/C.msg": "int64[999] x", "a/D.msg": "string[9999999999] s"}
+    )
+    for name in ("a/B", "a/D"):
+        with pytest.raises(DefinitionError, match="more than 4294967296 bytes"):
+            huge.layout(name)
+
+
+@given(
+    text=st.lists(
+        st.sampled_from(
+            ["int32 ", "a", "b", "\n", "C c\n", "string[] s\n", f"{RULE}\nMSG: a/C\n", "X=1\n", "é"]
+        ),
+        max_size=12,
+    ).map("".join)
+)
+def test_any_full_text_is_used_or_refused(text: str) -> None:
+    """No text of a stranger's connection header raises anything but DefinitionError."""
+    try:
+        definitions = Definitions.from_full_text("a/B", text)
+        assert len(definitions.md5sum("a/B")) == 32
+        assert definitions.layout("a/B").minimum >= 0
+        again = Definitions.from_full_text("a/B", definitions.full_text("a/B"))
+        assert again.md5sum("a/B") == definitions.md5sum("a/B")
+    except DefinitionError as error:
+        assert str(error).isprintable()
