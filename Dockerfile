@@ -29,18 +29,21 @@ RUN python3 -m venv /opt/rosrv \
  && find /opt/rosrv/lib -name '*.so' -exec strip --strip-unneeded {} + \
  && find /opt/rosrv/lib -name direct_url.json -delete
 COPY appliance /opt/rosrv/lib/python3.11/site-packages/appliance
+COPY roswire /opt/rosrv/lib/python3.11/site-packages/roswire
+COPY rosmop /opt/rosrv/lib/python3.11/site-packages/rosmop
 COPY policies /build/etc/policies
 COPY monitors /build/etc/monitors
 # Rights and times of a checkout are its owner's. He may keep his files to himself (umask 077): the processes' users
 # read them all the same; and when he fetched them is nothing that an image is to say.
-RUN chmod -R u=rwX,go=rX /opt/rosrv/lib/python3.11/site-packages/appliance /build/etc \
- && find /opt/rosrv/lib/python3.11/site-packages/appliance /build/etc -exec touch {} + \
+RUN cd /opt/rosrv/lib/python3.11/site-packages \
+ && chmod -R u=rwX,go=rX appliance roswire rosmop /build/etc \
+ && find appliance roswire rosmop /build/etc -exec touch {} + \
  && printf '#!/opt/rosrv/bin/python -P\nfrom appliance.cli.main import main\n\nmain()\n' > /opt/rosrv/bin/rosrv \
  && chmod 755 /opt/rosrv/bin/rosrv \
  && find /opt/rosrv/lib -name __pycache__ -prune -exec rm -rf {} + \
  && cd /opt/rosrv/lib/python3.11/site-packages \
  && compile="/opt/rosrv/bin/python -m compileall -q --invalidation-mode unchecked-hash" \
- && $compile appliance \
+ && $compile appliance roswire rosmop \
  # Some packages carry templates that no interpreter takes; those are imported by nobody.
  && { $compile . > /dev/null || true; }
 

@@ -8,14 +8,14 @@ unexport PYTHONDONTWRITEBYTECODE
 .DEFAULT_GOAL := help
 BIN := .venv/bin
 PYTEST := $(BIN)/pytest
-CHECKED := appliance tests examples benchmarks distribution
+CHECKED := appliance roswire rosmop tests examples benchmarks distribution
 LONG_PROOFS := $(addprefix tests/proofs/test_,histories.py insertion_mutants.py insertion_traces.py insertion_at_large.py certifier.py events.py)
-LONG_UNIT := $(shell grep '^tests/unit' tests/long.txt)
+LONG_UNIT := $(shell grep '^tests/unit\|^rosmop' tests/long.txt)
 # What fetches packages needs this machine's network: a worker of pytest-xdist has none but a loopback of its own.
 CONTAINERS := tests/system/containers
 FETCHING := tests/system/vm tests/system/test_examples.py tests/system/test_generated_client.py
 NAMESPACES := $(filter-out $(CONTAINERS) $(FETCHING),$(wildcard tests/system/test_*.py) $(patsubst %/.,%,$(wildcard tests/system/[a-z]*/.)))
-PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples\|^from hypothesis' tests/unit tests/integration)
+PROPERTIES = $(shell grep --recursive --files-with-matches --include='test_*.py' 'tests.support.examples\|^from hypothesis\|rosmop.tests.examples' tests/unit tests/integration rosmop/tests)
 
 .PHONY: help setup demo check static unit test units nodes test-system system-machine system-containers system-namespaces test-package prove wheel package image site release bench clean
 
@@ -42,18 +42,18 @@ static:
 # a test is said when it is to run.
 build/collected:
 	mkdir -p build
-	$(PYTEST) tests/unit tests/integration tests/proofs --collect-only --quiet > /dev/null || true
+	$(PYTEST) tests/unit rosmop/tests tests/integration tests/proofs --collect-only --quiet > /dev/null || true
 	touch $@
 
 unit: build/collected
-	$(PYTEST) tests/unit $(addprefix --ignore=,$(LONG_UNIT)) -n logical --quiet
+	$(PYTEST) tests/unit rosmop/tests $(addprefix --ignore=,$(LONG_UNIT)) -n logical --quiet
 
 test: setup ## check, the long unit tests, and those with real ROS nodes (root: they make network namespaces)
 	$(MAKE) --jobs=3 --output-sync=target static units nodes
 
 # Tests with real nodes wait half of their time: what computes has the processors then, and after them, for it is nice.
 units: build/collected
-	nice $(PYTEST) tests/proofs/test_insertion.py tests/unit -n logical --dist loadfile --no-loadscope-reorder --quiet --durations=10
+	nice $(PYTEST) tests/proofs/test_insertion.py tests/unit rosmop/tests -n logical --dist loadfile --no-loadscope-reorder --quiet --durations=10
 
 nodes: build/collected
 	$(PYTEST) tests/integration -n auto --dist loadfile --no-loadscope-reorder --quiet --durations=10

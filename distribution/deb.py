@@ -71,7 +71,8 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     library = root / LIBRARY
     make_environment(library, architecture, work)
     _make_virtual(library)
-    _copy(ROOT / "appliance", library / "common/appliance")
+    for package in ("appliance", "roswire", "rosmop"):
+        _copy(ROOT / package, library / "common" / package, "tests", "docs", "README.md", "Makefile", "*.toml")
     shipped = root / "usr/share/rosrv"
     for folder in ("examples", "monitors", "policies"):
         _copy(ROOT / folder, shipped / folder)
@@ -119,8 +120,8 @@ def _documentation(target: Path) -> None:
         shutil.copyfile(ROOT / name, target / name)
 
 
-def _copy(folder: Path, target: Path) -> None:
-    shutil.copytree(folder, target, ignore=shutil.ignore_patterns("__pycache__", "*.pyc"))
+def _copy(folder: Path, target: Path, *without: str) -> None:
+    shutil.copytree(folder, target, ignore=shutil.ignore_patterns("__pycache__", "*.pyc", *without))
 
 
 def _debian_folder(target: Path, moment: int) -> None:

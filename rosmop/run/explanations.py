@@ -7,9 +7,9 @@ import datetime
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from appliance import late
 from rosmop.run.causes import SEQ, Happened
 from rosmop.run.outcomes import DROPPED, Fault, Outcome, Verdict, named
+from rosmop.run.subformulas import deciding
 
 _EACH_END = 5
 """So many of the first and of the last events are told; how many there are between them is said."""
@@ -92,7 +92,7 @@ def why_of(verdict: Verdict, who: Who) -> dict[str, Any]:
     said["fewest"] = why.fewest
     if why.since is not None:
         said["since"] = moment(why.since)
-    decided = late.load("rosmop.run.subformulas").deciding(verdict.source, why)
+    decided = deciding(verdict.source, why)
     if decided:
         said["decided"] = decided
     return {"why": said}

@@ -5,13 +5,13 @@
 from collections.abc import Callable
 
 import pytest
-from rosmop.tests.examples import examples
 
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from rosmop.run.timers import MAX_TICKS
 from rosmop.runtime.wire import Message
 from rosmop.tests.acting import definitions, load, message, refused
+from rosmop.tests.examples import examples
 from rosmop.tests.random_specifications import Messages, Specifications
 from rosmop.tests.random_specifications import definitions as random_definitions
 from rosmop.text.errors import SpecificationError

@@ -7,13 +7,13 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rosmop.tests.examples import examples
 
 from rosmop.form import nodes
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
 from rosmop.runtime.values import Values
 from rosmop.tests.acting import message
+from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
 from rosmop.text.errors import SpecificationError

@@ -13,10 +13,10 @@ import pytest
 import wasmtime
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rosmop.tests.examples import examples
 
 from rosmop.fast import wasm_instance
 from rosmop.fast.wasm_instance import PAGE, Machine, MachineError, MachineTrap, translated
+from rosmop.tests.examples import examples
 
 LIMIT = 4 * PAGE
 FUEL = 1_000_000

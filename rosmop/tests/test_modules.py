@@ -11,7 +11,6 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rosmop.tests.examples import examples
 
 from rosmop.check.sources import compiled_from
 from rosmop.fast.serialization import decoded_part, encoded_part
@@ -20,6 +19,7 @@ from rosmop.fast.wasm_instance import MachineError
 from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
+from rosmop.tests.examples import examples
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
 from rosmop.text.errors import SpecificationError
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from random import Random
 
 import pytest
-from rosmop.tests.examples import examples
 
 from rosmop.certify.properties import certificates_of
 from rosmop.check.specification import compile_files
@@ -20,6 +19,7 @@ from rosmop.run.execution import EXPLAINED
 from rosmop.run.outcomes import Outcome
 from rosmop.run.slices import GROWING_LIMIT, MAX_BINDING
 from rosmop.tests.acting import definitions, load, message, refused
+from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
 from rosmop.tests.logics.driving import seeded
 from rosmop.text.parser import parse

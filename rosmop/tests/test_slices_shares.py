@@ -5,7 +5,6 @@
 from random import Random
 
 import pytest
-from rosmop.tests.examples import examples
 
 from rosmop.run.causes import Sender
 from rosmop.run.engine import MonitorSet
@@ -13,6 +12,7 @@ from rosmop.run.execution import TICK_BUDGET
 from rosmop.run.outcomes import Outcome
 from rosmop.run.slices import TOGETHER_LIMIT
 from rosmop.tests.acting import definitions, message
+from rosmop.tests.examples import examples
 
 ROBOT, GUEST = Sender(1), Sender(2)
 HOSTS = {1: "10.0.0.1", 2: "10.0.0.2", 3: "10.0.0.3", 4: "10.0.0.4"}

@@ -12,7 +12,6 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from rosmop.tests.examples import examples
 
 from rosmop.check.sources import compiled_from
 from rosmop.form.compiled import Compiled
@@ -21,6 +20,7 @@ from rosmop.run.causes import Sender
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from rosmop.tests.acting import definitions, message
+from rosmop.tests.examples import examples
 from rosmop.tests.test_slices import Made, body, made, slice_of, told
 
 SECOND = 10**9

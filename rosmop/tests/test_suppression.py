@@ -6,11 +6,11 @@ from random import Random
 from typing import cast
 
 import pytest
-from rosmop.tests.examples import examples
 
 from rosmop.logics.interface import CompiledProperty, FormulaError, FormulaRun, RunFaultError
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import definitions, load, message
+from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
 from rosmop.tests.logics.driving import ABC, compiled, seeded
 from rosmop.tests.logics.temporal import Tree, draw

@@ -6,13 +6,13 @@ from random import Random
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from rosmop.tests.examples import examples
 
 from rosmop.logics.catalogue import LOGICS
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
 from rosmop.run.outcomes import Outcome
 from rosmop.tests.acting import message
+from rosmop.tests.examples import examples
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
 from rosmop.text.errors import SpecificationError
 

@@ -8,7 +8,6 @@ from random import Random
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rosmop.tests.examples import examples
 
 from rosmop.fast import wasm_runner
 from rosmop.fast.abi import AREA
@@ -24,6 +23,7 @@ from rosmop.run.outcomes import Outcome, Verdict, named
 from rosmop.runtime.context import LogLine, Published
 from rosmop.runtime.wire import Buffer
 from rosmop.tests.acting import message
+from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
 from rosmop.text.errors import SpecificationError

@@ -9,11 +9,11 @@ from random import Random
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rosmop.tests.examples import examples
 
 from rosmop.fast import wasm_runner
 from rosmop.fast.abi import ROOM
 from rosmop.fast.layout import HEAP
+from rosmop.tests.examples import examples
 from rosmop.tests.random_specifications import definitions
 from rosmop.tests.test_walks import Fed, frames, plain
 

@@ -6,10 +6,10 @@ from random import Random
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rosmop.tests.examples import examples
 
 from rosmop.fast import wasm_runner
 from rosmop.fast.abi import MOST_KEPT
+from rosmop.tests.examples import examples
 from rosmop.tests.test_walks import Fed, plain
 
 SOME = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck))

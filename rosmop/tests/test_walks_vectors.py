@@ -6,13 +6,13 @@ from random import Random
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rosmop.tests.examples import examples
 
 from rosmop.fast import layout, wasm_runner
 from rosmop.fast.abi import ROOM
 from rosmop.fast.batch_codegen import written
 from rosmop.form.components import groups
 from rosmop.runtime.values import Values
+from rosmop.tests.examples import examples
 from rosmop.tests.test_walks import Fed, plain
 from rosmop.text.errors import SpecificationError
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from rosmop.tests.examples import examples
 
 import rosmop.certify
 from appliance.specifications.files import Sources, SpecificationsRefusedError, check
@@ -19,6 +18,7 @@ from rosmop.logics.automaton import Automaton
 from rosmop.logics.catalogue import compile_property
 from rosmop.logics.interface import CompiledProperty, FiniteProperty, FormulaError, Source
 from rosmop.logics.tfsm import TimedMachine
+from rosmop.tests.examples import examples
 
 EVENTS = ["a", "b", "c", "d"]
 ORIGIN = Position("x.rv", 1, 1)

@@ -8,7 +8,6 @@ from typing import Any
 
 import msgspec
 import pytest
-from rosmop.tests.examples import examples
 
 from appliance.channel.messages import PartNames
 from appliance.specifications.checking import parts
@@ -23,8 +22,9 @@ from rosmop.form.compiled import Compiled
 from rosmop.form.components import groups
 from rosmop.run.engine import MonitorSet
 from rosmop.runtime.values import Values
+from rosmop.tests.certify.step_mutants import tables, walks
+from rosmop.tests.examples import examples
 from rosmop.tests.random_specifications import Specifications, definitions
-from tests.support.step_mutants import tables, walks
 
 GUARD = """s() { int n = 0;
     event a(int x) /plain own/Plain '{kind:0, count:x}' { if (x > 8) { return; } }
@@ -113,18 +113,18 @@ def _advance(**fields: Callable[[nodes.Advance], object]) -> Callable[..., nodes
 
 
 FAULTS: dict[str, tuple[object, str, object]] = {
-    "another column of the table": (program, "_event", _advance(table=lambda one: one.table[1:] + one.table[:1])),
-    "another initial state": (program, "_event", _advance(initial=lambda one: one.initial + 1)),
-    "no handler runs": (program, "_event", _advance(handlers=lambda _: ())),
-    "a handler in another state": (program, "_event", _advance(
+    "another column of the table": (components, "_event", _advance(table=lambda one: one.table[1:] + one.table[:1])),
+    "another initial state": (components, "_event", _advance(initial=lambda one: one.initial + 1)),
+    "no handler runs": (components, "_event", _advance(handlers=lambda _: ())),
+    "a handler in another state": (components, "_event", _advance(
         handlers=lambda one: tuple(
             msgspec.structs.replace(each, states=frozenset({0})) for each in one.handlers
         )
     )),
-    "handlers in another order": (program, "_event", _advance(handlers=lambda one: one.handlers[::-1])),
-    "formulas keep dropped messages": (program, "_event", _advance(suppresses=lambda _: False)),
-    "machines forget dropped messages": (program, "_event", _advance(suppresses=lambda _: True)),
-    "properties in another order": (program, "_event", _advance(property=lambda one: 1 - (one.property or 0))),
+    "handlers in another order": (components, "_event", _advance(handlers=lambda one: one.handlers[::-1])),
+    "formulas keep dropped messages": (components, "_event", _advance(suppresses=lambda _: False)),
+    "machines forget dropped messages": (components, "_event", _advance(suppresses=lambda _: True)),
+    "properties in another order": (components, "_event", _advance(property=lambda one: 1 - (one.property or 0))),
     "a drop has no effect": (batch_codegen._Walk, "_drop", lambda *_: b""),
     "handlers are not called": (batch_codegen._Walk, "_handle", lambda *_: b""),
     "properties do not step": (batch_codegen._Walk, "_advance", lambda *_: b""),

@@ -10,10 +10,10 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from rosmop.tests.examples import examples
 
 from rosmop.runtime.numbers import MATH
 from rosmop.tests.acting import act, load, message
+from rosmop.tests.examples import examples
 from tests.support.requirements import need_program
 
 TYPES = (

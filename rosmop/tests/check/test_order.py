@@ -4,10 +4,10 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from rosmop.tests.examples import examples
 
 from rosmop.tests.acting import act, refused_action
 from rosmop.tests.check.test_against_cpp import printed
+from rosmop.tests.examples import examples
 from rosmop.tests.test_walks import Fed, plain
 
 CHANGES = (

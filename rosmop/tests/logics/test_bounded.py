@@ -9,10 +9,10 @@ from types import FrameType
 from typing import Any
 
 import pytest
-from rosmop.tests.examples import examples
 
 from rosmop.logics import bounded
 from rosmop.logics.interface import RunFaultError
+from rosmop.tests.examples import examples
 from rosmop.tests.logics.driving import ABC, compiled, play, refusal, seeded
 from rosmop.tests.logics.temporal import Printer, Tree, draw
 from rosmop.tests.logics.test_mtl import Timed, timed_trace

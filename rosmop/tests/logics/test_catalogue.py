@@ -11,11 +11,11 @@ import msgspec
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rosmop.tests.examples import examples
 
 from rosmop.form.positions import Position
 from rosmop.logics.catalogue import LOGICS, compile_property
 from rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError
+from rosmop.tests.examples import examples
 from rosmop.tests.logics.driving import ABC, ORIGIN, compiled, play, refusal, seeded
 
 EXAMPLES = {

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from itertools import product
 
 import pytest
-from rosmop.tests.examples import examples
 
+from rosmop.tests.examples import examples
 from rosmop.tests.logics.driving import compiled, refusal, seeded, told, traces
 from rosmop.tests.logics.temporal import Printer, Tree, draw
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import pytest
-from rosmop.tests.examples import examples
 
 from rosmop.logics.interface import CompiledProperty
+from rosmop.tests.examples import examples
 from rosmop.tests.logics.driving import compiled, play, refusal, seeded, told
 
 Timed = tuple[tuple[int, str], ...]

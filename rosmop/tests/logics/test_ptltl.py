@@ -3,11 +3,11 @@
 from itertools import product
 
 import pytest
-from rosmop.tests.examples import examples
 
 from rosmop.logics import past
 from rosmop.logics.interface import FiniteProperty
 from rosmop.logics.past import PastProperty
+from rosmop.tests.examples import examples
 from rosmop.tests.logics.driving import ABC, compiled, refusal, seeded, told, traces
 from rosmop.tests.logics.temporal import Printer, Tree, draw
 

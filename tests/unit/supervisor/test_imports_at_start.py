@@ -17,8 +17,7 @@ _LINKED = _BARE | {"appliance.channel.admin"}
 ALSO: Final = {
     "signer": _LINKED | {"appliance.config"}, "control": _BARE,
     "relay": _LINKED | {
-        "cryptography", "appliance.config", "roswire.definitions", "rosmop.logics.formula",
-        "rosmop.run.explain",
+        "cryptography", "appliance.config", "roswire.definitions",
     },
     "charon": _LINKED, "compiler": _LINKED, "syslog": _LINKED, "recorder": {"pydantic", "appliance.channel.admin"},
     "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette", "yaml", "appliance.policy.policy"},

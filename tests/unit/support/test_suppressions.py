@@ -9,7 +9,7 @@ import pytest
 from tests.support.outside import TESTS
 
 ROOT = TESTS.parent
-FOLDERS = ("appliance", "benchmarks", "distribution", "examples", "scripts", "tests")
+FOLDERS = ("appliance", "rosmop", "roswire", "benchmarks", "distribution", "examples", "scripts", "tests")
 LANGUAGES = {".py", ".js", ".mjs", ".sh", ".cpp", ".hpp", ".css", ""}
 SUPPRESSION = re.compile(
     r"(?:#|//|/\*) *(?:(?:ruff: )?noqa(?:: ?[A-Z]+[0-9]+(?:, ?[A-Z]+[0-9]+)*)?|type: ignore(?:\[[^]]*\])?"
