@@ -215,7 +215,7 @@ RELAY_MESSAGE = Share(
     (
         "unit/relay/monitors/test_middle.py::test_a_message_that_takes_longer_than_the_budget_is_a_fault",
         "unit/relay/monitors/test_middle.py::test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn",
-        "unit/rosmop/test_budget.py::test_every_walk_of_a_message_ends_with_its_time",
+        "rosmop/tests/test_budget.py::test_every_walk_of_a_message_ends_with_its_time",
     ),
     setting="relay.budget (milliseconds)",
 )
@@ -269,9 +269,9 @@ SLICES = Share(
     " 1,000 in all where an event or a timer does not bind all parameters, or where a property has no tables",
     "`monitor fault`, a line of the monitor; `rosrv_monitor_slices`",
     (
-        "unit/rosmop/test_slices_shares.py::test_a_guest_that_makes_up_ids_refuses_the_robot_nothing",
-        "unit/rosmop/test_slices_shares.py::test_a_guest_that_makes_up_ids_pushes_out_its_own",
-        "unit/rosmop/test_slices_shares.py::test_one_message_concerns_a_bounded_number_of_slices",
+        "rosmop/tests/test_slices_shares.py::test_a_guest_that_makes_up_ids_refuses_the_robot_nothing",
+        "rosmop/tests/test_slices_shares.py::test_a_guest_that_makes_up_ids_pushes_out_its_own",
+        "rosmop/tests/test_slices_shares.py::test_one_message_concerns_a_bounded_number_of_slices",
     ),
     setting="slices (the first number)",
 )

@@ -43,11 +43,12 @@ def missing(text: str, tests: Path) -> list[str]:
 
 
 def _runs(tests: Path, path: str, name: str) -> bool:
-    if not path.endswith(".py") or not (tests / path).is_file():
+    file = tests.parent / path if path.startswith("rosmop/") else tests / path
+    if not path.endswith(".py") or not file.is_file():
         return False
     functions = [
         node
-        for node in ast.parse((tests / path).read_text()).body
+        for node in ast.parse(file.read_text()).body
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.name == name
     ]
     marks = [ast.unparse(mark) for function in functions for mark in function.decorator_list]
