@@ -72,7 +72,9 @@ def _gather(source: Path, architecture: Architecture, work: Path, moment: int) -
     make_environment(library, architecture, work)
     _make_virtual(library)
     for package in ("appliance", "roswire", "rosmop"):
-        _copy(ROOT / package, library / "common" / package, "tests", "docs", "README.md", "Makefile", "*.toml")
+        _copy(
+            ROOT / package, library / "common" / package, "tests", "docs", "README.md", "Makefile", "*.toml"
+        )
     shipped = root / "usr/share/rosrv"
     for folder in ("examples", "monitors", "policies"):
         _copy(ROOT / folder, shipped / folder)

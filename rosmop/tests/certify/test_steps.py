@@ -128,7 +128,10 @@ FAULTS: dict[str, tuple[object, str, object]] = {
     "a drop has no effect": (batch_codegen._Walk, "_drop", lambda *_: b""),
     "handlers are not called": (batch_codegen._Walk, "_handle", lambda *_: b""),
     "properties do not step": (batch_codegen._Walk, "_advance", lambda *_: b""),
-    "states are not written": (batch_codegen._Walk, "_done", lambda self: batch_codegen._set(batch_codegen._AT, batch_codegen._get(batch_codegen._NEXT))),
+    "states are not written": (
+        batch_codegen._Walk, "_done",
+        lambda self: batch_codegen._set(batch_codegen._AT, batch_codegen._get(batch_codegen._NEXT)),
+    ),
 }  # fmt: skip
 
 TWO = """s() { event a(int x) /plain own/Plain '{kind:0, count:x}' { if (x > 8) { return; } }
