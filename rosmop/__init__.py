@@ -1,6 +1,6 @@
-"""The ``.rv`` language: specifications of monitors, compiled to functions over the bytes of ROS messages.
+"""The ``.rv`` language: specifications of monitors over the bytes of ROS messages.
 
-`syntax` reads the text, `types` knows what values are, `compile` checks it and writes it in the form that `ir` defines,
-runs plainly and writes as modules; `runtime` is what that calls, `logics` makes monitors from formulas, `engine` runs
-it all. Pure: no I/O, no clock, no globals.
+`text` parses, `types` knows the types of values, `logics` makes monitors from formulas, `check` type-checks and lowers to
+the intermediate form in `form`. `run` interprets that form, which defines the meaning; `fast` translates parts of it to
+WebAssembly. `runtime` has the functions that specifications call. The package does no I/O and reads no clock.
 """
