@@ -218,10 +218,6 @@ class Syslog:
     send: Literal["all", "denials"] = key(
         default="all", description="denials: those, warnings and alarms; signed checkpoints are always sent"
     )
-    format: Literal["fields", "ocsf"] = key(
-        default="fields",
-        description="fields: as parameters of RFC 5424, the reason as text; ocsf: the text is an event of OCSF 1.6.0",
-    )
     facility: int = key(default=13, ge=0, le=23, description="13 is `log audit`, 10 `authpriv`, 16 `local0`")
     host_name: str | None = key(
         default=None, description="the name messages come from; the machine's unless it is given"

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import appliance
 from appliance.audit.events import EVENTS, SEVERITIES
 from appliance.audit.kinds import ABOUT
-from appliance.audit.ocsf import class_text
 from appliance.audit.record import Severity
 
 _FIELDS = frozenset(
@@ -63,11 +62,10 @@ _HEAD = """\
 
 Every event by its stable name (`rosrv audit search --event NAME`), what it means, the severities it is recorded
 with, and the fields of its `detail`. The fields that every record has are in [audit.md](audit.md). A name is never
-renamed or given another meaning. The last column is the class and activity of the event in OCSF 1.6.0 (`--ocsf`, and
-`audit.syslog.format: ocsf`); activity 99 has the event's name as `activity_name`.
+renamed or given another meaning.
 
-| event | meaning | severity | fields of `detail` | OCSF class: activity |
-|---|---|---|---|---|
+| event | meaning | severity | fields of `detail` |
+|---|---|---|---|
 """
 
 
@@ -138,7 +136,7 @@ def markdown() -> str:
     order = [one.value for one in Severity]
     rows = [
         f"| `{name}` | {meaning} | {', '.join(sorted(severities[name], key=order.index)) or 'by case'} |"
-        f" {', '.join(f'`{one}`' for one in fields[name]) or '-'} | {class_text(name)} |"
+        f" {', '.join(f'`{one}`' for one in fields[name]) or '-'} |"
         for name, meaning in EVENTS.items()
     ]
     return _HEAD + "\n".join(rows) + "\n"

@@ -103,7 +103,6 @@ def make_forwarder(settings: Settings, kept: Path) -> Forwarder:
             facility=wanted.facility,
             longest=longest,
             host_name=wanted.host_name,
-            ocsf=wanted.format == "ocsf",
         ),
         chosen=wanted.send,
     )

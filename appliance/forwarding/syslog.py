@@ -16,9 +16,8 @@ from datetime import UTC, datetime
 import msgspec
 
 from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
-from appliance.audit.ocsf import as_ocsf_line
 from appliance.audit.output import Entry, fields_of, printable
-from appliance.audit.record import Record, Severity
+from appliance.audit.record import Severity
 
 ELEMENT = "rosrv@32473"  # 32473 is kept for examples (RFC 5612): the project has no number of its own
 LONGEST_DATAGRAM, LONGEST_IN_STREAM = 2048, 8192  # RFC 5426, 3.2; RFC 5425, 4.3.1
@@ -29,7 +28,6 @@ _SEVERITIES = {
     Severity.WARNING: 4,
     Severity.ALARM: 1,
 }
-_IDENTIFYING = ("sequence", "id", "event")
 _LONGEST_MESSAGE_ID = 32
 _LONGEST_HOST_NAME = 255
 _LONGEST_VALUE = 512
@@ -38,17 +36,11 @@ _CUT = "..."
 
 
 class Formatter:
-    """Makes messages that come from `host_name`, of a facility (0 to 23), at most `longest` bytes each.
+    """Makes messages from `host_name`, of a facility (0 to 23), at most `longest` bytes each."""
 
-    `ocsf`: the text of a message is an event of OCSF, and its parameters are what identifies the record.
-    """
-
-    def __init__(
-        self, *, facility: int, longest: int, host_name: str | None = None, ocsf: bool = False
-    ) -> None:
+    def __init__(self, *, facility: int, longest: int, host_name: str | None = None) -> None:
         self._facility = facility
         self._longest = longest
-        self._ocsf = ocsf
         self._room = min(_LONGEST_VALUE, (longest - _FIXED) // _OPEN)
         self._host = _name(host_name or socket.gethostname(), _LONGEST_HOST_NAME)
 
@@ -56,12 +48,6 @@ class Formatter:
         """A record of the log."""
         record = entry.record
         head = self._head(record.severity, record.time, record.event)
-        if self._ocsf:
-            named = {
-                name: value for name, value in fields_of(entry).items() if name in _IDENTIFYING and value
-            }
-            room = self._longest - len(_message(head, ELEMENT, named, "")) - 1
-            return _message(head, ELEMENT, named, as_ocsf_line(entry, room))
         named = {name: _value(value, self._room) for name, value in fields_of(entry).items() if value}
         text = _ascii(record.reason or record.event)
         detail = json.dumps(record.detail, separators=(",", ":")) if record.detail else ""
@@ -81,12 +67,6 @@ class Formatter:
             name: str(value) for name, value in msgspec.structs.asdict(signed).items() if value is not None
         }
         text = f"checkpoint {signed.number} of the audit log"
-        if self._ocsf:
-            record = Record(
-                id=signed.hash, time=signed.time, event="checkpoint", severity=Severity.NOTICE, reason=text,
-                detail={"number": signed.number, "sequence": signed.sequence, "hash": signed.hash},
-            )  # fmt: skip
-            text = as_ocsf_line(Entry(signed.sequence, record))
         return _message(head, SYSLOG_ELEMENT, fields, text)
 
     def _head(self, severity: Severity, time: int, event: str) -> str:

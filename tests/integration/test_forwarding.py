@@ -146,37 +146,6 @@ def test_only_denials(tmp_path: Path) -> None:
         assert all(one.fields.get("decision") != "allow" for one in collector.messages)
 
 
-def test_as_ocsf(tmp_path: Path) -> None:
-    """With `format: ocsf` a SIEM gets events that say who was refused what; checkpoints come as ever."""
-    with (
-        StreamCollector() as collector,
-        forwarding(collector.port, tmp_path, format="ocsf") as appliance,
-    ):
-        with master_at(appliance.master_uri) as master:
-            assert master.noSuchCall("/rogue\u202e]\n")[0] == 0
-        (denial,) = appliance.recorded("--caller", "/rogue*")
-        messages = collector.wait_for(
-            lambda messages: any(
-                int(one.fields["sequence"]) >= denial["sequence"] for one in sealed(messages)
-            )
-        )
-        events = [json.loads(one.text) for one in messages]
-        (event,) = [one for one in events if one["metadata"]["uid"] == denial["id"]]
-        assert event["type_uid"] == event["class_uid"] * 100 + event["activity_id"] == 600399
-        assert (event["action_id"], event["disposition_id"], event["severity_id"]) == (2, 2, 3)
-        assert (event["src_endpoint"], event["actor"]) == (
-            {"ip": "127.0.0.1"},
-            {"app_name": "/rogue\u202e]\n"},
-        )
-        assert event["api"] == {"operation": "noSuchCall"}
-        assert event["metadata"]["sequence"] == denial["sequence"]
-        assert collector.sequences() == sorted(set(collector.sequences()))
-        exported = appliance.rosrv("audit", "export", "--ocsf", "--caller", "/rogue*").stdout
-        tail = appliance.rosrv("audit", "tail", "--no-follow", "--ocsf", "--caller", "/rogue*").stdout
-        found = appliance.rosrv("audit", "search", "--ocsf", "--caller", "/rogue*").stdout
-        assert json.loads(exported) == json.loads(tail) == json.loads(found) == event
-
-
 def test_history_written_anew_by_root(tmp_path: Path) -> None:
     """Root rewrites the log with the real key: here all is right, and the other machine's file knows better."""
     with StreamCollector() as collector, forwarding(collector.port, tmp_path) as appliance:

@@ -17,7 +17,6 @@ import typer
 
 from appliance.audit.copies import read_copies
 from appliance.audit.export_proof import verify_export
-from appliance.audit.ocsf import as_ocsf_line
 from appliance.audit.output import Entry, as_json, as_object
 from appliance.audit.query import Filter
 from appliance.audit.search import LARGEST_PAGE
@@ -38,7 +37,6 @@ from appliance.cli.target import Appliance, speaks
 _CHECKPOINT_SECONDS = 5.0  # between two looks: one is made a minute, and a look over REST is itself recorded
 _TOLD_EVERY = 1000
 _Json = Annotated[bool, typer.Option("--json", help="One JSON object a line (NDJSON)")]
-_Ocsf = Annotated[bool, typer.Option("--ocsf", help="One event of OCSF 1.6.0 a line (NDJSON), for a SIEM")]
 _AlwaysJson = Annotated[bool, typer.Option("--json", help="NDJSON, which it always is")]
 
 
@@ -52,15 +50,14 @@ def search(
     oldest_first: Annotated[bool, typer.Option("--oldest-first", help="From the first record on")] = False,
     cursor: Annotated[str | None, typer.Option("--cursor", help="Go on where a search ended")] = None,
     as_json_lines: _Json = False,
-    ocsf: _Ocsf = False,
 ) -> None:
     """Find records, newest first.
 
     Example: rosrv audit search --deny --since 1h --topic '/cmd_*'
     """
     page = appliance.audit().search(wanted, cursor, limit, newest_first=not oldest_first)
-    if as_json_lines or ocsf:
-        _print_lines(page.entries, as_json_lines, ocsf=ocsf)
+    if as_json_lines:
+        _print_lines(page.entries, as_json_lines)
     else:
         print_entries(page.entries)
     if page.cursor is not None:
@@ -76,14 +73,13 @@ def tail(
     lines: Annotated[int, typer.Option("--lines", "-n", min=0, max=LARGEST_PAGE, help="At first")] = 10,
     follow: Annotated[bool, typer.Option(help="Wait for more, until interrupted")] = True,
     as_json_lines: _Json = False,
-    ocsf: _Ocsf = False,
 ) -> None:
     """Show the last records and follow the log.
 
     Example: rosrv audit tail --deny
     """
     for entries in appliance.audit().follow(wanted, lines, on=follow):
-        _print_lines(entries, as_json_lines, ocsf=ocsf)
+        _print_lines(entries, as_json_lines)
 
 
 @speaks
@@ -204,22 +200,15 @@ def export(
     *,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
     as_json_lines: _AlwaysJson = True,  # noqa: ARG001  every verb takes --json
-    ocsf: _Ocsf = False,
 ) -> None:
     """Write all records that match as NDJSON, oldest first, each with its place in the hash chain.
 
-    It proves itself elsewhere: `rosrv audit verify --export week.ndjson --key audit.pub`. With --ocsf the lines are
-    events of OCSF, which have no place for the chain and prove nothing.
+    It proves itself elsewhere: `rosrv audit verify --export week.ndjson --key audit.pub`.
 
     Example: rosrv audit export --since 7d --output week.ndjson
     """
     source = appliance.audit()
-    if ocsf:
-        entries: Iterable[tuple[int, str]] = (
-            (entry.sequence, as_ocsf_line(entry)) for entry in source.export(wanted)
-        )
-    else:
-        entries = source.evidence(wanted)
+    entries = source.evidence(wanted)
     with progress("exporting", source.last, shares_screen=output is None) as told:
         if output is None:
             count = _write_all(entries, told, sys.stdout)
@@ -230,8 +219,8 @@ def export(
         tell(f"{count} records in {output}")
 
 
-def _print_lines(entries: list[Entry], as_json_lines: bool, *, ocsf: bool) -> None:
-    formatted = as_ocsf_line if ocsf else as_json if as_json_lines else line
+def _print_lines(entries: list[Entry], as_json_lines: bool) -> None:
+    formatted = as_json if as_json_lines else line
     for entry in entries:
         write(formatted(entry))
     sys.stdout.flush()

@@ -147,30 +147,3 @@ def test_a_checkpoint() -> None:
             "previous": "c" * 64, "signature": "d" * 128, "key": "e" * 64,
         }
     }  # fmt: skip
-
-
-@pytest.mark.parametrize("longest", [2048, 8192])
-@pytest.mark.parametrize("host_name", ["robot-1", "x" * 255])
-@pytest.mark.parametrize("detail", [{"call": "setParam"}, {"x": "y" * 60_000}])
-def test_ocsf(longest: int, host_name: str, detail: dict[str, str]) -> None:
-    """As OCSF the text is an event, whole or shortened within the bound; what identifies the record is before it."""
-    made = Formatter(facility=13, longest=longest, host_name=host_name, ocsf=True)
-    data = made.record(
-        entry(decision="deny", caller_id="/\u202e]\x7f" * 200, reason="why" * 200, detail=detail)
-    )
-    assert len(data) <= longest
-    message = parse(data)
-    assert message.elements == {ELEMENT: {"sequence": "7", "id": "0" * 20, "event": "decision"}}
-    event = json.loads(message.text)
-    assert (event["class_uid"], event["metadata"]["uid"]) == (6003, "0" * 20)
-    assert event["metadata"].get("is_truncated", False) == (longest == 2048 or "x" in detail)
-
-
-def test_a_checkpoint_with_ocsf() -> None:
-    """The element that proves the log is as ever; the text is an event here, too."""
-    one = SignedCheckpoint("a" * 32, 3, 120, "b" * 64, _TIME, "c" * 64, "d" * 128, "e" * 64)
-    message = parse(Formatter(facility=13, longest=2048, host_name="robot-1", ocsf=True).checkpoint(one))
-    assert message.elements[SYSLOG_ELEMENT]["signature"] == "d" * 128
-    event = json.loads(message.text)
-    assert (event["class_uid"], event["activity_name"]) == (1008, "checkpoint")
-    assert event["unmapped"]["detail"] == {"number": 3, "sequence": 120, "hash": "b" * 64}
