@@ -25,6 +25,10 @@ class Asker(NamedTuple):
     node: str | None = None
 
 
+Recordings = Callable[[str, str | None, Severity, str | None, int], dict[str, str]]
+"""Return what the record of an event says of its recording: `RecordingPlan.detail`."""
+
+
 class AuditTrail:
     """Records decisions and events under the running policy revision.
 
@@ -33,13 +37,14 @@ class AuditTrail:
     host beyond its share of the log causes without a call is counted, not recorded each time.
     """
 
-    def __init__(self, log: AuditLog, *, strict: bool, deny_when_failed: bool) -> None:
+    def __init__(
+        self, log: AuditLog, *, strict: bool, deny_when_failed: bool, recordings: Recordings
+    ) -> None:
         self._log = log
         self._ids = log.ids
         self.strict = strict
         self._deny_when_failed = deny_when_failed
-        self.recordings: Callable[[str, str | None, Severity, str | None, int], dict[str, str]] | None = None
-        """What a record says of the recording that has it: `RecordingPlan.detail`, once there is one."""
+        self._recordings = recordings
         self.revision = 0
         self.meter = Meter()
 
@@ -109,7 +114,7 @@ class AuditTrail:
             detail["needs"] = decision.needs
         now = time.time_ns()
         severity = Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING
-        detail |= self._recorded("decision", word, severity, asker.host, now)
+        detail |= self._recordings("decision", word, severity, asker.host, now)
         return Record(
             id=self._ids.next(),
             time=now,
@@ -165,7 +170,7 @@ class AuditTrail:
         `reads`: it changed nothing, so that its repetitions are counted.
         """
         now, severity = time.time_ns(), severity or SEVERITIES.get(event, Severity.INFO)
-        detail = {**(more or {}), **detail, **self._recorded(event, decision, severity, host, now)}
+        detail = {**(more or {}), **detail, **self._recordings(event, decision, severity, host, now)}
         stranger = self._marked(host, decision, detail)
         return self._log.record(
             Record(
@@ -186,12 +191,6 @@ class AuditTrail:
                 folds=reads or (decision is None and host is not None and bool(self.owing(host))),
             )
         )
-
-    def _recorded(
-        self, event: str, decision: str | None, severity: Severity, host: str | None, now: int
-    ) -> dict[str, str]:
-        """Which recording has what happens now, or why there is none; empty when it is no trigger of one."""
-        return {} if self.recordings is None else self.recordings(event, decision, severity, host, now)
 
     def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
         """Whether this is about a stranger whom something is refused; the detail says so then."""

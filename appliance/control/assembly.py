@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from ipaddress import ip_address, ip_network
 
 from appliance import late
-from appliance.audit.ids import IdSource
 from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.config import Settings
@@ -22,7 +21,7 @@ from appliance.control.lifeline import ControlLifeline
 from appliance.control.monitor_states import published_now
 from appliance.control.policies import Policies
 from appliance.control.recording_orders import RecordingOrders
-from appliance.control.standing import HostStanding, charged_to
+from appliance.control.standing import HostStanding
 from appliance.master import rosout
 from appliance.master.calls.call import served
 from appliance.master.calls.execution import Execution
@@ -87,6 +86,7 @@ class Foundation:
     compiler: SpecificationCompiler
     store: StateStore
     trail: AuditTrail
+    plan: RecordingPlan
     policies: Policies
     registry: Registry
     standing: HostStanding
@@ -111,9 +111,7 @@ class Parts:
             base.settings.recorder,
             base.trail,
             lambda: messages.RevisionsStated(base.policies.revision, self.monitors.revision),
-            RecordingPlan(
-                base.settings.recorder, lambda host: charged_to(base.policies.current, host), IdSource().next
-            ),
+            base.plan,
         )
         self._make_graph()
         self._make_reach()

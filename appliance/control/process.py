@@ -19,6 +19,7 @@ import structlog
 import uvloop
 
 from appliance.audit.budget import Budget
+from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
 from appliance.audit.retention import Retention
 from appliance.audit_trail import AuditTrail
@@ -42,7 +43,7 @@ from appliance.control.rest import RestLink
 from appliance.control.robot import master_address, robot_addresses
 from appliance.control.signing import Signing
 from appliance.control.spare_memory import SpareMemory
-from appliance.control.standing import HostStanding
+from appliance.control.standing import HostStanding, charged_to
 from appliance.control.switched_off import SwitchedOffWatch
 from appliance.control.tokens import Tokens
 from appliance.hosts.authority import Authority
@@ -56,6 +57,7 @@ from appliance.hosts.tunnels import Tunnels
 from appliance.master.graph.registry import Life, Registry
 from appliance.master.reach.places import NoPortError
 from appliance.master.upkeep.enactor import restore
+from appliance.recorder.plan import RecordingPlan
 from appliance.rpc.server import listen
 from appliance.shares.pool import Standing
 from appliance.shares.table import AUDIT_RESERVE
@@ -142,10 +144,14 @@ class _Control:
         self._standing: HostStanding | None = None
         self._audit = _open_audit(self._settings, self._signing, self._log_held(), self._standing_of)
         audit = self._settings.audit
+        plan = RecordingPlan(
+            self._settings.recorder, lambda host: charged_to(policies.current, host), IdSource().next
+        )
         trail = AuditTrail(
             self._audit,
             strict=audit.durability == "strict",
             deny_when_failed=audit.on_audit_failure == "deny",
+            recordings=plan.detail,
         )
         store = StateStore(
             self._settings.state / "control",
@@ -176,6 +182,7 @@ class _Control:
             compiler=self._compiler,
             store=store,
             trail=trail,
+            plan=plan,
             policies=policies,
             registry=registry,
             standing=standing,

@@ -50,7 +50,6 @@ class RecordingOrders:
     ) -> None:
         self._rules = rules
         self._plan = plan
-        trail.recordings = plan.detail
         self._trail = trail
         self._in_force = in_force
         self.link = Link(self._heard)

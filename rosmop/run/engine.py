@@ -35,7 +35,7 @@ from rosmop.run.causes import NOBODY, Sender
 from rosmop.run.execution import Asked, Execution, OnFault
 from rosmop.run.monitor import Group, Monitor, Step, monitors_of
 from rosmop.run.outcomes import Outcome
-from rosmop.run.slice_quota import Holder
+from rosmop.run.slice_quota import HolderOf, no_holder
 from rosmop.run.slices import LIMIT
 from rosmop.run.state import (
     KeptGroup,
@@ -122,9 +122,10 @@ class MonitorSet:
         *,
         slices: int = LIMIT,
         deadlines: int = sys.maxsize,
+        holder_of: HolderOf = no_holder,
     ) -> None:
         """`compiled` is all of them in their order; what is on trial is in `trials`. At most so many `deadlines` of
-        slices pass at a time.
+        slices pass at a time. Slices are charged to `holder_of` the source whose message makes them (`quota.py`).
         """
         tried = {name for trial in trials for name in trial.names}
         self.names: tuple[str, ...] = tuple(one.name for one in compiled.specifications)
@@ -137,7 +138,7 @@ class MonitorSet:
         self.interpreter = compiled.interpreter()
         self.on_fault: OnFault = on_fault
         self.patience = patience
-        self._monitors = monitors_of(compiled, self.interpreter, 0, slices)
+        self._monitors = monitors_of(compiled, self.interpreter, 0, slices, holder_of)
         self.groups = tuple(_groups(compiled, self._monitors))
         self._guards = guards(compiled)
         self._types = types_of(compiled)
@@ -176,6 +177,7 @@ class MonitorSet:
         trial_patience: Patience = lambda: _never,
         margins: bool = False,
         slices: int = LIMIT,
+        holder_of: HolderOf = no_holder,
     ) -> "MonitorSet":
         """Compile files (name to text) in this order; raises `SpecificationError` with all that is wrong.
 
@@ -188,7 +190,13 @@ class MonitorSet:
 
         compiled = compiled_from(sources, definitions, margins=margins)
         return cls.of(
-            compiled, on_fault, patience, trials=trials, trial_patience=trial_patience, slices=slices
+            compiled,
+            on_fault,
+            patience,
+            trials=trials,
+            trial_patience=trial_patience,
+            slices=slices,
+            holder_of=holder_of,
         )
 
     @classmethod
@@ -202,15 +210,25 @@ class MonitorSet:
         trial_patience: Patience = lambda: _never,
         slices: int = LIMIT,
         deadlines: int = sys.maxsize,
+        holder_of: HolderOf = no_holder,
     ) -> "MonitorSet":
         """The set of what was compiled; the rest as `load` and `__init__` say."""
         tried = []
         for group in compiled.groups(trials):
-            trial = cls(compiled.part(group), on_fault, trial_patience, slices=slices, deadlines=deadlines)
+            trial = cls(
+                compiled.part(group),
+                on_fault,
+                trial_patience,
+                slices=slices,
+                deadlines=deadlines,
+                holder_of=holder_of,
+            )
             for monitor in trial._monitors:
                 monitor.context.most = TRIAL_BUDGET
             tried.append(trial)
-        return cls(compiled, on_fault, patience, tried, slices=slices, deadlines=deadlines)
+        return cls(
+            compiled, on_fault, patience, tried, slices=slices, deadlines=deadlines, holder_of=holder_of
+        )
 
     # What there is
 
@@ -340,13 +358,6 @@ class MonitorSet:
         self._execution.asked = asked
         for trial in self.trials:
             trial.explain_when(tried, tried)
-
-    def charge_slices(self, holder_of: Callable[[int], Holder]) -> None:
-        """Charge slices to the holder of the source whose message makes them (`quota.py`)."""
-        for part in (self, *self.trials):
-            for monitor in part._monitors:
-                if monitor.slices is not None:
-                    monitor.slices.holder_of = holder_of
 
     @property
     def area(self) -> memoryview | None:

@@ -12,6 +12,7 @@ from rosmop.form.compiled import Compiled, EventCode, PropertyCode, Specificatio
 from rosmop.logics.interface import FormulaRun, Run
 from rosmop.run.explain import TRAIL, Bound, Exits, Steps, history_of
 from rosmop.run.interpreter import Interpreter
+from rosmop.run.slice_quota import HolderOf
 from rosmop.run.slices import Slice, Slices
 from rosmop.runtime.context import Context
 from rosmop.runtime.wire import Message
@@ -197,12 +198,18 @@ def monitors_of(
     interpreter: Interpreter,
     time_ns: int,
     slices: int,
+    holder_of: HolderOf,
 ) -> tuple[Monitor, ...]:
-    """The running forms of compiled specifications, in their initial state; each with at most so many slices."""
-    return tuple(_monitor(interpreter, code, time_ns, slices) for code in compiled.specifications)
+    """Return the running forms of compiled specifications, in their initial state.
+
+    Each has at most `slices` slices, which are charged to `holder_of(source)`.
+    """
+    return tuple(_monitor(interpreter, code, time_ns, slices, holder_of) for code in compiled.specifications)
 
 
-def _monitor(interpreter: Interpreter, code: SpecificationCode, time_ns: int, slices: int) -> Monitor:
+def _monitor(
+    interpreter: Interpreter, code: SpecificationCode, time_ns: int, slices: int, holder_of: HolderOf
+) -> Monitor:
     function = interpreter.function
     properties = tuple(
         RunningProperty(
@@ -216,7 +223,7 @@ def _monitor(interpreter: Interpreter, code: SpecificationCode, time_ns: int, sl
     )
     monitor = Monitor(code, interpreter.contexts[code.context], properties)
     if code.slicing is not None:
-        monitor.slices = Slices(code, interpreter.variables, slices)
+        monitor.slices = Slices(code, interpreter.variables, slices, holder_of)
     steps = [
         Step(
             monitor,

@@ -1,13 +1,22 @@
 """Counts what hosts have of something finite, the oldest first."""
 
 from collections import OrderedDict
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from typing import Generic, TypeVar
 
 Thing = TypeVar("Thing", bound=Hashable)
 
 Holder = Hashable | None
 """Who has something, as whoever runs the monitors names it; None where nobody is told apart."""
+
+
+HolderOf = Callable[[int], Holder]
+"""Return who is charged for what the messages of a source make (`Sender.source`)."""
+
+
+def no_holder(_source: int) -> Holder:
+    """Charge nobody, where sources are not told apart."""
+    return None
 
 
 class Quota(Generic[Thing]):

@@ -47,7 +47,7 @@ from rosmop.logics.interface import (
     FormulaRun,
     Run,
 )
-from rosmop.run.slice_quota import Holder, Quota
+from rosmop.run.slice_quota import Holder, HolderOf, Quota
 from rosmop.runtime.context import FOLDED_NS
 from rosmop.types import kinds
 
@@ -117,7 +117,14 @@ class _Known:
 class Slices:
     """All slices of one specification."""
 
-    def __init__(self, code: SpecificationCode, namespace: dict[str, Any], limit: int) -> None:
+    def __init__(
+        self,
+        code: SpecificationCode,
+        namespace: dict[str, Any],
+        limit: int,
+        holder_of: HolderOf,
+    ) -> None:
+        """`holder_of(source)` is charged for the slices that messages of this source make."""
         assert code.slicing is not None  # noqa: S101  who asks has looked
         properties = [declared.property for declared in code.properties]
         self._all = (1 << len(code.slicing.parameters)) - 1
@@ -129,8 +136,6 @@ class Slices:
             self.limit = min(self.limit, GROWING_LIMIT)
         if any(_domain(event) != self._all for event in code.events):
             self.limit = min(self.limit, TOGETHER_LIMIT)
-        self.holder_of: Callable[[int], Holder] = lambda _source: None
-        """Who is charged for the slices that the messages of a source make (`Sender.source`)."""
         self.refused: Mapping[str, object] | None = None
         """The binding of the last event of which there can be no slice."""
         self.why = ""
@@ -140,6 +145,7 @@ class Slices:
         self.behind: list[Slice] = []
         """The slices that matter to the last event and have deadlines before it that have not passed yet."""
         self._code = code
+        self._holder_of = holder_of
         self._namespace = namespace
         self._parameters = code.slicing.parameters
         self._own = code.slicing.own
@@ -277,7 +283,7 @@ class Slices:
         if size > MAX_BINDING:
             self._refuse(domain, key, f"a binding of {size} bytes; it may have {MAX_BINDING}")
             return ()
-        self._holder = self.holder_of(source)
+        self._holder = self._holder_of(source)
         whole: list[Slice] = []
         seeds: list[Slice] = []
         for slice_ in (*self._agreeing(domain, key), *self._fresh(event, domain, key)):

@@ -8,7 +8,7 @@ import pytest
 
 from rosmop.run.causes import Sender
 from rosmop.run.engine import MonitorSet
-from rosmop.run.execution import TICK_BUDGET
+from rosmop.run.execution import TICK_BUDGET, OnFault
 from rosmop.run.outcomes import Outcome
 from rosmop.run.slices import TOGETHER_LIMIT
 from rosmop.tests.acting import definitions, message
@@ -28,8 +28,7 @@ ACTING, OBSERVING = GOALS % "DROP;", GOALS % 'ROS_WARN("twice");'
 
 def begun(text: str, slices: int) -> MonitorSet:
     """A set in which each source is a host."""
-    monitors = MonitorSet.load({"x.rv": text}, definitions(), slices=slices)
-    monitors.charge_slices(HOSTS.get)
+    monitors = MonitorSet.load({"x.rv": text}, definitions(), slices=slices, holder_of=HOSTS.get)
     monitors.start(0)
     return monitors
 
@@ -150,10 +149,10 @@ def test_one_message_concerns_a_bounded_number_of_slices() -> None:
 
 
 @pytest.mark.parametrize("on_fault", ["drop", "pass"])
-def test_a_message_that_is_cut_has_happened_in_no_slice(on_fault: str) -> None:
+def test_a_message_that_is_cut_has_happened_in_no_slice(on_fault: OnFault) -> None:
     """The budget ends in the middle of the slices: one fault, nothing put out, and all slices as before."""
     action = '{ times = times + 1; ROS_INFO("stop"); for (int i = 0; i < 300000; i++) { times = times; } }'
-    monitors = MonitorSet.load({"x.rv": STOPPED % action}, definitions(), on_fault)  # type: ignore[arg-type]
+    monitors = MonitorSet.load({"x.rv": STOPPED % action}, definitions(), on_fault)
     monitors.start(0)
     for name in "abcde":
         send(monitors, "/goal", name, GUEST)

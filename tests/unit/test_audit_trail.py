@@ -9,7 +9,7 @@ import pytest
 from appliance.audit.budget import Budget
 from appliance.audit.ids import IdSource
 from appliance.audit.record import Severity
-from appliance.audit_trail import NOT_RECORDED, AuditTrail
+from appliance.audit_trail import NOT_RECORDED, AuditTrail, Recordings
 from appliance.config import RecorderRules
 from appliance.recorder.plan import RecordingPlan
 from appliance.shares.pool import Standing
@@ -38,9 +38,14 @@ class Log:
         return self.failed
 
 
-def trail(log: Log, *, deny: bool) -> AuditTrail:
+def trail(log: Log, *, deny: bool, recordings: Recordings = lambda *_: {}) -> AuditTrail:
     """As control makes it."""
-    return AuditTrail(log, strict=True, deny_when_failed=deny)  # type: ignore[arg-type]  # stands for the log
+    return AuditTrail(
+        log,  # type: ignore[arg-type]  # stands for the log
+        strict=True,
+        deny_when_failed=deny,
+        recordings=recordings,
+    )
 
 
 def test_nobody_is_told_where_the_log_is() -> None:
@@ -99,9 +104,9 @@ def test_what_a_host_beyond_its_share_causes_is_counted() -> None:
 def test_the_record_of_a_drop_says_which_recording_has_it() -> None:
     """Whatever a specification names its values; so does an alarm; what is no trigger says nothing."""
     log = Log()
-    one = trail(log, deny=False)
     rules = RecorderRules(enabled=True, per_hour=1, triggers=["drop", "alarm", "denial"])
-    one.recordings = RecordingPlan(rules, lambda host: host, IdSource().next).detail
+    plan = RecordingPlan(rules, lambda host: host, IdSource().next)
+    one = trail(log, deny=False, recordings=plan.detail)
     one.happened("message dropped", "too fast", host="10.0.0.9", more={"recording": "forged"})
     one.happened("message changed", "", host="10.0.0.9")
     one.happened("monitor fault", "", severity=Severity.ALARM, host="10.0.0.7")

@@ -16,6 +16,7 @@ from appliance.relay.loop import READ, Loop
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet
+    from rosmop.run.slice_quota import HolderOf
 
 _SWITCH_SECONDS = 0.0005  # the loop waits so long at most for the thread that loads
 
@@ -24,10 +25,16 @@ Result = Union["MonitorSet", list[str]]
 
 
 class Loader:
-    """Loads what is stated; `done(statement, result)` hears of each."""
+    """Loads what is stated; `done(statement, result)` hears of each.
 
-    def __init__(self, loop: Loop, done: Callable[[SpecificationsStated, Result], None]) -> None:
+    `holder_of(source)` is charged for the slices that messages of a source make.
+    """
+
+    def __init__(
+        self, loop: Loop, done: Callable[[SpecificationsStated, Result], None], holder_of: "HolderOf"
+    ) -> None:
         self._loop = loop
+        self._holder_of = holder_of
         self._done = done
         self._waiting: deque[SpecificationsStated] = deque()
         self._thread: threading.Thread | None = None
@@ -66,7 +73,7 @@ class Loader:
         self._wake = -1
 
     def _work(self, message: SpecificationsStated, wake: int) -> None:
-        self._result = self.load(message)
+        self._result = self.load(message, self._holder_of)
         os.eventfd_write(wake, 1)
 
     def _ready(self, _events: int) -> None:
@@ -79,12 +86,11 @@ class Loader:
             self._begin()
 
     @staticmethod
-    def load(message: SpecificationsStated) -> Result:
+    def load(message: SpecificationsStated, holder_of: "HolderOf") -> Result:
         """The set that these specifications make, or what is wrong with them."""
         try:  # it is loaded late, for that takes half a second of a small machine
-            result: Result = late.load("appliance.relay.monitors.monitor_sets", "prepare").monitor_set(
-                message
-            )
+            sets = late.load("appliance.relay.monitors.monitor_sets", "prepare")
+            result: Result = sets.monitor_set(message, holder_of)
         except Exception as error:  # noqa: BLE001  a defect is a reason to refuse, no more
             return [f"a defect of rosrv, please report it: {type(error).__name__}: {error}"]
         return result

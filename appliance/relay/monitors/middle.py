@@ -96,7 +96,7 @@ class Middle:
         """For the walks of requests and replies until there is another `sight`: at most a second."""
         self._timer: Timer | None = None
         self._due: int | None = None
-        self._loader = Loader(loop, self.loaded)
+        self._loader = Loader(loop, self.loaded, self.holder_of)
         self.observations = Observations(loop, reporter, self._rows)
         self._changed = changed
         self._holder = holder
@@ -144,7 +144,6 @@ class Middle:
             return
         result.limit_time(time.thread_time, self.budget)
         result.explain_when(self.observer.asks, self._on_trial.asks)
-        result.charge_slices(self._holder_of)
         before, now, first = self.monitors, self.now(), self._stated is None or bool(self.blocked)
         if before is None:
             outcome = self._begun(result, now, restarted=first and message.restarted)
@@ -179,7 +178,8 @@ class Middle:
             return monitors.recover((), {"": _NO_MEMORY}, now, restarted=True)
         return monitors.start(now, restarted=restarted)
 
-    def _holder_of(self, source: int) -> str:
+    def holder_of(self, source: int) -> str:
+        """Return who is charged for the slices that messages of this source make."""
         place = self.senders.place(source)
         return self._holder("" if place is None else place.host)
 

@@ -12,6 +12,7 @@ from rosmop.fast.serialization import decoded_part
 from rosmop.fast.wasm_instance import load
 from rosmop.form.compiled import Compiled, Part
 from rosmop.run.engine import MonitorSet
+from rosmop.run.slice_quota import HolderOf
 from rosmop.types.messages import Messages
 from roswire.definitions import Definitions
 
@@ -20,8 +21,8 @@ _TRIAL_TICKS_SECONDS = 0.02
 _DEADLINES = 100  # of slices that pass in one go: some milliseconds
 
 
-def monitor_set(message: SpecificationsStated) -> Result:
-    """The set that these specifications make, or why there is none."""
+def monitor_set(message: SpecificationsStated, holder_of: HolderOf) -> Result:
+    """Return the set that these specifications make, or why there is none."""
     try:
         part = decoded_part(message.part) if message.part else _NOTHING
     except msgspec.MsgspecError as error:
@@ -34,6 +35,7 @@ def monitor_set(message: SpecificationsStated) -> Result:
         trial_patience=lambda: _patience(_TRIAL_TICKS_SECONDS),
         slices=message.slices,
         deadlines=_DEADLINES,
+        holder_of=holder_of,
     )
     monitors.take_module(part.module)
     return monitors

@@ -29,7 +29,7 @@ async def test_an_idle_connection_is_closed_at_every_listener(tmp_path: Path, *,
     settings = dataclasses.replace(given, limits=dataclasses.replace(given.limits, idle_seconds=0.1))
     policy = compile_policy("[Nodes]\ndefault = *\n", file="a.ini")
     log = AuditLog(tmp_path / "audit.db")
-    trail = AuditTrail(log, strict=False, deny_when_failed=False)
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
     doors = Doors(settings, trail, lambda: policy, lambda _host: Standing.NAMED)
 
     async def answer(_request: HttpRequest) -> bytes:

@@ -30,7 +30,6 @@ class Trail:
     def __init__(self) -> None:
         self.events: list[tuple[str, dict[str, Any]]] = []
         self.failure: str | None = None
-        self.recordings: Any = None
 
     def happened(self, event: str, _reason: str, **detail: Any) -> str:
         """As `AuditTrail`."""

@@ -20,7 +20,9 @@ def test_every_report_is_recorded(tmp_path: Path, kind: str) -> None:
     """A verdict has a category of its own, and a robot's names are not ours to choose."""
     log = AuditLog(tmp_path / "audit.db")
     records = MonitorRecords(
-        AuditTrail(log, strict=False, deny_when_failed=False), lambda _topic, _data: None, []
+        AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {}),
+        lambda _topic, _data: None,
+        [],
     )
     detail = {"logic": "fsm", **{name: f"its {name}" for name in NAMES}}
     event = MonitorEvent(

@@ -10,7 +10,7 @@ PROGRAM = """
 import gc, sys
 from appliance.channel.messages import SpecificationsStated
 from appliance.relay.monitors.loader import Loader
-monitors = Loader.load(SpecificationsStated(1, bytes.fromhex(sys.argv[1]), {"m": True}, False))
+monitors = Loader.load(SpecificationsStated(1, bytes.fromhex(sys.argv[1]), {"m": True}, False), lambda _: None)
 assert monitors.monitors, monitors
 ir = tuple(f"rosmop.ir.{name}" for name in ("feed", "module", "layout", "wasm"))
 compiler = ("lark", "rosmop.text", "rosmop.check.", "rosmop.fast.wasm_build", *ir)

@@ -27,6 +27,7 @@ from appliance.channel.messages import (
 from appliance.relay.connections.frames import Batch
 from appliance.relay.monitors.loader import Loader
 from appliance.relay.monitors.places import Place
+from rosmop.run.slice_quota import HolderOf
 from roswire.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
 from tests.support.stated import stated
 from tests.unit.relay.world import ASK, HEADER, LOOPBACK, Peer, World
@@ -210,9 +211,9 @@ def test_the_first_specifications_hold_up_nothing_but_what_is_to_be_carried(
     compiled = threading.Event()
     load_now = Loader.load
 
-    def load_late(message: SpecificationsStated) -> Any:
+    def load_late(message: SpecificationsStated, holder_of: HolderOf) -> Any:
         compiled.wait()
-        return load_now(message)
+        return load_now(message, holder_of)
 
     monkeypatch.setattr(Loader, "load", staticmethod(load_late))
     late = GUARD.replace("/chatter", "/late")
@@ -259,9 +260,9 @@ def test_what_a_new_control_begins_with_is_in_force_before_it_places_anything(
     compiled = threading.Event()
     load_now = Loader.load
 
-    def load_late(message: SpecificationsStated) -> Any:
+    def load_late(message: SpecificationsStated, holder_of: HolderOf) -> Any:
         compiled.wait()
-        return load_now(message)
+        return load_now(message, holder_of)
 
     monkeypatch.setattr(Loader, "load", staticmethod(load_late))
     world.state(stated(2, [("0.rv", text)], {}, {}, True, ahead=True))
@@ -780,7 +781,7 @@ def test_slices_are_charged_to_the_host_that_publishes(world: Monitored) -> None
     middle = world.engine.middle
     world.state(NodePlaced("robot", "/robot", "10.0.0.1"), world.listen())
     numbers = [middle.senders.number(Place("k", "/t", host)) for host in ("10.0.0.1", "10.0.0.8", "10.0.0.9")]
-    assert [middle._holder_of(number) for number in (*numbers, 999)] == ["10.0.0.1", "", "", ""]
+    assert [middle.holder_of(number) for number in (*numbers, 999)] == ["10.0.0.1", "", "", ""]
 
 
 def test_each_binding_has_its_deadline_in_the_relay(world: Monitored) -> None:
