@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from itertools import count
+from typing import Any
 
 import pytest
 from msgspec import structs
@@ -21,9 +22,9 @@ NAMES = {"127.0.0.1": ROBOT, GUEST: GUEST, "10.0.0.7": "10.0.0.7", "10.0.0.8": "
 def made(**rules: object) -> RecordingPlan:
     """A plan, in which hosts without a name are unknown."""
     ids = count(1)
-    every = {"enabled": True, "per_hour": 6, "before": 60, "after": 10} | rules
+    every: dict[str, Any] = {"enabled": True, "per_hour": 6, "before": 60, "after": 10} | rules
     return RecordingPlan(
-        RecorderRules(**every),  # type: ignore[arg-type]
+        RecorderRules(**every),
         lambda host: NAMES.get(host, UNKNOWN),
         lambda: str(next(ids)),
     )

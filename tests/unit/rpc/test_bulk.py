@@ -3,6 +3,7 @@
 import asyncio
 import datetime
 import ipaddress
+from functools import partial
 from typing import Any
 
 import pytest
@@ -138,7 +139,7 @@ def test_what_a_thread_does_for_a_host_is_charged_to_it() -> None:
             await bulk.in_thread(lambda: sum(range(200_000)) / 0)
         time.charge(HOSTS[2], 10.0)  # the turn is over
         for host in (HOSTS[0], HOSTS[1]):
-            time.run(host, lambda host=host: order.append(host))  # type: ignore[misc]
+            time.run(host, partial(order.append, host))
         while time.waiting:
             await asyncio.sleep(0)
         assert order == [HOSTS[1], HOSTS[0]]
