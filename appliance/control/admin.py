@@ -24,11 +24,10 @@ class AdminServer:
     def __init__(self, administration: Administration) -> None:
         self._administration = administration
         self._decoder = msgspec.json.Decoder(admin.AnyRequest)
-        self._server: asyncio.Server | None = None  # held: a server that nobody holds is closed
 
-    async def start(self, sock: socket.socket) -> None:
-        """Serve the listening socket."""
-        self._server = await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT)
+    async def start(self, sock: socket.socket) -> asyncio.Server:
+        """Serve the listening socket as long as the server that this returns is held."""
+        return await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:

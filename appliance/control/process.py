@@ -284,8 +284,8 @@ class _Control:
             require_proof=self._settings.api_require_proof,
         )
         if _ADMIN in sockets:
-            self._admin = AdminServer(administration)
-            await self._admin.start(sockets[_ADMIN].dup())
+            # Held: a server that nobody holds is closed.
+            self._admin = await AdminServer(administration).start(sockets[_ADMIN].dup())
 
     def _audit_state(self) -> AuditState:
         assert self._forwarded is not None  # noqa: S101  it is asked when all is there

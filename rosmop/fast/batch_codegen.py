@@ -114,12 +114,12 @@ def written(
         shared |= dict.fromkeys(variables, cells[-1])
     effects = writer.take(16 * (MAX_EFFECTS + 2))
     feeds: dict[str, Feed] = {}
-    walks: dict[str, _Walk] = {}
+    walks: dict[str, WalkWriter] = {}
     tables = _Tables(writer)
     for component, own in zip(components, cells, strict=True):
         for topic, events in component.topics:
             try:
-                walks[topic] = _Walk(writer, own, tables, effects, events, stamped=topic in stamped)
+                walks[topic] = WalkWriter(writer, own, tables, effects, events, stamped=topic in stamped)
             except (NotScalarError, RecursionError):
                 continue
     settled = [writer.settling(own) for own in cells if own.kept]
@@ -189,7 +189,7 @@ def _set(local: int, value: bytes) -> bytes:
     return value + b"\x21" + unsigned(local)
 
 
-class _Walk:
+class WalkWriter:
     """Writes the walk for one topic. Raises `NotScalarError` if no message would come through."""
 
     def __init__(

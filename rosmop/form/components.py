@@ -66,7 +66,7 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
             (
                 topic,
                 tuple(
-                    _event(specifications, properties, number, index, met.index(number))
+                    event_of(specifications, properties, number, index, met.index(number))
                     for number, index in events
                 ),
             )
@@ -80,13 +80,14 @@ def _group(specifications: Sequence[SpecificationCode], numbers: Sequence[int]) 
     )
 
 
-def _event(
+def event_of(
     specifications: Sequence[SpecificationCode],
     properties: Sequence[tuple[int, int]],
     number: int,
     index: int,
     place: int,
 ) -> nodes.Event:
+    """Return the form of one event of a specification, with how its properties advance."""
     advances = []
     for property_index, code in enumerate(specifications[number].properties):
         compiled, handlers = code.property, set(code.order)

@@ -33,7 +33,7 @@ class Code:
     body: tuple[Instruction, ...]
 
 
-_TYPES = {0x7F: "i32", 0x7E: "i64", 0x7D: "f32", 0x7C: "f64"}
+TYPES = {0x7F: "i32", 0x7E: "i64", 0x7D: "f32", 0x7C: "f64"}
 _COMPARED = "eq ne lt_s lt_u gt_s gt_u le_s le_u ge_s ge_u"
 _COMPARED_FLOATS = "eq ne lt gt le ge"
 _CALCULATED = "clz ctz popcnt add sub mul div_s div_u rem_s rem_u and or xor shl shr_s shr_u"
@@ -70,8 +70,8 @@ def _plain() -> dict[int, str]:
     return found | {0xA7 + place: name for place, name in enumerate(_CONVERTED.split())}
 
 
-_PLAIN: Mapping[int, str] = MappingProxyType(_plain())
-_MEMORY = MappingProxyType({0x28 + place: name for place, name in enumerate(_ACCESSES.split())})
+PLAIN: Mapping[int, str] = MappingProxyType(_plain())
+MEMORY = MappingProxyType({0x28 + place: name for place, name in enumerate(_ACCESSES.split())})
 _TRUNCATING = MappingProxyType(dict(enumerate(_TRUNCATED.split())))
 _NUMBERED = MappingProxyType({0x0C: "br", 0x0D: "br_if", 0x10: "call", 0x20: "local.get", 0x21: "local.set"})
 _BLOCKS = MappingProxyType({0x02: "block", 0x03: "loop", 0x04: "if"})
@@ -82,16 +82,20 @@ _FLOATS = MappingProxyType(
 )
 
 
-class _Reader:
+class Reader:
+    """Reads numbers and instructions of a module, from `at` on."""
+
     def __init__(self, data: bytes) -> None:
         self._data = data
         self.at = 0
 
     def byte(self) -> int:
+        """Read one byte."""
         self.at += 1
         return self._data[self.at - 1]
 
     def unsigned(self) -> int:
+        """Read an unsigned number (LEB128)."""
         value = shift = 0
         while True:
             byte = self.byte()
@@ -101,17 +105,20 @@ class _Reader:
                 return value
 
     def signed(self) -> int:
+        """Read a signed number (LEB128)."""
         begun = self.at
         value = self.unsigned()
         bits = 7 * (self.at - begun)
         return value - (value >> bits - 1 << bits)
 
     def take(self, size: int) -> bytes:
+        """Read this many bytes."""
         self.at += size
         return self._data[self.at - size : self.at]
 
     def types(self) -> tuple[str, ...]:
-        return tuple(_TYPES[self.byte()] for _ in range(self.unsigned()))
+        """Read a list of types."""
+        return tuple(TYPES[self.byte()] for _ in range(self.unsigned()))
 
     def block(self) -> tuple[tuple[Instruction, ...], int]:
         """Instructions up to an `else` or `end`, and which of the two it is."""
@@ -120,14 +127,15 @@ class _Reader:
             code = self.byte()
             if code in (_ELSE, _END):
                 return tuple(found), code
-            found.append(self._instruction(code))
+            found.append(self.instruction(code))
 
-    def _instruction(self, code: int) -> Instruction:
-        if code in _PLAIN:
-            return Instruction(_PLAIN[code])
-        if code in _MEMORY:
+    def instruction(self, code: int) -> Instruction:
+        """Read the rest of an instruction that begins with this byte."""
+        if code in PLAIN:
+            return Instruction(PLAIN[code])
+        if code in MEMORY:
             self.unsigned()  # what the address is a multiple of: a hint
-            return Instruction(_MEMORY[code], (self.unsigned(),))
+            return Instruction(MEMORY[code], (self.unsigned(),))
         if code in _NUMBERED:
             return Instruction(_NUMBERED[code], (self.unsigned(),))
         if code in _BLOCKS:
@@ -155,7 +163,7 @@ def functions_of(module: bytes) -> list[Code]:
 
     Raises `UnknownInstructionError`, `KeyError` for an unknown type, and `IndexError` where the module ends too early.
     """
-    reader = _Reader(module)
+    reader = Reader(module)
     reader.take(8)
     types: list[tuple[tuple[str, ...], tuple[str, ...]]] = []
     chosen: list[int] = []
@@ -175,7 +183,7 @@ def functions_of(module: bytes) -> list[Code]:
                 made: list[str] = []
                 for _ in range(reader.unsigned()):
                     count = reader.unsigned()
-                    made += [_TYPES[reader.byte()]] * count
+                    made += [TYPES[reader.byte()]] * count
                 found.append(Code(parameters, results[0], tuple(made), reader.block()[0]))
         reader.at = end
     return found

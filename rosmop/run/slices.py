@@ -156,7 +156,8 @@ class Slices:
         self._holder: Holder = None
         self._now = 0
         self._known = {domain: _Known() for domain in _joined(_domain(event) for event in code.events)}
-        self._live: Quota[tuple[int, Key]] = Quota(self.limit)
+        self.quota: Quota[Binding] = Quota(self.limit)
+        """The bindings of the slices that there are, by the hosts that are charged for them."""
         self._ended: Quota[tuple[int, Key]] = Quota(self.limit)
         self._forgotten = 0
         self._told: int | None = None
@@ -175,7 +176,7 @@ class Slices:
     @property
     def live(self) -> int:
         """How many slices there are, with those that lack a parameter."""
-        return self._live.total
+        return self.quota.total
 
     def _look_at(self, properties: Sequence[PropertyCode]) -> None:
         """Find out in which states of automata a slice is over, as if there were none, or nothing but a state."""
@@ -202,7 +203,7 @@ class Slices:
         zero = tuple(self._namespace[code] for _, code, _ in self._parameters)
         values = self.own()
         self._first = Slice(0, (True, *zero), runs, values)
-        self._live.clear()
+        self.quota.clear()
         self._ended.clear()
         self._deadlines.clear()
         for known in self._known.values():
@@ -213,7 +214,7 @@ class Slices:
     def take_over(self, before: "Slices") -> None:
         """Go on with those of the same specification before it was loaded again."""
         self._first, self._known = before._first, before._known
-        self._live.take_over(before._live)
+        self.quota.take_over(before.quota)
         self._ended.take_over(before._ended)
         self._deadlines, self._order = before._deadlines, before._order
         self._whole = before._whole
@@ -359,12 +360,12 @@ class Slices:
         """Why the host can have no slice more."""
         if self._holder is None:
             return f"more than {self.limit} slices"
-        held = self._live.held(self._holder)
+        held = self.quota.held(self._holder)
         return f"its host has {held} of {self.limit} slices, which is as many as are left for all others"
 
     def _has_room(self, most: int) -> bool:
         """Whether the host may have so many slices more, or has some of its own to forget for them."""
-        return self._live.fits(self._holder, most) or (self._forgets and self._live.held(self._holder) > 0)
+        return self.quota.fits(self._holder, most) or (self._forgets and self.quota.held(self._holder) > 0)
 
     def _refuse(self, domain: int, key: Key, why: str) -> None:
         self.refused, self.why = self._shown(domain, key), why
@@ -519,7 +520,7 @@ class Slices:
         for slice_ in live:
             slice_.kept = True
             self._put(slice_.domain, slice_.key, slice_)
-            self._live.take(slice_.holder, (slice_.domain, slice_.key))
+            self.quota.take(slice_.holder, (slice_.domain, slice_.key))
             if slice_.due is not None:
                 self._deadlines.append((slice_.due, slice_.turn, slice_))
         heapify(self._deadlines)
@@ -572,7 +573,7 @@ class Slices:
         if slice_.key in known:
             self._ended.give_back(slice_.holder, binding)
         slice_.gone = False
-        self._live.take(slice_.holder, binding)
+        self.quota.take(slice_.holder, binding)
         self._put(*binding, slice_)
 
     def values(self, slice_: Slice) -> Mapping[int, Any]:
@@ -591,21 +592,21 @@ class Slices:
         return told
 
     def _keep(self, slice_: Slice) -> None:
-        while not self._live.fits(slice_.holder, 1):
-            domain, key = self._live.oldest(slice_.holder)
+        while not self.quota.fits(slice_.holder, 1):
+            domain, key = self.quota.oldest(slice_.holder)
             oldest = self._known[domain].slices[key]
             assert oldest is not None  # noqa: S101  it is live
             self._leave(oldest)
             self._forget(domain, key)
             self._forgotten += 1
         slice_.kept = True
-        self._live.take(slice_.holder, (slice_.domain, slice_.key))
+        self.quota.take(slice_.holder, (slice_.domain, slice_.key))
         self._put(slice_.domain, slice_.key, slice_)
 
     def _leave(self, slice_: Slice) -> None:
         """A slice is live no more."""
         slice_.gone = True
-        self._live.give_back(slice_.holder, (slice_.domain, slice_.key))
+        self.quota.give_back(slice_.holder, (slice_.domain, slice_.key))
 
     def _put(self, domain: int, key: Key, slice_: Slice | None) -> None:
         known = self._known[domain]

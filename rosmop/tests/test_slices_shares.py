@@ -10,7 +10,7 @@ from rosmop.run.causes import Sender
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import TICK_BUDGET, OnFault
 from rosmop.run.outcomes import Outcome
-from rosmop.run.slices import TOGETHER_LIMIT
+from rosmop.run.slices import TOGETHER_LIMIT, Binding, Slices
 from rosmop.tests.acting import definitions, message
 from rosmop.tests.examples import examples
 
@@ -43,6 +43,11 @@ def live(monitors: MonitorSet) -> int:
     slices = monitors.monitors[0].slices
     assert slices is not None
     return slices.live
+
+
+def of_host(slices: Slices, host: str) -> list[Binding]:
+    """Return the bindings of a host's slices, the oldest first."""
+    return [binding for holder, binding in slices.quota.all() if holder == host]
 
 
 def test_a_guest_that_makes_up_ids_refuses_the_robot_nothing() -> None:
@@ -91,7 +96,7 @@ def test_no_sequence_removes_a_slice_for_another_host(text: str) -> None:
         for _ in range(80):
             slices = monitors.monitors[0].slices
             assert slices is not None
-            before = {host: [*slices._live._of.get(host, ())] for host in HOSTS.values()}
+            before = {host: of_host(slices, host) for host in HOSTS.values()}
             host = random.choice((*HOSTS,))
             send(
                 monitors,
@@ -99,7 +104,7 @@ def test_no_sequence_removes_a_slice_for_another_host(text: str) -> None:
                 f"{host} {random.randrange(9)}",
                 Sender(host),
             )
-            after = {host: [*slices._live._of.get(host, ())] for host in HOSTS.values()}
+            after = {host: of_host(slices, host) for host in HOSTS.values()}
             assert slices.live == sum(map(len, after.values())) <= 12
             assert all(after[other] == before[other] for other in HOSTS.values() if other != HOSTS[host])
 
@@ -130,10 +135,11 @@ def states(monitors: MonitorSet) -> list[object]:
     """The states and variables of all slices."""
     slices = monitors.monitors[0].slices
     assert slices is not None
+    found = [slices.state(binding) for _host, binding in slices.quota.all()]
     return [
         (slice_.runs[0].state, slice_.values)  # type: ignore[attr-defined]  # of tables
-        for slice_ in slices._whole.values()
-        if slice_ is not None
+        for slice_ in found
+        if slice_ is not None and slices.is_whole(slice_)
     ]
 
 

@@ -8,22 +8,23 @@ from rosmop.fast.batch_codegen import WrittenModule
 from rosmop.fast.wasm import signed, unsigned
 from rosmop.prove import decoding
 
-_OPCODES = {name: code for code, name in (decoding._PLAIN | decoding._MEMORY).items()}
+_OPCODES = {name: code for code, name in (decoding.PLAIN | decoding.MEMORY).items()}
 _PAIRS = (("add", "sub"), ("and", "or"), ("eq", "ne"), ("shl", "shr_u"), ("lt_s", "ge_s"), ("lt_s", "le_s"),
           ("lt_u", "ge_u"), ("gt_s", "le_s"), ("gt_s", "ge_s"), ("mul", "add"), ("gt_u", "le_u"), ("ge_u", "lt_u"),
           ("shr_s", "shl"), ("eq", "gt_u"))  # fmt: skip
 
 
-class _Reader(decoding._Reader):
+class _Reader(decoding.Reader):
     """Notes where each instruction stands."""
 
     def __init__(self, data: bytes) -> None:
         super().__init__(data)
         self.found: list[tuple[int, int, decoding.Instruction]] = []
 
-    def _instruction(self, code: int) -> decoding.Instruction:
+    def instruction(self, code: int) -> decoding.Instruction:
+        """Read one, and note it."""
         begin = self.at - 1
-        one = super()._instruction(code)
+        one = super().instruction(code)
         if not one.body and not one.otherwise:
             self.found.append((begin, self.at, one))
         return one
@@ -104,7 +105,7 @@ def walks(module: WrittenModule) -> Iterator[tuple[str, str, WrittenModule]]:
     kinds = list(decoding.functions_of(code)[number].parameters)
     for _ in range(inner.unsigned()):
         many = inner.unsigned()
-        kinds += [decoding._TYPES[inner.byte()]] * many
+        kinds += [decoding.TYPES[inner.byte()]] * many
     inner.block()
     for begin, end, one in inner.found:
         for kind, other in _others(one, kinds):

@@ -54,11 +54,9 @@ async def served(state: Path) -> AsyncIterator[Slow]:
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listening.bind(str(state / ADMIN_SOCKET))
     listening.listen()
-    server = AdminServer(administration)
-    await server.start(listening)
+    server = await AdminServer(administration).start(listening)
     yield slow
-    assert server._server is not None
-    server._server.close()
+    server.close()
 
 
 async def test_what_is_not_answered_in_time_is_withdrawn(

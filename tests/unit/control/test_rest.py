@@ -210,6 +210,7 @@ def test_more_than_may_wait_are_told_so_at_once() -> None:
 
 def test_what_no_client_waits_for_does_not_take_effect() -> None:
     """An order whose time is over, whose client is gone, or whose api is, is withdrawn; the others take effect."""
+    read = asyncio.Event()
 
     async def play(world: Everything, link: RestLink) -> None:
         world.go.clear()
@@ -220,9 +221,9 @@ def test_what_no_client_waits_for_does_not_take_effect() -> None:
         api.channel.send(RequestWithdrawn(3))
         api.channel.send(RequestWithdrawn(77))
         api.channel.send(RequestMade(4, StatusWanted(), "nobody's"))
+        api.channel.send(RestServed("sha256//" + "A" * 43 + "="))
         async with asyncio.timeout(20):
-            while 4 not in link._withdrawn:  # what was sent before it has been read then
-                await asyncio.sleep(0)
+            await read.wait()  # what was sent before the pin, too
         world.go.set()
         heard = {one.number: answer_of(one) for one in (await api.until(5))[1:]}
         assert [heard[number].trouble for number in (1, 2, 3)] == ["", "busy", "busy"]
@@ -231,7 +232,7 @@ def test_what_no_client_waits_for_does_not_take_effect() -> None:
             "answered"
         ]
 
-    run(play)
+    run(play, lambda _pin: read.set())
 
 
 def test_a_defect_is_one_answer() -> None:

@@ -394,7 +394,7 @@ def test_a_bomb_is_not_unpacked(
         assert "unpacks to more than" in reviewer.said
         large.file_size, large.compress_size = 100, 10_000
         archive.filelist += [large] * 3
-        archive._didModify = True  # type: ignore[attr-defined]  # a directory whose entries have one place
+        archive.comment = b"written again"  # a directory whose entries have one place
         archive.close()
         assert reviewer.status(tmp_path / "y.zip") == 2
         assert "overlap" in reviewer.said

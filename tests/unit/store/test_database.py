@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -288,14 +289,11 @@ def test_a_statement_torn_by_the_crash_is_left_out(tmp_path: Path) -> None:
 
 
 class _Gate:
-    """`os` and a lock for one file: a write waits until another thread closes the file, or waits to close it."""
+    """What is done to one file, and its lock: a write waits until another thread closes the file, or waits to."""
 
     def __init__(self) -> None:
         self.writing, self.closing = threading.Event(), threading.Event()
         self._lock = threading.Lock()
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(os, name)
 
     def __enter__(self) -> None:
         if not self._lock.acquire(blocking=False):
@@ -304,10 +302,6 @@ class _Gate:
 
     def __exit__(self, *_: object) -> None:
         self._lock.release()
-
-    def Lock(self) -> "_Gate":  # noqa: N802  the name in `threading`
-        """Be the lock."""
-        return self
 
     def write(self, descriptor: int, data: bytes) -> int:
         """Write when another thread wants to close the file."""
@@ -326,8 +320,10 @@ def test_closing_waits_for_a_write_that_is_under_way(tmp_path: Path, monkeypatch
     """A thread that has the descriptor's number writes to that file, also if another thread closes it meanwhile."""
     gate = _Gate()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(ahead_module, "os", gate)
-    monkeypatch.setattr(ahead_module, "threading", gate)
+    flags = {name: getattr(os, name) for name in ("O_RDWR", "O_CREAT", "O_APPEND", "O_CLOEXEC")}
+    calls = SimpleNamespace(open=os.open, write=gate.write, close=gate.close, **flags)
+    monkeypatch.setattr(ahead_module, "os", calls)
+    monkeypatch.setattr(ahead_module, "threading", SimpleNamespace(Lock=lambda: gate))
     ahead = WriteAhead(tmp_path / "state.ahead")
     writing = threading.Thread(target=ahead.append, args=([("INSERT", ())],))
     writing.start()
