@@ -8,14 +8,16 @@ registration together, all hosts without one, or new connections. The relay's ow
 no payer. A payer with more than `_DIRECT` descriptors has an epoll of its own inside the loop's, so however many of
 them are ready, those of others are found in time. Payers are served by deficit round robin in its continuous form: the
 payer that has used the least processor time goes first, for at most `QUANTUM`; credit for idle time is one quantum, and
-a new payer begins behind others.
+a new payer begins behind others. A payer is *costly* when it used much more than a quantum the last time. All others
+that are ready come before the next costly one, for a quantum together, even where they have used more.
 
 Invariants:
 - A handler is never called for a descriptor that was unwatched earlier in the same turn, and a descriptor
   closed through `discard` is closed only at the end of the turn, so its number cannot mean another socket
   within it. An event that waits for the payer's next turn is forgotten when the descriptor is unwatched or changed.
-- A turn calls the relay's own handlers first. It begins no further handler or timer after `QUANTUM`, so it lasts that
-  long and the time of one handler. Handlers with much to do stop when the quantum is `over` and call `later`.
+- A turn calls the relay's own handlers first. It begins no further handler or timer after `QUANTUM`, except for one
+  costly payer, so it lasts that long and the time of two handlers, of which one is not costly. Handlers with much to do
+  stop when the quantum is `over` and call `later`.
 - A handler that raises is a defect; the exception ends the process and the supervisor starts another.
 """
 
@@ -51,6 +53,7 @@ QUANTUM = RELAY_TURN.bounds.host * 1000
 
 _DIRECT = 64  # descriptors of a payer in the loop's epoll: those in one of its own cost 0.7 µs more each time
 _PAYERS = 512  # payers beyond which those that have nothing are forgotten
+_COSTLY = 3 * QUANTUM  # payers whose handlers stop when the quantum is over use less in one go
 _LITTLE = 1e-4  # seconds that nobody is charged for when nobody else has anything to do
 
 # Python takes memory for so many each time: for more of them not from where that is quick
@@ -78,6 +81,7 @@ class _Payer:
     """One class of the quota: what is ready, what waits for its next turn, and the processor time that it has used."""
 
     __slots__ = (
+        "costly",
         "crowd",
         "crowd_ready",
         "direct",
@@ -94,7 +98,7 @@ class _Payer:
         self.spent = spent
         self.watched = self.direct = 0
         self.crowd: select.epoll | None = None  # of its descriptors beyond `_DIRECT`
-        self.crowd_ready = False
+        self.crowd_ready = self.costly = False
         self.events: dict[int, int] = {}  # that are ready, in order
         self.later: deque[Callable[[], None]] = deque()
         self.later_first = False
@@ -259,7 +263,9 @@ class Loop:
         handler(events)
         took = self.clock() - began
         if took > _LITTLE and payer is not None:
-            payer.spent = max(payer.spent, self._floor - QUANTUM) + int(took * 1e9)
+            used = int(took * 1e9)
+            payer.spent = max(payer.spent, self._floor - QUANTUM) + used
+            payer.costly = used > _COSTLY
             self._floor = max(self._floor, payer.spent)
 
     def _serve_many(self, found: list[tuple[int, int]]) -> None:
@@ -291,10 +297,14 @@ class Loop:
             payer.spent = max(payer.spent, self._floor - QUANTUM)
         in_order = sorted(ready, key=_spent)
         least = in_order[0].spent
+        costly = next((payer for payer in in_order if payer.costly), None)
         for payer in in_order:
-            if payer.spent - least > QUANTUM or self._since - began >= QUANTUM:
+            if self._since - began >= QUANTUM or (costly is None and payer.spent - least > QUANTUM):
                 break  # whoever has used more waits for those that may be ready again
-            self._serve(payer)
+            if not payer.costly:
+                self._serve(payer)
+        if costly is not None and costly.spent - least <= QUANTUM:
+            self._serve(costly)
         self._floor = max(self._floor, min(map(_spent, in_order)))
 
     def _serve(self, payer: _Payer) -> None:
@@ -313,6 +323,7 @@ class Loop:
             self._waiting[payer.name] = payer
         elif self._waiting:
             self._waiting.pop(payer.name, None)
+        payer.costly = self._since - began > _COSTLY
 
     def _call_later(self, payer: _Payer, began: int) -> None:
         for _ in range(len(payer.later)):

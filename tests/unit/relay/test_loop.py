@@ -181,6 +181,28 @@ def test_who_overdraws_waits_until_the_others_have_had_as_much(costs: Costs) -> 
     assert 38 <= costs.order.count("robot") <= 42
 
 
+def test_costly_messages_of_many_hosts_never_come_in_a_row(costs: Costs) -> None:
+    """A host that keeps to its quantum is served between any two of them, even one that has used more than each."""
+    for number in range(200):
+        costs.ready(f"10.9.0.{number}", 10 * QUANTUM)
+    costs.turns_until(lambda: len(costs.order) >= 200)
+    costs.ready("robot", QUANTUM)
+    costs.turns_until(lambda: "robot" in costs.order)
+    costs.order.clear()
+    costs.turns_until(lambda: len(costs.order) >= 300)
+    guests = "".join("r" if payer == "robot" else "g" for payer in costs.order)
+    assert "ggg" not in guests
+
+
+def test_hosts_within_their_quantum_do_not_starve_a_costly_one(costs: Costs) -> None:
+    """It has as much processor time as each of them."""
+    costs.ready("camera", 10 * QUANTUM)
+    for number in range(9):
+        costs.ready(f"10.9.0.{number}", QUANTUM)
+    costs.turns_until(lambda: costs.order.count("camera") >= 10)
+    assert 90 <= costs.order.count("10.9.0.0") <= 110
+
+
 def test_control_and_lifeline_are_served_in_every_turn(costs: Costs) -> None:
     """Whatever hosts have ready, the relay's own descriptors come first."""
     for number in range(100):
