@@ -55,6 +55,7 @@ class Engine:
         self._loop = loop
         self._limits = limits
         self._reporter = Reporter(limits)
+        self._table = StatedTable()
         self.middle = Middle(
             loop,
             self._reporter,
@@ -62,8 +63,8 @@ class Engine:
             publish=lambda published: self._publish(published.topic, published.data),
             changed=self._monitors_changed,
             holder=self._holder,
+            payer=self._table.payer,
         )
-        self._table = StatedTable()
         self.memory = Memory.of(limits, self._table.standing)
         self._context = RelayContext(
             loop, limits, self._reporter, self.memory, Scratch(), self.middle, self._table.payer

@@ -179,7 +179,8 @@ RELAY_HEADERS = Share(
 RELAY_TURN = Share(
     "microseconds of processor time in one turn of a relay's loop",
     Bounds(1000, 1000, 1000, 0),
-    "the host that has used most waits until the others that are ready have been served; a stranger here is a host"
+    "the host that has used most waits until the others that are ready have been served, and so does one whose last"
+    " message took longer than that, before its next; a stranger here is a host"
     " without a grant; hosts with grants that no rule names, or only `*`, count as one; a change of the policy counts"
     " from the next connection; new connections are accepted in a share of their own and charged to their host too; the"
     " relay's links to control and its supervisor come first",
@@ -187,6 +188,7 @@ RELAY_TURN = Share(
     (
         "unit/relay/test_loop.py::test_a_host_with_little_to_do_waits_for_one_quantum_of_others",
         "unit/relay/test_loop.py::test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one",
+        "unit/relay/test_loop.py::test_costly_messages_of_many_hosts_never_come_in_a_row",
         "unit/relay/test_loop.py::test_all_unknown_hosts_together_are_one_payer",
         "unit/relay/test_grants.py::test_hosts_that_only_everybody_names_pay_as_one",
     ),
@@ -209,11 +211,13 @@ RELAY_MESSAGE = Share(
     "microseconds of processor time that monitors take for one message, request or reply",
     Bounds(10_000, 10_000, 0, 0),
     "the message is cut off, which is a fault of the specification (`on_fault` decides whether it is dropped); for a"
-    " second after one, messages of that publication have a tenth; the messages behind it wait for their host's next"
+    " second after one, messages of that publication, or of all hosts that no rule but `*` names, have a tenth; the"
+    " messages behind it wait for their host's next"
     " turn",
     "`monitor fault`",
     (
         "unit/relay/monitors/test_middle.py::test_a_message_that_takes_longer_than_the_budget_is_a_fault",
+        "unit/relay/monitors/test_middle.py::test_hosts_that_the_policy_does_not_name_have_one_pace",
         "unit/relay/monitors/test_middle.py::test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn",
         "rosmop/tests/test_budget.py::test_every_walk_of_a_message_ends_with_its_time",
     ),

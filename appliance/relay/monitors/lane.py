@@ -65,6 +65,9 @@ class Monitors(Protocol):
     def over(self) -> bool:
         """Whether the publisher's quantum is used up."""
 
+    def pace(self, place: Place) -> Pace:
+        """Return the pace of messages from a place."""
+
     def keep(self, way: str) -> None:
         """Keep the state of those that judge messages on a topic."""
 
@@ -88,7 +91,6 @@ class Lane:
         self._counts: Counts | None = None
         self._defect: Walker | None = None
         self._source = middle.senders.number(place)
-        self._pace = Pace()
 
     def through(self, batch: Batch) -> Batch | None:
         """The frames that go on, as the monitors leave them; None when none does. Their state is kept before that."""
@@ -158,7 +160,7 @@ class Lane:
             walked = walker.walk(*given)
             alone = walked is not None and walked.paused and walked.position == passage.position
             if alone:
-                walked = walker.walk_one(*given, self._pace.fuel(passage.time, middle.budget))
+                walked = walker.walk_one(*given, middle.pace(self._place).fuel(passage.time, middle.budget))
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             self._failed(error, walker, passage.time)
             return False
@@ -175,7 +177,7 @@ class Lane:
             middle.look_again()
         if alone:
             if walked.paused:  # the engine would take much longer
-                self._pace.cut(passage.time)
+                middle.pace(self._place).cut(passage.time)
             return passage.position > begun
         return walked.paused or passage.position == passage.end
 
@@ -232,7 +234,7 @@ class Lane:
             body = view[first:following]
             before = bytes(body[:SHOWN]) if shows else b""
             sighting = Sighting(passage, position, bytes(body[:head]))
-            monitors.hurry(self._pace.part(now))
+            monitors.hurry(middle.pace(place).part(now))
             try:
                 outcome = process(topic, body, now, sighting.sender(self._source))
             except Exception as error:  # noqa: BLE001  a defect of the monitors must not end the relay
@@ -255,7 +257,7 @@ class Lane:
             position = following
             looked += 1
             if outcome.faults and monitors.late:
-                self._pace.cut(now)
+                middle.pace(place).cut(now)
             if middle.over():
                 break
         passage.position = position

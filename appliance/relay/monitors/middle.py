@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from rosmop.run.outcomes import Outcome
 
 _AFTER_DEFECT = 1.0
-_UNHURRIED = Pace()
 _NO_MEMORY = "the relay process before this one ended, and nothing keeps the state of monitors"
 
 
@@ -66,7 +65,8 @@ class Middle:
 
     `budget` is how many seconds of processor time a message may take. `publish(published)` sends what a monitor
     publishes; `changed(topics)` is called when other topics may be wanted, with those whose messages may fare otherwise
-    now (None: all). `holder(host)` is charged for the slices that messages of this host make.
+    now (None: all). `holder(host)` is charged for the slices that messages of this host make, `payer(host)` for their
+    processor time.
     """
 
     def __init__(
@@ -78,6 +78,7 @@ class Middle:
         publish: Callable[[Published], None],
         changed: Callable[[frozenset[str] | None], None],
         holder: Callable[[str], str] = str,
+        payer: Callable[[str], str] = str,
     ) -> None:
         self._loop = loop
         self.budget = budget
@@ -91,7 +92,7 @@ class Middle:
         self._awaited: SpecificationsStated | None = None
         self.sight = object()
         self._paces: dict[Place, Pace] = {}
-        """Of the senders of requests and replies in the last two seconds."""
+        """Of places whose messages were cut off in the last two seconds, and others."""
         self._prepared: dict[tuple[Place, str], Prepared] = {}
         """For the walks of requests and replies until there is another `sight`: at most a second."""
         self._timer: Timer | None = None
@@ -100,6 +101,8 @@ class Middle:
         self.observations = Observations(loop, reporter, self._rows)
         self._changed = changed
         self._holder = holder
+        self._payer = payer
+        self._shared_pace = Pace()
         self.senders = Senders()
         self._margins = Margins()
         self._publish = publish
@@ -303,6 +306,14 @@ class Middle:
         """Where the messages of this publication go through."""
         return Lane(self, place)
 
+    def pace(self, place: Place) -> Pace:
+        """Return the pace of messages from a place; hosts that pay as one have one."""
+        if self._payer(place.host) != place.host:
+            return self._shared_pace
+        if place not in self._paces:
+            self._paces[place] = Pace()
+        return self._paces[place]
+
     def look_again(self) -> None:
         """Something has happened that may change what lanes have prepared, and what is prepared here."""
         self.sight = object()
@@ -353,7 +364,7 @@ class Middle:
         outcome = self._walked(self.monitors, place, way_of(service, part), body, now)
         if outcome is None:
             self.look_again()
-            pace = self._paces.setdefault(place, Pace())
+            pace = self.pace(place)
             self.monitors.hurry(pace.part(now))
             try:
                 outcome = self.monitors.process_service(
@@ -395,7 +406,7 @@ class Middle:
             return prepared
 
         try:
-            fuel = self._paces.get(place, _UNHURRIED).fuel(now, self.budget)
+            fuel = self.pace(place).fuel(now, self.budget)
             outcome = monitors.taken(way, body, now, prepare, fuel)
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             observer.defect(error, place, now)

@@ -1,7 +1,8 @@
 """How much processor time the next message of a publication, or of a service's client, may take.
 
 A message that takes all of the budget is cut off, and whoever sends one may send more. So for a second after it the
-next ones have a tenth. Messages that are cut off within that second do not prolong it.
+next ones have a tenth. Messages that are cut off within that second do not prolong it. Hosts that the policy does not
+name have one pace together, as many addresses could each send such a message.
 """
 
 from rosmop.runtime.context import FUEL_PER_SECOND

@@ -387,6 +387,19 @@ def test_a_message_that_takes_longer_than_the_budget_is_a_fault(world: Monitored
     assert fault.detail["file"] == "0.rv"
 
 
+def test_hosts_that_the_policy_does_not_name_have_one_pace(world: Monitored) -> None:
+    """One that sent a message that took all of its time slows down the messages of all of them, and no others."""
+    middle = world.engine.middle
+    for key, host, named in (("a", "10.9.0.1", False), ("b", "10.9.0.2", False), ("c", "10.0.0.1", True)):
+        world.state(NodePlaced(key, "/node", host), world.listen())
+        world.state(PublicationPlaced(key, "/t", "*", named=named))
+    one, other, robot = (Place("k", "/t", host) for host in ("10.9.0.1", "10.9.0.2", "10.0.0.1"))
+    middle.pace(one).cut(1)
+    assert [middle.pace(place).part(2) for place in (one, other, robot)] == [0.1, 0.1, 1]
+    middle.pace(robot).cut(1)
+    assert [middle.pace(place).part(2) for place in (robot, robot._replace(resource="/u"))] == [0.1, 1]
+
+
 def test_what_is_left_of_a_read_outlives_other_specifications_and_comes_in_order(world: Monitored) -> None:
     """Messages that wait for their turn are judged by what is in force then; none is lost or overtaken."""
     world.load(COSTLY)
