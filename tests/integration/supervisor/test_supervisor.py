@@ -247,8 +247,8 @@ def test_a_clean_end_leaves_nothing(start: Any, state: Path) -> None:
     assert running.process.stop(with_signal=signal.SIGTERM) == 0
     assert time.monotonic() - began < allowed(5)
     assert running.children() == []
-    left = sorted(path.name for path in state.iterdir())
-    assert left == ["compiler", "control", "ipsec", "lock", "relay", "rosmaster", "rosout", "run", "signer"]
+    parts = {"compiler", "control", "ipsec", "monitors", "relay", "rosmaster", "rosout", "run", "signer"}
+    assert {path.name for path in state.iterdir()} == {"lock", *parts}
     assert running.process.seen(event="process did not end") == []
 
 
@@ -382,11 +382,12 @@ def test_each_part_of_the_state_is_its_owners_only(common: Running) -> None:
 
 
 def test_a_child_has_only_the_files_it_was_given(common: Running) -> None:
-    """No descriptor of the supervisor (lock, kept sockets, other lifelines) leaks into a child."""
-    supervisors, relays = (_open_files(pid) for pid in (common.process.pid, common.living("relay")))
-    assert [
-        one for one in supervisors & relays if one.startswith(("socket:", "/")) and one != "/dev/null"
-    ] == []
+    """A relay shares one file with the supervisor: the state of its monitors, which no other role has open."""
+    memory = [str(path) for path in (common.state / "monitors").glob("*/relay-0")]
+    supervisors = _open_files(common.process.pid)
+    relays = supervisors & _open_files(common.living("relay")) - {"/dev/null"}
+    assert [one for one in relays if one.startswith(("socket:", "/"))] == memory
+    assert [role for role in ALL if set(memory) & _open_files(common.living(role))] == ["relay"]
 
 
 def test_the_hidden_master_listens_on_loopback_only(common: Running) -> None:
