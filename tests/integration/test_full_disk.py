@@ -28,6 +28,7 @@ ORDERS: tuple[admin.AdminRequest[Any], ...] = (
     admin.MonitorRollback(0),
     admin.MonitorConfirm(),
     admin.MonitorSwitch(["silent"], False),
+    admin.MonitorShadow(["silent"], True),
     admin.MonitorTrial(["silent"], True),
     admin.MonitorResume(["silent"]),
     admin.TokenAdd("late", "viewer", 3600.0),
