@@ -63,6 +63,12 @@ class AuditTrail:
         """Why this host must wait before more is recorded of it; empty when it need not."""
         return self._log.budget.owing(host)
 
+    async def still_owing(self, host: str) -> str:
+        """The same after the log has caught up: a record that turns out to be a repetition is not owed for."""
+        if self.owing(host):
+            await self._log.wait_durable()
+        return self.owing(host)
+
     def pause(self, host: str) -> float:
         """For how many seconds this host's calls wait for that, then to be asked again; 0 when they need not."""
         return self._log.budget.pause(host)

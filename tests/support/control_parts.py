@@ -68,6 +68,10 @@ class Records:
         """As `AuditTrail`."""
         return self.debt
 
+    async def still_owing(self, host: str) -> str:
+        """As `AuditTrail`."""
+        return self.owing(host)
+
     def decided(
         self, _caller: Any, _method: str, _category: str, resource: str, decision: Decision, **_more: str
     ) -> str:

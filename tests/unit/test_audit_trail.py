@@ -114,3 +114,29 @@ def test_the_record_of_a_drop_says_which_recording_has_it() -> None:
     assert (len(drop["recording"]), drop["charged_to"]) == (20, "10.0.0.9")
     assert change == {}
     assert alarm["charged_to"] == "10.0.0.7"
+
+
+def test_records_that_the_log_has_yet_to_count_are_not_owed() -> None:
+    """A host that asks faster than the log counts repetitions owes for none of them once the log has caught up."""
+
+    class Behind(Log):
+        async def wait_durable(self) -> str | None:
+            for record in self.records:
+                self.budget.folded(record)
+            self.records.clear()
+            return None
+
+    log = Behind()
+    one = trail(log, deny=True)
+    while not one.owing(GUEST):
+        one.happened("malformed", "x" * 100_000, decision="deny", host=GUEST)
+    assert asyncio.run(one.still_owing(GUEST)) == ""
+
+
+def test_records_that_are_written_are_owed() -> None:
+    """A host that owes for what is on the disk owes for it after the log has caught up, too."""
+    log = Log()
+    one = trail(log, deny=True)
+    while not one.owing(GUEST):
+        one.happened("malformed", "x" * 100_000, decision="deny", host=GUEST)
+    assert "bytes of audit records" in asyncio.run(one.still_owing(GUEST))

@@ -51,7 +51,7 @@ class Multicall:
         room = self.parameters.mirror.bytes_limit
         before: _UnderWay | None = None
         async with asyncio.TaskGroup() as group:
-            while left and not (why := self._why_no_more(visit, room)):
+            while left and not (why := await self._why_no_more(visit, room)):
                 answers: list[Value] = []
                 run = await self._run(visit, left, room) if _in_run(visit, left[0]) else None
                 if before is not None and (run is None or not run.goes_beside(before.run)):
@@ -77,11 +77,11 @@ class Multicall:
             return results + [self._fault(visit, LIMIT_FAULT, "limit exceeded", why)] * len(left)
         return results
 
-    def _why_no_more(self, visit: Visit, room: int) -> str:
+    async def _why_no_more(self, visit: Visit, room: int) -> str:
         """Why no more parts are carried out; empty when they are."""
         if room <= 0:
             return f"the answers to a multicall have more than {self.parameters.mirror.bytes_limit} bytes"
-        return self.trail.owing(visit.caller.peer.text)
+        return await self.trail.still_owing(visit.caller.peer.text)
 
     async def _run(self, visit: Visit, left: "_Parts", room: int) -> "_Run":
         """The next parts, which are taken from those that are left, as they were understood."""

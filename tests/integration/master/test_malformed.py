@@ -1,5 +1,6 @@
 """HTTP and XML that are none, on RVMaster's port and on a node's face: refused, recorded, noticed by nobody."""
 
+import re
 import zlib
 
 import pytest
@@ -127,6 +128,7 @@ def test_a_multicall_of_cheap_calls(field: Field) -> None:
             piece = sock.recv(1 << 20)
             assert piece
             received += piece
+    assert re.findall(rb"[^>]*parts are not carried out", received)[:1] == []
     assert received.count(b"<i4>1</i4>") + received.count(b"<int>1</int>") >= count
 
 

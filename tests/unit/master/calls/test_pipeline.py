@@ -70,6 +70,10 @@ class Records:
         """As `AuditTrail`."""
         return self.debt
 
+    async def still_owing(self, _host: str) -> str:
+        """As `AuditTrail`."""
+        return self.debt
+
     def decided(
         self, _caller: Any, method: str, _category: str, resource: str, decision: Decision, **about: Any
     ) -> str:
