@@ -707,7 +707,10 @@ def test_a_service_that_is_busy_lets_its_client_wait_as_in_plain_ros(world: Worl
 @pytest.mark.parametrize("seed", range(20))
 def test_a_call_reaches_its_server_whatever_overtakes_what(seed: int) -> None:
     """Service, grant and a restatement come before, between and after the client's connection, header and request."""
-    world, order = World(replace(LIMITS, grant_seconds=30.0)), random.Random(seed)  # noqa: S311 - an order, no secret
+    patient = replace(
+        LIMITS, grant_seconds=30.0, header_seconds=30.0, connect_seconds=30.0, service_seconds=30.0
+    )  # no time that passes between two steps, however long, ends the connection
+    world, order = World(patient), random.Random(seed)  # noqa: S311 - an order, no secret
     peer = Peer(socket.create_connection(world.port.getsockname()))
     world.open.append(peer.sock)
     stated: list[Message] = []
