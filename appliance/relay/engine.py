@@ -238,6 +238,7 @@ class Engine:
             make_room=lambda size: self._make_room(host, size),
             refused=self._reporter.send,
             recorded=self._recorded,
+            over=self._loop.over,
         )
         publisher: Publisher | OwnPublisher
         if node is not None and node.monitors:

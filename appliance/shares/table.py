@@ -190,6 +190,7 @@ RELAY_TURN = Share(
         "unit/relay/test_loop.py::test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one",
         "unit/relay/test_loop.py::test_costly_messages_of_many_hosts_never_come_in_a_row",
         "unit/relay/test_loop.py::test_all_unknown_hosts_together_are_one_payer",
+        "unit/relay/test_engine.py::test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time",
         "unit/relay/test_grants.py::test_hosts_that_only_everybody_names_pay_as_one",
     ),
 )

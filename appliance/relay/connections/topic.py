@@ -39,6 +39,7 @@ from appliance.relay.connections.headers import to_subscriber
 from appliance.relay.connections.memory import HostShare
 from appliance.relay.recorder_ring import LeftOut
 
+_ROW = 16  # subscribers between two readings of the processor time
 _SEEN_OF_A_HOST = 16  # subscribers that a publisher may see by name: each is a connection to it more
 
 
@@ -115,7 +116,8 @@ class RelayedTopic:
 
     `fresh`: the publisher has just appeared. `limited(part, messages, size)` hears what limits
     dropped; `flow` is where they are set. `make_room(size)` tries to have others give up so much of
-    theirs, `refused(message)` is called when a latched message is not kept.
+    theirs, `refused(message)` is called when a latched message is not kept. `over()`: the publisher's quantum is
+    used up; subscribers that have not got a batch by then get it at its next turn, before anything else is read.
     """
 
     def __init__(
@@ -133,6 +135,7 @@ class RelayedTopic:
         make_room: Callable[[int], None],
         refused: Callable[[LatchRefused], None],
         recorded: Recorder | None,
+        over: Callable[[], bool] = lambda: False,
     ) -> None:
         self.key = key
         self.topic = topic
@@ -146,6 +149,8 @@ class RelayedTopic:
         self._make_room = make_room
         self._refused = refused
         self._recorder = recorded
+        self.over = over
+        self._waits: tuple[Batch, tuple[Member, ...]] | None = None  # a batch, and who has yet to get it
         self._recording: Stream | LeftOut | None = None
         self._unkept: LatchRefused | None = None
         self._fresh_until = clock() + (APPEARED if fresh else -1)
@@ -259,6 +264,7 @@ class RelayedTopic:
     def upstream_closed(self) -> None:
         """The connection to the publisher is gone; its subscribers stay (see above)."""
         self._end_recording()
+        self.hand_out(divided=False)
         self._latch(None)
         self.flow.forget()
         self._withheld = False
@@ -315,14 +321,14 @@ class RelayedTopic:
             recording.write(head.view, head.messages, head.first, judged)
         return rest
 
-    def _admit(self, batch: Batch, since: float) -> Batch | None:
+    def _admit(self, batch: Batch, since: float, *, divided: bool = True) -> Batch | None:
         """Give a batch to monitors and subscribers; returns what monitors had no time for."""
         left = batch if self.through is None else self.through(batch)
         rest = batch.tail(batch.left) if batch.left else None
         if left is None:
             self._withheld = True
         else:
-            self._pass_on(left)
+            self._pass_on(left, divided=divided)
             if self._served:
                 self._delays.add(self._clock() - since, left.messages)
         return rest
@@ -335,9 +341,9 @@ class RelayedTopic:
         if self._recording is not None:
             self._recording.write(batch.view, batch.messages, self._next)
         self._next += batch.messages
-        self._pass_on(batch)
+        self._pass_on(batch, divided=False)
 
-    def _pass_on(self, batch: Batch) -> None:
+    def _pass_on(self, batch: Batch, *, divided: bool) -> None:
         for look in self._looks:
             look(batch)
         if self._latching:
@@ -346,10 +352,29 @@ class RelayedTopic:
             now = self._clock()
             if self._first_words.over(now) or not self._first_words.add(batch, now):
                 self._forget_first_words()
+        self.hand_out(divided=False)  # the batch before
+        self._waits = batch, self._each()
+        self.hand_out(divided=divided)
+
+    @property
+    def undelivered(self) -> int:
+        """The bytes of a batch that some subscribers get at the publisher's next turn (`hand_out`)."""
+        return 0 if self._waits is None else len(self._waits[0].view)
+
+    def hand_out(self, *, divided: bool = True) -> None:
+        """Give subscribers the batch that waits for them, for a quantum if the work may be `divided`."""
+        if self._waits is None:
+            return
+        (batch, members), self._waits = self._waits, None
         congested = False
-        for member in self._each():
-            self._dropped += member.deliver(batch)
-            congested = congested or member.behind_since is not None
+        for number, member in enumerate(members):
+            if divided and number and not number % _ROW and self.over():
+                kept = Batch(batch.keep(), batch.messages, batch.last, owned=True, stride=batch.stride)
+                self._waits = kept, members[number:]
+                break
+            if member in self._served:
+                self._dropped += member.deliver(batch)
+                congested = congested or member.behind_since is not None
         if congested:
             self._pause_or_trim()
 
@@ -374,7 +399,7 @@ class RelayedTopic:
         now = self._clock()
         waiting = self.flow.later(now)
         if waiting is not None:
-            self._admit(waiting, now)
+            self._admit(waiting, now, divided=False)
         if self._first_words is not None and self._first_words.over(now):
             self._forget_first_words()
         for member in self._each():

@@ -276,7 +276,7 @@ class Publisher:
             return
         if batch is not None:
             rest = self._topic.received(batch, since)
-            if rest is not None or self._receiver.more:
+            if rest is not None or self._receiver.more or self._topic.undelivered:
                 self._since = since
                 self._continue(rest)
 
@@ -285,7 +285,8 @@ class Publisher:
         sock = self._socket
         while sock is not None and self._socket is sock:
             receiver = self._receiver
-            if rest is not None or (receiver.more and (self._pause is not None or self._loop.over())):
+            over = receiver.more and (self._pause is not None or self._loop.over())
+            if rest is not None or over or self._topic.undelivered:
                 self._leave(rest)
                 return
             if not receiver.more:
@@ -301,7 +302,7 @@ class Publisher:
     def _leave(self, rest: Batch | None) -> None:
         """Leave this, and what else has come, for the publisher's next turn."""
         self._rest = rest
-        self._rest_weight.set(0 if rest is None else len(rest.view))
+        self._rest_weight.set(self._topic.undelivered + (0 if rest is None else len(rest.view)))
         self._receiver.set_aside()
         if not self._left and self._socket is not None:
             self._left = True
@@ -317,6 +318,10 @@ class Publisher:
         """It is the publisher's turn again."""
         self._scheduled = False
         if not self._left or self._pause is not None:
+            return
+        self._topic.hand_out()
+        if self._topic.undelivered or self._pause is not None:
+            self._leave(self._rest)
             return
         rest, self._rest = self._rest, None
         self._rest_weight.set(0)

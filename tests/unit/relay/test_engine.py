@@ -817,6 +817,42 @@ def test_a_client_that_never_reads_gets_no_second_request_through(world: World) 
     world.gets(service, encode_frame(b"2"))
 
 
+def test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Some subscribers get a message in the publisher's next turns; each gets all messages in order, and none twice."""
+    world = World(replace(LIMITS, connections=400, connections_per_host=100))
+    publisher, first = world.subscribed()
+    others = [world.connect(encode_header(ASK)) for _ in range(39)]
+    for subscriber in others:
+        world.gets_header(subscriber)
+    topic, _ = world.engine.topics["k", "/chatter"]
+    monkeypatch.setattr(topic, "over", lambda: True)
+    messages = [encode_frame(f"{number}".encode() * 9) for number in range(5)]
+    held = world.held
+    publisher.send(messages[0])
+    world.until(lambda: topic.undelivered)
+    for subscriber in others:
+        subscriber.read()
+    assert sum(bool(subscriber.data) for subscriber in (first, *others)) <= 17
+    assert world.held == held + topic.undelivered
+    publisher.send(b"".join(messages[1:]))
+    left = [others.pop(), others.pop(0)]
+    for subscriber in left:
+        subscriber.reset()
+    late = world.connect(encode_header(ASK))
+    for subscriber in (first, *others):
+        world.gets(subscriber, b"".join(messages))
+    world.gets_header(late)
+    late.read()
+    late.data.clear()  # what was read after it came
+    assert (topic.undelivered, world.held) == (0, held)
+    publisher.send(messages[0])
+    for subscriber in (first, *others, late):
+        world.gets(subscriber, messages[0])
+    world.close()
+
+
 def test_subscribers_of_a_topic_that_is_gone_are_cut_a_quantum_at_a_time(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
