@@ -55,8 +55,10 @@ async def served(state: Path) -> AsyncIterator[Slow]:
     listening.bind(str(state / ADMIN_SOCKET))
     listening.listen()
     server = await AdminServer(administration).start(listening)
-    yield slow
-    server.close()
+    try:
+        yield slow
+    finally:
+        server.close()
 
 
 async def test_what_is_not_answered_in_time_is_withdrawn(
@@ -84,7 +86,9 @@ async def test_a_tool_without_an_answer_says_how_to_find_out(
     """Where control does not even answer what became of the order, the tool names the command that finds out."""
     monkeypatch.setattr(admin_socket, "_GRACE_SECONDS", 0.05)
     wanted = pytest.raises(NotRunningError, match=r"may have taken effect; .* rosrv audit search --since 5m")
-    async with served(tmp_path):
+    async with served(tmp_path) as slow:
+        # An order that has not begun is answered when it is withdrawn.
+        monkeypatch.setattr(socket.socket, "shutdown", _once(slow.begun, socket.socket.shutdown))
         with wanted:
             await asyncio.to_thread(AdminSocket(tmp_path, 0.05).ask, PolicyConfirm())
 
@@ -105,6 +109,17 @@ async def test_the_order_of_a_killed_tool_is_withdrawn(tmp_path: Path) -> None:
         answer: AdminAnswer[PolicyConfirmed] = decode(await reader.readline(), PolicyConfirm())
         assert (answer.ok, slow.done) == (True, 1)
         writer.close()
+
+
+def _once(event: asyncio.Event, method: Any) -> Any:
+    """Return the method, for other threads: it waits for the event first."""
+    loop = asyncio.get_running_loop()
+
+    def later(*arguments: Any) -> Any:
+        asyncio.run_coroutine_threadsafe(event.wait(), loop).result(30)
+        return method(*arguments)
+
+    return later
 
 
 def _then(method: Any, after: Any) -> Any:
