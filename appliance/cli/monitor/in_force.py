@@ -126,7 +126,7 @@ def enable(
             "--shadow", help="Shadow mode: change and drop nothing, record what they would have done"
         ),
     ] = False,
-    trial: Annotated[bool, typer.Option("--trial", hidden=True)] = False,
+    trial: Annotated[bool, typer.Option("--trial", hidden=True, help="The former name of --shadow.")] = False,
 ) -> None:
     """Enable monitors. With --shadow they only record what they would have done.
 

@@ -266,7 +266,7 @@ def test_nothing_is_waited_for_that_nobody_asks() -> None:
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Events that wait are bounded in number; beyond that is a fault, and the run goes on."""
-    monkeypatch.setattr(bounded, "MOST_OPEN", 100)
+    monkeypatch.setattr(bounded.BoundedProperty, "most", 100)
     run = compiled("mtl", "a => eventually[0,1s] b").start(0)
     for time in range(100):
         assert run.step(0, time) == ()

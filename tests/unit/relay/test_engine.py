@@ -67,7 +67,10 @@ def test_a_subscriber_gets_the_publishers_header_and_messages(world: World) -> N
     assert opened == ConnectionOpened(opened.number, "k", "/chatter", "topic", LOOPBACK, "/listener")
     publisher.send(encode_frame(b"one") + encode_frame(b"two"))
     world.gets(subscriber, encode_frame(b"one") + encode_frame(b"two"))
-    rows = world.hears(TrafficReported).rows
+    reports = (
+        world.hears(TrafficReported).rows for _ in range(100)
+    )  # the first may be from before the messages
+    rows = next(filter(None, reports))
     assert [(row.resource, row.messages, row.bytes, row.subscribers) for row in rows] == [
         ("/chatter", 2, 14, 1)
     ]
