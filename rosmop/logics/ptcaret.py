@@ -7,7 +7,8 @@ into: from the event ``begin`` to the ``end`` that belongs to it, both included,
 - ``@b x``: ``x`` held at the ``begin`` of the innermost open call; ``@c x``: at the event before it;
 - ``x Ss@b y``: ``y`` held at the ``begin`` of an open call, and ``x`` at those since; ``…s@c``, ``…s@bc`` as below;
 - ``<*s@b> x``, ``[*s@b] x``: at some, at every ``begin`` of an open call; ``…s@c``: at the event before it; ``…s@bc``:
-  at an event ``begin`` or ``call`` that is not within a call that has returned.
+  at an event ``begin`` or ``call`` that is not within a call that has returned. ``[*s@c] x`` is ``!<*s@c> !x``: a
+  ``begin`` that is the first event has no event before it, and violates nothing.
 
 An ``end`` to which no ``begin`` belongs begins the abstract past anew. Calls that are open are remembered, up to a
 bound beyond which a ``begin`` is a fault of the specification. (Rosu, Chen and Ball, 2008.)
@@ -126,7 +127,7 @@ def plain(formula: Formula) -> Formula:
         return Formula(formula.operator, operands, formula.name, formula.bounds, formula.offset)
     inner = operands[0]
     if where in ("c", "call"):
-        inner = Formula("previously", (inner,))
+        inner = Formula("dual previously" if operator == "every" else "previously", (inner,))
     there = Formula("event", name=BEGIN)
     if where == "bc":
         there = Formula("or", (there, Formula("event", name=CALL)))

@@ -9,7 +9,7 @@ from rosmop.logics.formula import NOT, Level, Syntax, boolean_levels, read_formu
 from rosmop.logics.interface import CompiledProperty, Source
 from rosmop.logics.past import compile_past
 
-_FUTURE = "is about the future; write `ltl:` for `ptltl:`, or a past operator: (*) <*> [*] S"
+_FUTURE = "is about the future; write `ltl:` as the logic, or a past operator: (*) <*> [*] S"
 
 SYNTAX = Syntax(
     unary={
@@ -22,7 +22,7 @@ SYNTAX = Syntax(
     levels=boolean_levels([Level({"S": "since", "~S": "dual since"}, "left")]),
     refused={
         **dict.fromkeys(("[]", "<>", "o", "~o", "U", "~U", "R"), _FUTURE),
-        "~": "has no meaning in ptltl; write `!` for a negation",
+        "~": "has no meaning here; write `!` for a negation",
     },
 )
 

@@ -111,7 +111,7 @@ DERIVED: list[tuple[str, Tree]] = [
     ("@b (*) a", ("ab since", ("not", BEGIN), ("and", BEGIN, X))),
     ("@c a", ("ab since", ("not", BEGIN), ("and", BEGIN, ("previously", A)))),
     ("<*s@b> (*) a", ("ab once", ("and", BEGIN, X))),
-    ("[*s@c] a", ("ab historically", ("implies", BEGIN, ("previously", A)))),
+    ("[*s@c] a", ("not", ("ab once", ("and", BEGIN, ("previously", ("not", A)))))),
     ("<*s@bc> (*) a", ("ab once", ("and", ("or", BEGIN, CALL), X))),
     ("call Ss@b (*) a", ("ab since", ("implies", BEGIN, CALL), ("and", BEGIN, X))),
     ("(*) a Ss@c a", ("ab since", ("implies", CALL, X), ("and", BEGIN, X))),
