@@ -1,12 +1,14 @@
 """A file that a person names is a regular one, read under a bound; what it cannot be is said in words."""
 
+import logging
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import structlog
 
 from appliance.cli import main
 from appliance.cli.rest.session import _context
@@ -68,6 +70,19 @@ KINDS: dict[str, Callable[[Path], object]] = {
 }
 
 
+@pytest.fixture
+def logs() -> Iterator[None]:
+    """Log as before, after a verb (`up`) that has set up the logs of its process."""
+    root = logging.getLogger()
+    handlers, level = [*root.handlers], root.level
+    yield
+    structlog.reset_defaults()
+    structlog.contextvars.clear_contextvars()
+    root.handlers[:] = handlers
+    root.setLevel(level)
+
+
+@pytest.mark.usefixtures("logs")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("verb", VERBS)
 def test_no_file_makes_a_verb_hang_or_crash(
