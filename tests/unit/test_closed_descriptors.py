@@ -1,9 +1,8 @@
 """The number of a descriptor that was closed is not kept: another file gets it next."""
 
 import ast
-from pathlib import Path
 
-APPLIANCE = Path(__file__).parents[2] / "appliance"
+from tests.support.sources import ROOT, product_files
 
 
 def kept_after_closing(source: str) -> list[int]:
@@ -34,8 +33,8 @@ def kept_after_closing(source: str) -> list[int]:
 def test_no_object_keeps_the_number_of_a_closed_descriptor() -> None:
     """A function that closes an attribute sets it to -1 or None: a later use fails, and reaches no other file."""
     found = [
-        f"{path.relative_to(APPLIANCE)}:{line}"
-        for path in sorted(APPLIANCE.rglob("*.py"))
+        f"{path.relative_to(ROOT)}:{line}"
+        for path in product_files()
         for line in kept_after_closing(path.read_text(encoding="utf-8"))
     ]
     assert found == []

@@ -1,9 +1,9 @@
 """No text that comes from outside is ever made into code of Python."""
 
 import ast
-from pathlib import Path
 
-APPLIANCE = Path(__file__).parents[2] / "appliance"
+from tests.support.sources import ROOT, product_files
+
 MAKE_CODE = {"eval", "exec", "compile", "__import__"}
 
 
@@ -19,8 +19,8 @@ def made_of_text(source: str) -> list[int]:
 def test_nothing_makes_code_of_text() -> None:
     """Specifications are interpreted, or become WebAssembly; policies and formulas are data."""
     found = [
-        f"{path.relative_to(APPLIANCE)}:{line}"
-        for path in sorted(APPLIANCE.rglob("*.py"))
+        f"{path.relative_to(ROOT)}:{line}"
+        for path in product_files()
         for line in made_of_text(path.read_text(encoding="utf-8"))
     ]
     assert found == []

@@ -3,9 +3,7 @@
 import ast
 from collections.abc import Iterator
 
-from tests.support.outside import TESTS
-
-SOURCES = TESTS.parent / "appliance"
+from tests.support.sources import ROOT, product_files
 
 
 def test_no_slot_can_stay_unfilled() -> None:
@@ -16,11 +14,11 @@ def test_no_slot_can_stay_unfilled() -> None:
     """
     begun: dict[object, set[str]] = {}
     filled: dict[str, set[object]] = {}
-    for path in SOURCES.rglob("*.py"):
+    for path in product_files():
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        begun[path.relative_to(SOURCES)] = set(slots(tree))
+        begun[path.relative_to(ROOT)] = set(slots(tree))
         for name in set_elsewhere(tree):
-            filled.setdefault(name, set()).add(path.relative_to(SOURCES))
+            filled.setdefault(name, set()).add(path.relative_to(ROOT))
     unfilled = [
         f"{path}: {name}, filled in {sorted(map(str, others))}"
         for path, names in begun.items()

@@ -3,7 +3,8 @@
 import ast
 from pathlib import Path
 
-REPOSITORY = Path(__file__).parents[2]
+from tests.support.sources import ROOT, product_files
+
 READERS = {
     "a moment that people are shown, or that stands in a file": [
         "api/history.py", "audit/ids.py", "audit/log.py", "audit_trail.py", "backup/create.py", "control/policies.py",
@@ -49,6 +50,5 @@ def _reads_wall_clock(path: Path) -> bool:
 
 def test_only_these_files_read_the_wall_clock() -> None:
     """What waits, expires or counts seconds elsewhere would believe a clock that was set."""
-    package = REPOSITORY / "appliance"
-    found = {str(path.relative_to(package)) for path in package.rglob("*.py") if _reads_wall_clock(path)}
-    assert found == {file for files in READERS.values() for file in files}
+    found = {str(path.relative_to(ROOT)) for path in product_files() if _reads_wall_clock(path)}
+    assert found == {f"appliance/{file}" for files in READERS.values() for file in files}

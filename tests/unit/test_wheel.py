@@ -59,16 +59,20 @@ def test_it_brings_what_is_not_code(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         names = {name.partition(".data/data/")[2] or name for name in archive.namelist()}
     tracked = subprocess.run(
-        ["git", "-c", f"safe.directory={ROOT}", "ls-files", "examples", "monitors", "policies", "docs", "appliance"],
+        [
+            "git", "-c", f"safe.directory={ROOT}", "ls-files", "examples", "monitors", "policies", "docs", "appliance",
+            "roswire", "rosmop", ":!rosmop/tests",
+        ],
         cwd=ROOT, capture_output=True, text=True, check=True,
     ).stdout.split()  # fmt: skip
-    places = {"appliance": "", "docs": "share/doc/rosrv/", "": "share/rosrv/"}
+    places = {"appliance": "", "roswire": "", "rosmop": "", "docs": "share/doc/rosrv/", "": "share/rosrv/"}
     expected = set()
     for path in tracked:
         top, _, rest = path.partition("/")
         place = places.get(top, places[""])
         expected.add(place + (rest if top == "docs" else path))
     assert expected - names == set()
+    assert not [name for name in names if name.startswith("rosmop/tests")]
 
 
 def test_no_compiler_is_told_from_a_wrong_source(tmp_path: Path) -> None:

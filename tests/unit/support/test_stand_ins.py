@@ -4,7 +4,7 @@ import ast
 import re
 from collections.abc import Iterator
 
-from tests.support.outside import TESTS
+from tests.support.sources import ROOT, files_of_tests
 
 # Names with an underscore that belong to a published interface.
 PUBLISHED = {
@@ -44,10 +44,10 @@ def test_the_rule_finds_what_it_forbids() -> None:
 
 def trees(words: str) -> Iterator[tuple[str, ast.Module]]:
     """Every file of the tests that has what is looked for in its text, by its name in tests/, and its syntax tree."""
-    for path in sorted(TESTS.rglob("*.py")):
+    for path in files_of_tests():
         text = path.read_text(encoding="utf-8")
         if re.search(words, text):
-            yield str(path.relative_to(TESTS)), ast.parse(text)
+            yield str(path.relative_to(ROOT)), ast.parse(text)
 
 
 def private(tree: ast.Module) -> Iterator[str]:
