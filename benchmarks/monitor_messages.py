@@ -2,9 +2,9 @@
 
 A message on a topic of no monitor; the reference specification of the design (reads two fields, writes one, steps
 one state machine); the same with ten monitors on other topics; a string that grows; a copy of the whole message;
-the reference in the module, many at once and alone; a state machine with a timeout; a handler, a line of output and a
-message that is published with each message; a string and the last ten numbers that are kept; and loading, with the
-module and without.
+the last ten numbers that are kept; a message that is published with each message; the reference in the module, many at
+once and alone; a state machine with a timeout; a handler and a line of output with each message; a string that is kept;
+and loading, with the module and without.
 Times are processor time, the median of the rounds, in microseconds for a message.
 """
 
@@ -100,8 +100,7 @@ def batched(messages: int, body: bytes, text: str = REFERENCE, topic: str = "/cm
     frame = struct.pack("<I", len(body)) + body
     view = area[: len(frame) * messages]
     view[:] = frame * messages
-    counted, published = [True] * len(walker.verdicts), [True] * len(walker.publishes)
-    prepared = walker.prepare(loud=False, told=(), counted=counted, published=published)
+    prepared = walker.prepare(loud=False, told=(), counted=[True] * len(walker.verdicts))
     times = MESSAGES // messages
     return microseconds(lambda: walker.walk(view, 0, 0, [], 1, prepared), times) / messages
 
@@ -140,11 +139,8 @@ def main() -> None:
     print(f"{'a tfsm, engine':32} {row:8.2f} µs")
     print(f"{'a tfsm, 64 together':32} {batched(64, COMMAND, WATCHED):8.3f} µs")
     print(f"{'a string is kept, 64 together':32} {batched(64, COMMAND, KEPT):8.3f} µs")
-    print(f"{'a window of ten, 64 together':32} {batched(64, COMMAND, WINDOW):8.3f} µs")
     print(f"{'a handler each, 64 together':32} {batched(64, COMMAND, HANDLED):8.3f} µs")
     print(f"{'a line each, 64 together':32} {batched(64, COMMAND, SAID):8.3f} µs")
-    print(f"{'published each, 64 together':32} {batched(64, COMMAND, PUBLISHED):8.3f} µs")
-    print(f"{'copied each, 64 together':32} {batched(64, COMMAND, WHOLE):8.3f} µs")
     scans = monitors(SCAN)
     loop = microseconds(lambda: scans.process("/scan", LASER, 1), MESSAGES // 20)
     print(f"{'a loop over 100 numbers, engine':32} {loop:8.2f} µs")

@@ -29,7 +29,6 @@ from rosmop.fast.abi import (
     LEFT,
     NOW,
     POSITION,
-    ROOM,
     SAID,
     SURE,
     TOLD,
@@ -86,10 +85,8 @@ class WrittenModule(FeedModule):
     """Where the budget of each specification stands, by its context."""
     strings: Mapping[bytes, int]
     """Where constant strings stand."""
-    rooms: Sequence[range]
-    """Where vectors stand that are kept or made."""
-    places: Sequence[range]
-    """What it uses for messages that it makes."""
+    references: Sequence[range]
+    """Where functions leave the values of their references."""
     handlers: Mapping[str, Sequence[int]]
     """The numbers of the functions of each topic's verdicts (`Feed.verdicts`)."""
     functions: int
@@ -147,11 +144,9 @@ def written(
         writer.throttles,
         writer.lines,
         writer.said,
-        writer.publications,
         writer.budgets,
         {raw: writer.constants[raw] for raw in writer.strings},
-        writer.rooms,
-        writer.places,
+        writer.references,
         {topic: [one.number for one in walks[topic].handlers()] for topic in feeds},
         len(writer.written),
     )
@@ -217,22 +212,17 @@ class WalkWriter:
             for number, event in enumerate(events)
         ]
         functions = [*self._written, *self.handlers()]
-        says = any(written.says for written in functions)
-        self._publishes = sorted({each for written in functions for each in written.publishes})
-        self._says = says or bool(self._publishes)
-        if says and stamped and any(written.early for written in functions):
+        self._says = any(written.says for written in functions)
+        if self._says and stamped and any(written.early for written in functions):
             raise NotScalarError("output about a message whose header is changed")
         self._budgets = sorted({writer.budget(writer.functions[event.function].context) for event in events})
         self._counters = writer.take(16 * len(events) + 8 * len(self.verdicts))
         assigned = sorted(
             {name for written in functions for name in written.assigned}.difference(cells.noted)
         )
-        self._settles = any(cells.texts_of(name) for name in assigned)
-        self._undo = tuple(
-            (address, cells.vectors[name] + 2 * ROOM if name in cells.vectors else writer.take(8))
-            for name in assigned
-            for address in cells.words(name)
-        )
+        addresses = [cells.variables[name][0] for name in assigned]
+        self._settles = not set(addresses).isdisjoint(cells.kept)
+        self._undo = tuple((address, writer.take(8)) for address in addresses)
         self._log = writer.take(16 * sum(written.writes for written in self._written))
         properties = {
             advance.property for event in events for advance in event.advances if advance.property is not None
@@ -272,7 +262,6 @@ class WalkWriter:
             [written.number for written in self._written],
             self._says,
             f"settle {self._cells.settle}" if self._settles else "",
-            self._publishes,
         )
 
     def handlers(self) -> list[Written]:
@@ -317,7 +306,6 @@ class WalkWriter:
 
     def code(self) -> bytes:
         """The function."""
-        self._heap = self._writer.heap() if self._writer.has_heap else 0
         here = _get(_AT) + b"\xad" + load(I32, EFFECT) + constant(I32, self._effects) + _SUB
         here += constant(I32, 4) + b"\x76\xad" + constant(I64, 32) + _SHL64 + _OR64
         if self.verdicts:
@@ -328,7 +316,6 @@ class WalkWriter:
             store(I64, NOW, _get(_NOW)),
             store(I32, EFFECT, constant(I32, self._effects)),
             store(I32, SAID, constant(I32, self._writer.said)) if self._says else b"",
-            store(I32, self._heap, constant(I32, self._heap + 8)) if self._heap else b"",
             _set(_TOLD, load(I64, self._cells.source + 8)),
             _set(_ENABLED, load(I64, self._cells.source + 16)),
             *(_set(local, load(I32, self._state(number))) for number, local in self._states.items()),
@@ -366,7 +353,6 @@ class WalkWriter:
         """Nothing has happened to the frame at hand: the runtime stops, if it does, at calls and where loops begin."""
         code = store(I32, POSITION, _get(_AT)) + store(I32, UNDO, constant(I32, self._log))
         code += store(I32, SURE, load(I32, SAID)) if self._says else b""
-        code += store(I32, self._heap + 4, load(I32, self._heap)) if self._heap else b""
         return code + b"".join(store(I64, kept, load(I64, address)) for address, kept in self._undo)
 
     def _frame(self) -> bytes:

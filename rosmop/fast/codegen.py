@@ -1,23 +1,19 @@
-"""A part of the form as WebAssembly: numbers, conditions, loops, what stands in the message, numbers put there, drops.
+"""A part of the form as WebAssembly: numbers, conditions, loops, reading the message, writing its numbers, drops.
 
-Strings of the message, its vectors and what messages are in it are looked at where they stand, if everything in them
-has a fixed size (`places.py`); strings are kept (`texts.py`), vectors of numbers and times are kept, made and changed
-(`vectors.py`); messages are made, published and kept (`records.py`), also with arrays of any length of numbers or
-times (`arrays.py`).
+Strings, vectors and messages in the message at hand are read in place, if everything in them has a fixed size
+(`codegen_access.py`); strings are kept (`strings_codegen.py`).
 
 `Writer` writes the functions of events and what they call; `feed.py` puts them behind the walk over a read.
 
 - An event, and the handler of a verdict, takes where the message is in the memory and its size (i32, i32), and returns
   bits (i32): `HAPPENED`, `DROPPED`, `CHANGED` (bytes are others), `ELSEWHERE`, `RESET`.
 - What is beyond this part and every fault is `ELSEWHERE`: this message is for Python's functions, and what was done to
-  it is taken back. Within what it calls it is a trap. Beyond are strings that are made or changed, vectors of anything
-  but numbers and times, of more than `ROOM` bytes, arrays of the message that become longer or shorter, messages by
-  reference, messages (and `MESSAGE`) with arrays of strings or messages, of more than `MOST_MADE` bytes or with what is
-  beyond, what is published with a string of more than `MOST_KEPT`, or first of its kind of a second, recursion, `sin`
-  and its like. An event of which no message can come past such a place has no module: `NotScalarError` names what is
-  beyond.
-- A line of output, and a message that is published, is noted behind those before, where `SAID` points, and the message
-  at hand stands at `POSITION` (`output.py`).
+  it is taken back. Within what it calls it is a trap. Beyond are strings that are made or changed; vectors and
+  messages that are made, kept, compared or changed, `MESSAGE` and whatever is published; messages by reference; output
+  that is the first of its kind in a second; recursion; `sin` and its like. An event of which no message can come past
+  such a place has no module: `NotScalarError` names what is beyond.
+- A line of output is noted behind those before, where `SAID` points, and the message at hand is at `POSITION`
+  (`deferred_output.py`).
 - Before a field is written, what stood there is noted in the log (address, size, bytes; 16 bytes each) that `UNDO`
   points behind.
 - What the form charges is taken from the budget of its specification, as everywhere.
@@ -29,19 +25,12 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any
 
-from rosmop.fast.abi import NOW, ROOM, UNDO, Cells
+from rosmop.fast.abi import NOW, POSITION, SAID, UNDO, Cells
 from rosmop.fast.arithmetic import to_floating
-from rosmop.fast.codegen_access import loaded
+from rosmop.fast.codegen_access import loaded, root_of
 from rosmop.fast.deferred_output import BYTES, HEAD, Line, is_text
-from rosmop.fast.layout import (
-    Layout,
-    NotScalarError,
-    is_signed,
-    machine_type,
-)
-from rosmop.fast.records import Records
-from rosmop.fast.strings_codegen import settling
-from rosmop.fast.vectors_codegen import OF_VECTORS, made_in
+from rosmop.fast.layout import LINES, Layout, NotScalarError, is_signed, machine_type
+from rosmop.fast.strings_codegen import Texts, settling
 from rosmop.fast.wasm import (
     COMPARE,
     DROP,
@@ -76,8 +65,8 @@ class Written:
     """A function that is written: its types and code; what it assigns, how many fields it writes, and whether it drops.
 
     `brief`: without loops. `passes`: some message comes to its end. `says`: it may put out lines. `early`: it may write
-    into the first bytes of the message, where a header is. `publishes`: contexts, and topics on which they may publish.
-    `references`: where the values of its references stand when it has returned.
+    into the first bytes of the message, where a header is. `references`: where the values of its references stand when
+    it has returned.
     """
 
     number: int
@@ -91,7 +80,6 @@ class Written:
     passes: bool
     says: bool
     early: bool
-    publishes: frozenset[tuple[str, str]] = frozenset()
     references: tuple[tuple[str, int], ...] = ()
 
 
@@ -146,7 +134,7 @@ class Writer(Layout):
         return written
 
 
-class _Body(Records):
+class _Body(Texts):
     """Writes one function."""
 
     def __init__(
@@ -159,10 +147,8 @@ class _Body(Records):
     ) -> None:
         answers = isinstance(function, nodes.Function) and function.parameters == ("m",)
         super().__init__(writer, parameters, context, answers=answers)
-        self._own_places(function)
         self._writer = writer
         self._function = function
-        self._made, self._begun = made_in(function, writer.shared)
         self._references: dict[str, int] = {}
         """Where the values of references stand when it has returned."""
         self._result = result
@@ -201,7 +187,6 @@ class _Body(Records):
             self._depends,
             self._says,
             self._early,
-            frozenset(self._publishes),
             tuple(self._references.items()),
         )
 
@@ -232,8 +217,6 @@ class _Body(Records):
         value = node.value.value if isinstance(node.value, nodes.Discard) else node.value
         if isinstance(value, nodes.Assign):
             return self._assigned_to(value)
-        if isinstance(value, nodes.Call) and self._changes_message(value):
-            return self._change(value)
         if isinstance(value, nodes.Literal) and value.value is None:
             return b""
         if isinstance(value, nodes.Sequence):
@@ -304,9 +287,8 @@ class _Body(Records):
         many = self._length() + constant(I64, nodes.CHARGED) + b"\x56"
         return self._when(many, lambda: self._allocated(self._length()))
 
-    def _pending(self, node: nodes.Pending) -> bytes:
-        """Only `Whole` asks for it."""
-        self._assigned_fields[node.name] = node.writes
+    def _pending(self, _node: nodes.Pending) -> bytes:
+        """Only `Whole` asks for it, which is beyond."""
         return b""
 
     def _drop(self, _node: nodes.Drop) -> bytes:
@@ -349,61 +331,19 @@ class _Body(Records):
         code = self._when(self._get("dropped"), lambda: self._leave(nodes.Leave(node.site, True)))
         for write in sorted(node.writes, key=lambda write: write.end is not None):
             self._early = self._early or (write.at.base is None and write.at.offset < EARLY)
-            put = partial(self._put_field if write.end is None else self._put_array, write)
-            code += self._when(self._get(write.flag), partial(self._or_elsewhere, put))
+            code += self._when(self._get(write.flag), partial(self._put_field, write))
         return code
 
-    def _or_elsewhere(self, put: Callable[[], bytes]) -> bytes:
+    def _put_field(self, write: nodes.Write) -> bytes:
+        """Put a number where it differs, bit by bit. Python puts NaNs, strings and arrays."""
         try:
-            return put()
+            return self._put_number(write)
         except NotScalarError:
             return self._elsewhere()
 
-    def _put_array(self, write: nodes.Write) -> bytes:
-        """Put the elements of an array there that is as long. A NaN that is put there, or that Python would change, is
-        left.
-        """
-        value, end = write.value, write.end
-        if not isinstance(value, nodes.Copy) or not isinstance(value.value, nodes.Read) or end is None:
-            raise NotScalarError(str(value.type))
-        room, at = self._room(value.value), write.at
-        code, place, count = self._noted(b"".join(self._elements(value)))
-        if isinstance(value.type, kinds.Vector) and value.type.length is None:
-            at = at.plus(4)
-        behind = self._position(at) + count + constant(I64, room.size) + b"\x7e\x7c"
-        other = behind + self._get(end, I64) + b"\x52" + self._is_elsewhere(room) + b"\x72"
-        code += self._when(other, self._elsewhere)
-        element, to = (f"{what} {len(self._locals)}" for what in ("element", "target"))
-        code += (
-            place + self._set(element) + self._get("at") + self._position(at) + b"\xa7\x6a" + self._set(to)
-        )
-        left = f"left {len(self._locals)}"
-        each = self._put_element(room.element, self._get(element), self._get(to))
-        for name in (element, to):
-            each += self._get(name) + constant(I32, room.size) + b"\x6a" + self._set(name)
-        self._brief = False
-        self._writes += ROOM // room.size
-        return code + count + self._set(left, I64) + self._times(left, each)
-
-    def _put_element(self, kind: Type, element: bytes, to: bytes) -> bytes:
-        size, machine = self._writer.size(kind), machine_type(kind)
-        if isinstance(kind, kinds.Bool):
-            return self._put_bits(to, 0, size, loaded(element, 0, kind))
-        if len(struct_code(kind) or "") == 2:
-            code, bits = self._parts_of(kind, loaded(element, 0, kind))
-            return code + self._put_bits(to, 0, size, bits)
-        bits = element + bytes((MOVES[size][0], 0, 0))
-        if machine not in (F32, F64):
-            return self._put_bits(to, 0, size, bits)
-        value = loaded(element, 0, kind)
-        other = bits + to + bytes((MOVES[size][0], 0, 0)) + bytes((COMPARE[I64 if size == 8 else I32]["!="],))
-        if machine == F32:  # a signalling one comes from Python as a quiet one
-            other += bits + constant(I32, 1 << 22) + b"\x71\x45\x72"
-        none = value + value + bytes((COMPARE[machine]["!="],)) + other + b"\x71"
-        return self._when(none, self._elsewhere) + self._put_bits(to, 0, size, bits)
-
-    def _put_field(self, write: nodes.Write) -> bytes:
-        """Put a number where it differs, bit by bit; Python decides which bits a NaN has."""
+    def _put_number(self, write: nodes.Write) -> bytes:
+        if write.end is not None:
+            raise NotScalarError(str(write.value.type))
         codes = struct_code(write.value.type) or ""
         machine, size = machine_type(write.value.type), struct_size(codes)
         value = self._value(write.value)
@@ -457,10 +397,8 @@ class _Body(Records):
     def _assigned_to(self, node: nodes.Assign) -> bytes:
         if isinstance(node.type, kinds.String):
             return self._assigned_text(node)
-        if isinstance(node.type, kinds.Vector):
-            return self._assigned_vector(node)
-        if isinstance(node.type, kinds.Record):
-            return self._assigned_record(node)
+        if isinstance(node.type, kinds.Vector | kinds.Record):
+            return self._named_in_place(node)
         if node.type == kinds.VOID:
             return self._handed(node.name, node.value)
         machine, value = machine_type(node.type), self._value(node.value)
@@ -469,6 +407,18 @@ class _Body(Records):
             return value + self._set(node.name, machine)
         self._assigned.add(node.name)
         return self._cell(_STORES[machine], self._writer.variable(node.name, node.type), value)
+
+    def _named_in_place(self, node: nodes.Assign) -> bytes:
+        """Give a local variable a vector or message that is in the message at hand: it stays there."""
+        source, shared = root_of(node.value), self._writer.shared
+        if not source or source in shared or node.name in shared:
+            raise NotScalarError(str(node.type))
+        self._assigned.add(node.name)
+        if isinstance(node.type, kinds.Record):
+            return b"".join(self._place(node.value)) + self._set(f"place of {node.name}")
+        code, place, count = self._elements(node.value)
+        code += place + self._set(f"place of {node.name}")
+        return code + count + self._set(f"count of {node.name}", I64)
 
     def _assign(self, node: nodes.Assign) -> bytes:
         return self._assigned_to(node) + self._read(nodes.Read(node.type, node.name))
@@ -482,6 +432,18 @@ class _Body(Records):
             code, stores, cost = code + first, stores + slot, cost + size
         self._says = True
         return code + self._noted_line(line, cost) + stores + constant(I32, 0)
+
+    def _noted_line(self, line: Line, cost: bytes) -> bytes:
+        """Pay for a line of output, and begin it, where the local variable `line` says then."""
+        known = self._layout.lines
+        code = self._cell(0x28, SAID) + self._set("line")
+        end = self._get("line") + constant(I32, line.size) + b"\x6a"
+        full = end + constant(I32, self._layout.said + LINES) + b"\x4b"
+        code += self._when(full, self._elsewhere) + self._spend(cost) + self._cell(0x36, SAID, end)
+        for offset, head in ((0, constant(I32, len(known))), (4, self._cell(0x28, POSITION))):
+            code += self._get("line") + head + b"\x36\x00" + unsigned(offset)
+        known.append(line)
+        return code
 
     def _slot(self, node: nodes.Expression, name: str, at: int) -> tuple[bytes, bytes, bytes]:
         """What comes first; what puts a value into the line (of a string: its place and length); its cost."""
@@ -542,9 +504,6 @@ class _Body(Records):
         special = _SPECIAL.get(node.function)
         if special is not None:
             return special(self, node)
-        of_vectors = OF_VECTORS.get(node.function)
-        if of_vectors is not None:
-            return of_vectors(self, node)
         argument = node.arguments[0]
         if node.function in _OF_COUNTS:
             first, _, count = self._elements(argument)
@@ -610,7 +569,6 @@ class _Body(Records):
             self._assigned |= called.assigned
         self._brief = self._brief and called.brief
         self._says = self._says or called.says
-        self._publishes |= called.publishes
         return code + b"\x10" + unsigned(called.number), called.references
 
     def _return(self, node: nodes.Return) -> bytes:
@@ -625,7 +583,7 @@ class _Body(Records):
                 self._get(name, machine_type(kind)),
             )
         for name in node.references:
-            at = self._references.setdefault(name, self._writer.room(8))
+            at = self._references.setdefault(name, self._writer.reference())
             if f"count of {name}" in self._locals:
                 code += self._cell(0x36, at, self._get(f"place of {name}"))
                 code += self._cell(0x36, at + 4, self._get(f"count of {name}", I64) + b"\xa7")
@@ -672,9 +630,9 @@ class _Body(Records):
     def _elements(self, node: nodes.Expression) -> tuple[bytes, bytes, bytes]:
         if isinstance(node, nodes.Item) and node.base.type == kinds.VOID:
             return super()._elements(_part_of(node))
-        if isinstance(node.type, kinds.String) and isinstance(node, nodes.Invoke):
+        if _has_place(node.type) and isinstance(node, nodes.Invoke):
             return self._handed_back(node)
-        if isinstance(node.type, kinds.String) and isinstance(node, nodes.Sequence):
+        if _has_place(node.type) and isinstance(node, nodes.Sequence):
             return self._after(node)
         return super()._elements(node)
 

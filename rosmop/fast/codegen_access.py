@@ -202,12 +202,6 @@ def loaded(place: bytes, offset: int, kind: Type) -> bytes:
 
 def root_of(node: nodes.Expression) -> str:
     """The variable that a value is, is in, or is copied from; none where that is not plain."""
-    found = root(node)
-    return "" if found is None else found.name
-
-
-def root(node: nodes.Expression) -> nodes.Read | nodes.Assign | None:
-    """The same as it is read or assigned."""
     while not isinstance(node, nodes.Read | nodes.Assign):
         if isinstance(node, nodes.Copy):
             node = node.value
@@ -216,5 +210,5 @@ def root(node: nodes.Expression) -> nodes.Read | nodes.Assign | None:
         elif isinstance(node, nodes.Call) and node.function == "l_element":
             node = node.arguments[0]
         else:
-            return None
-    return node if node.type != kinds.VOID else None  # that holds what a function has handed back
+            return ""
+    return node.name if node.type != kinds.VOID else ""  # that holds what a function has handed back

@@ -23,10 +23,8 @@ class Parts(ABC):
         self._locals = {name: (index, kind) for index, (name, kind) in enumerate(parameters.items())}
         self._depth = 0  # blocks that are open
         self._loops: list[int] = []  # at which depth the block of each loop is
-        self._assigned: set[str] = set()  # variables of the set, and local vectors
-        self._rooms: dict[str, int] = {}  # where local vectors are
+        self._assigned: set[str] = set()  # variables of the set, and local vectors and messages
         self._brief = True
-        self._publishes: set[tuple[str, str]] = set()  # contexts and topics
 
     @abstractmethod
     def _block(self, statements: Sequence[nodes.Statement]) -> bytes:

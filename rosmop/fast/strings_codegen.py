@@ -9,7 +9,7 @@ A string longer than `MOST_KEPT` is not kept here: the message that brings it is
 only that is known (`BEYOND`); the message that looks at it is left.
 """
 
-from rosmop.fast.abi import MOST_KEPT, ROOM, Cells
+from rosmop.fast.abi import MOST_KEPT, Cells
 from rosmop.fast.codegen_access import Places
 from rosmop.fast.layout import Layout, NotScalarError
 from rosmop.fast.wasm import (
@@ -175,25 +175,23 @@ def mismatch() -> bytes:
 
 
 def settling(layout: Layout, cells: Cells) -> bytes:
-    """A function that copies the strings of all variables, and the arrays of any length of messages, to where they stay
-    until the next time but one: each has two places.
+    """A function that copies the strings of all variables to where they stay until the next time but one: each has two
+    places.
 
     That there is another place now is said last: one that is stopped is begun again when what the message at hand
     has done is taken back. It returns 0 (i32).
     """
     cells.generation = layout.take(8)
-    cells.texts = {at: cells.texts.get(at) or layout.take(2 * MOST_KEPT) for at in cells.kept}
+    cells.texts = {at: layout.take(2 * MOST_KEPT) for at in cells.kept}
     other, target = b"\x20\x00", b"\x20\x01"
     flip = load(I32, cells.generation) + b"\x45\x21\x00"
     code = []
     for address, begin in cells.texts.items():
-        element = layout.arrays_at.get(address, 1)
-        room = ROOM if address in layout.arrays_at else MOST_KEPT
         count = load(I32, address + 4)
         code += [
-            count, constant(I32, room // element), b"\x4d", IF, NOTHING,
-            other, constant(I32, room), b"\x6c", constant(I32, begin), b"\x6a\x21\x01",
-            target, load(I32, address), count, constant(I32, element), b"\x6c\xfc\x0a\x00\x00",
+            count, constant(I32, MOST_KEPT), b"\x4d", IF, NOTHING,
+            other, constant(I32, MOST_KEPT), b"\x6c", constant(I32, begin), b"\x6a\x21\x01",
+            target, load(I32, address), count, b"\xfc\x0a\x00\x00",
             store(I32, address, target),
             END,
         ]  # fmt: skip

@@ -18,8 +18,10 @@ from typing import Any, NamedTuple, Protocol
 
 from rosmop.fast.abi import (
     AREA,
+    BEYOND,
     LEFT,
     LOUD,
+    MOST_KEPT,
     POSITION,
     REST,
     SOONER,
@@ -31,7 +33,6 @@ from rosmop.fast.abi import (
     FeedModule,
 )
 from rosmop.fast.deferred_output import HEAD
-from rosmop.fast.variables import KeptMessage, element_code, entered, left
 from rosmop.fast.wasm_instance import Machine, MachineTrap
 from rosmop.form.compiled import Compiled
 from rosmop.form.components import groups
@@ -39,8 +40,8 @@ from rosmop.run.explain import ClockedSteps, Exits
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import CellNames, Monitor, RunningProperty
 from rosmop.run.outcomes import Outcome, Verdict
-from rosmop.runtime.context import FUEL_PER_SECOND, Context, LogLine, Published
-from rosmop.runtime.values import Values, struct_code
+from rosmop.runtime.context import FUEL_PER_SECOND, Context, LogLine
+from rosmop.runtime.values import struct_code
 from rosmop.runtime.wire import Buffer
 from rosmop.types import kinds
 from rosmop.types.kinds import Type
@@ -70,16 +71,13 @@ _CLOCK = struct.Struct("<qq")
 _NEVER = (1 << 63) - 1  # comes after every time, so that output is due
 
 
-Output = LogLine | Published
-
-
 class Walked(NamedTuple):
     """What a walk has done.
 
     `position` is where the first message begins that is left; `run` where what goes on in its buffer begins (behind the
     last dropped message). `dropped` are counts for each of the walker's events, if any was, `told` for each of its
-    verdicts, if there was any. `sooner`: something is due earlier than it was. `output` are the lines that were put out
-    and the messages that were published, in order, each with where the frame begins of the message that it is about.
+    verdicts, if there was any. `sooner`: something is due earlier than it was. `output` are the lines that were put
+    out, in order, each with where the frame begins of the message that it is about.
     `paused`: the walk used up its fuel, and the message at `position` may be walked next.
     """
 
@@ -88,15 +86,14 @@ class Walked(NamedTuple):
     dropped: Sequence[int]
     told: Sequence[int] = ()
     sooner: bool = False
-    output: Sequence[tuple[int, Output]] = ()
+    output: Sequence[tuple[int, LogLine]] = ()
     paused: bool = False
 
 
 class Prepared(NamedTuple):
     """What holds for all walks of a topic until the engine, or anything else, has done something: the sender of
     the messages; bits of `told` (and whether no message may be changed), `enabled` and `counted`, as the module takes
-    them; where walks add up how many messages a set of events (see `Walker.writers`) has changed; and
-    where is said which publications may be made, for each whether it may.
+    them; and where walks add up how many messages a set of events (see `Walker.writers`) has changed.
     """
 
     source: int
@@ -104,7 +101,6 @@ class Prepared(NamedTuple):
     enabled: int
     counted: int
     changed: dict[int, int]
-    publishes: Sequence[tuple[int, bool]] = ()
 
 
 class Due(Protocol):
@@ -125,7 +121,6 @@ class Home:
         running: Sequence[RunningProperty],
         throttles: Sequence[tuple[Context, int, int]],
         *,
-        values: Values,
         due: Due,
         properties: Sequence[tuple[str, int]] = (),
         known: Mapping[str, tuple[str, str]] = MappingProxyType({}),
@@ -144,24 +139,16 @@ class Home:
         self._cells = struct.Struct(
             "<" + "q" * len(running) + "".join(_cell(kind) for _, kind in variables.values())
         )
-        buffers = {cells.variables[name][0]: buffer for name, buffer in cells.vectors.items()} | cells.texts
-        self._spans = [
-            (place, buffers[address], element_code(kind))
+        self._strings = [
+            (place, cells.texts[address])
             for place, (address, kind) in enumerate(variables.values())
-            if isinstance(kind, kinds.String | kinds.Vector)
+            if isinstance(kind, kinds.String)
         ]
-        self._records = {
-            name: KeptMessage(
-                values, kind, at, cells.known[name], {each: cells.texts[each] for each in cells.inner[name]}
-            )
-            for name, (at, kind) in cells.records.items()
-        }
         codes = "".join(_cell(kind) for _, kind in variables.values())
         self.names = CellNames([*properties], [*map(known.get, variables)], codes, [*cells.clocks])
         self._end = cells.base + self._cells.size
         self._clocked = [*cells.clocks.values()]
-        plain = not (self._spans or self._records)
-        self.size = self._cells.size + _CLOCK.size * len(self._clocked) if plain else 0
+        self.size = 0 if self._strings else self._cells.size + _CLOCK.size * len(self._clocked)
         self.left = False
         self._generation = cells.generation
         self._source, self._until = cells.source, cells.until
@@ -178,19 +165,15 @@ class Home:
         self.prepared = prepared
         self.machine.refuel(FUEL)
         _PREPARED.pack_into(self._memory, self._source, prepared.source << 32, *prepared[1:4])
-        for address, counted in prepared.publishes:
-            _TIME.pack_into(self._memory, address, counted)
 
     def _enter(self) -> None:
         states: list[Any] = [running.run.state for running in self._running]  # type: ignore[attr-defined]  # of tables
         values = [self._values[name] for name in self._names]
         if self._generation:
             _LENGTH.pack_into(self._memory, self._generation, 0)
-        for place, buffer, code in self._spans:
-            values[place] = entered(self._memory, values[place], buffer, code)
+        for place, buffer in self._strings:
+            values[place] = _entered(self._memory, values[place], buffer)
         self._cells.pack_into(self._memory, self._base, *states, *values)
-        for name, kept in self._records.items():
-            kept.enter(self._memory, self._values[name])
         for context, site, address in self._throttles:
             _TIME.pack_into(self._memory, address, context.throttled.get(site, _NEVER))
         for running, address in self._clocks:
@@ -240,17 +223,29 @@ class Home:
             run: Any = running.run
             run.since, run.now = _CLOCK.unpack_from(self._memory, address)
         found = dict(zip(self._names, values[len(self._running) :], strict=True))
-        for place, _, code in self._spans:
+        for place, _ in self._strings:
             name = self._names[place]
-            found[name] = left(self._memory, found[name], code, self._values[name])
-        for name, kept in self._records.items():
-            found[name] = kept.left(self._memory, self._values[name])
+            found[name] = _left(self._memory, found[name], self._values[name])
         self._values.update(found)
+
+
+def _entered(memory: memoryview, value: bytes, buffer: int) -> int:
+    """Put a string there; where it is now, and how long it is (from bit 32 on)."""
+    if len(value) > MOST_KEPT:
+        return BEYOND << 32
+    memory[buffer : buffer + len(value)] = value
+    return buffer | len(value) << 32
+
+
+def _left(memory: memoryview, word: int, before: bytes) -> bytes:
+    """The string that such a number says; one that is not there is as it was before."""
+    at, count = word & _ADDRESS, word >> 32
+    return before if count == BEYOND else bytes(memory[at : at + count])
 
 
 def _cell(kind: Type) -> str:
     """The `struct` code of a variable in the module's memory, 8 bytes."""
-    if isinstance(kind, kinds.String | kinds.Vector):
+    if isinstance(kind, kinds.String):
         return "Q"
     if isinstance(kind, kinds.Bool):
         return "?7x"
@@ -281,9 +276,6 @@ class Walker:
         """Whether messages may be changed."""
         self._lines = [(line, home.named(line.context)) for line in module.lines] if feed.says else []
         self._said = module.said
-        self.publishes = tuple((home.named(context), topic) for context, topic in feed.publishes)
-        """What it may publish: the name of the monitor, and the topic."""
-        self._publications = [module.publications[each] for each in feed.publishes]
         self._monitors = tuple(dict.fromkeys(monitors))
         self._memory = home.machine.memory  # it does not grow
         self._owner = self._memory.obj
@@ -329,17 +321,14 @@ class Walker:
         counted: Sequence[bool] = (),
         source: int = 0,
         changed: dict[int, int] | None = None,
-        published: Sequence[bool] = (),
     ) -> Prepared:
         """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none,
-        `counted` for each verdict whether there may be more, `published` the same of what it `publishes`. Good until
-        the engine is asked for anything.
+        `counted` for each verdict whether there may be more. Good until the engine is asked for anything.
         """
         bits = sum(1 << number for number, silent in enumerate(told) if silent) - (LOUD if loud else 0)
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
         only = sum(1 << number for number, silent in enumerate(counted) if silent)
-        publishes = [*zip_longest(self._publications, published, fillvalue=False)]
-        return Prepared(source, bits, enabled, only, {} if changed is None else changed, publishes)
+        return Prepared(source, bits, enabled, only, {} if changed is None else changed)
 
     def walk(  # noqa: PLR0912, PLR0917  called for every batch: calls and keywords would cost a tenth of it
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
@@ -356,7 +345,7 @@ class Walker:
         frames = self._frames
         end = frames + len(view)
         begun, said = run, 0
-        output: list[tuple[int, Output]] = []
+        output: list[tuple[int, LogLine]] = []
         paused = False
         while True:
             try:
@@ -436,8 +425,7 @@ class Walker:
                 self.writers(who),
             )
         if walked is not None:
-            outcome.log = [each for _, each in walked.output if isinstance(each, LogLine)]
-            outcome.published = [each for _, each in walked.output if isinstance(each, Published)]
+            outcome.log = [line for _, line in walked.output]
             counts = zip(self.verdicts, walked.told, strict=False)  # none is counted where there is none
             outcome.verdicts = tuple(verdict for verdict, count in counts for _ in range(count))
         return outcome
@@ -447,7 +435,7 @@ class Walker:
     ) -> Walked:
         dropped: Sequence[int] = ()
         told: Sequence[int] = ()
-        output: list[tuple[int, Output]] = []
+        output: list[tuple[int, LogLine]] = []
         sooner = paused = False
         while position < len(view) and not sooner:
             following = position + 4 + _LENGTH.unpack_from(view, position)[0]
@@ -493,8 +481,8 @@ class Walker:
             frame[4:size] = area[4:]
         return walked
 
-    def _put_out(self, output: list[tuple[int, Output]]) -> None:
-        """Append what is put out and published, each with where its frame begins."""
+    def _put_out(self, output: list[tuple[int, LogLine]]) -> None:
+        """Append what is put out, each with where its frame begins."""
         at, end = self._said, _LENGTH.unpack_from(self._memory, SURE)[0]
         while at < end:
             number, frame = HEAD.unpack_from(self._memory, at)
@@ -564,7 +552,6 @@ def walks_of(
     if not module.feeds:
         return Walks()
     found = list(groups(compiled.specifications))
-    values = Values(compiled.messages)
     machine = Machine(module.code, module.memory)
     walks: dict[str, Walker] = {}
     for group, cells in zip(found, module.cells, strict=True):
@@ -586,7 +573,6 @@ def walks_of(
             interpreter,
             running,
             throttles,
-            values=values,
             due=due,
             properties=[(monitors[number].name, index) for number, index in group.properties],
             known={code: (one.name, name) for one in specifications for name, code in one.variables.items()},

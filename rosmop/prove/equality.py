@@ -6,8 +6,7 @@ function leaves the message to Python (which then judges it anew), or
 - the form does not fault,
 - both say the same of whether the event happened, dropped the message, changed it,
 - the bytes of the message, the variables and what is left of the budget are the same,
-- and so is what is put out and published, in its order. (An event that looks at a string or vector that is kept, or
-  changes or makes one, is not proved.)
+- and so is what is put out, in its order. (An event that looks at a string that is kept, or keeps one, is not proved.)
 
 Where it leaves the message, the walk takes back what it has done: each variable that it has written stands among those
 that are taken back, and each byte in the log (`module_terms.py`).
@@ -26,7 +25,7 @@ from rosmop.form.compiled import Compiled
 from rosmop.form.components import groups
 from rosmop.prove.decoding import functions_of
 from rosmop.prove.form_terms import Meaning, wrapped
-from rosmop.prove.module_terms import Done, Execution, made_at
+from rosmop.prove.module_terms import Done, Execution
 from rosmop.prove.terms import (
     DOUBLE,
     SINGLE,
@@ -46,7 +45,7 @@ from rosmop.prove.terms import (
 )
 from rosmop.runtime.context import BUDGET
 from rosmop.runtime.times import MAX_TIME
-from rosmop.runtime.values import Values, is_array, struct_code, struct_size
+from rosmop.runtime.values import Values
 from rosmop.types import kinds
 from rosmop.types.kinds import Type
 
@@ -113,20 +112,9 @@ class Validation:
         self._clock = clock
         self._patience = patience
         self.codes = functions_of(module.code)
-        kept = [at for own in module.cells for name in own.variables for at in own.texts_of(name)]
-        kept += [own.variables[name][0] for own in module.cells for name in own.vectors]
-        self._strings = [range(at, at + 8) for at in kept]
+        self._strings = [range(at, at + 8) for own in module.cells for at in own.kept]
         self._strings += [range(at, at + len(raw)) for raw, at in module.strings.items()]
-        self._strings += module.rooms
-        self._lasting = [
-            *(range(at, at + 8) for own in module.cells for at in own.known.values()),
-            *(range(at, at + 8) for at in module.publications.values()),
-            *(
-                range(at, at + own.sizes[name])
-                for own in module.cells
-                for name, (at, _) in own.records.items()
-            ),
-        ]
+        self._strings += module.references
 
     def finding(self, topic: str, event: str, function: str, place: int) -> Finding:
         """What is known of the event that is at this place among those of a topic."""
@@ -141,12 +129,10 @@ class Validation:
             return Finding(topic, event, str(error))
 
     def _compared(self, name: str, number: int, topic: str) -> str:
-        begin, cells, made, known = self._beginning()
+        begin, cells, known = self._beginning()
         module = self._module
-        meant = Meaning(self._forms, self._values, begin, name, module.lines, module.strings).result()
-        done = Execution(
-            self.codes, number, begin.message, begin.size, cells, self._strings, module.places, made
-        ).done()
+        meant = Meaning(self._forms, self._values, begin, name, module.lines).result()
+        done = Execution(self.codes, number, begin.message, begin.size, cells, self._strings).done()
         self._check_undone(done, topic)
         left = either(done.trapped, done.bits == _ELSEWHERE)
         unknown = either(*meant.unknown.values())
@@ -163,10 +149,6 @@ class Validation:
             **{
                 f"the variable at {place}": opposite(_same(done.cells[place], value))
                 for place, value in self._ends(meant)
-            },
-            **{
-                f"the message that is kept at {place}": made_at(done.slots, place, part.size() // 8) != part
-                for place, part in self._kept_ends(meant)
             },
             "how much is put out": done.said != meant.said,
             **{
@@ -214,25 +196,20 @@ class Validation:
         answer = solver.check()
         return answer, solver.model() if answer == z3.sat else None
 
-    def _beginning(self) -> tuple[Beginning, dict[int, Term], Term, list[Term]]:
-        """What every event may begin with; the same as the module's cells and messages; and what is known of it."""
-        made = z3.Array("made", z3.BitVecSort(32), z3.BitVecSort(8))
+    def _beginning(self) -> tuple[Beginning, dict[int, Term], list[Term]]:
+        """What every event may begin with; the same as the module's cells; and what is known of it."""
         now, size = z3.BitVec("now", 64), z3.BitVec("size", 32)
         known = [now >= 0, now < _LATEST, z3.ULE(size, AREA)]
         cells: dict[int, Term] = {_NOW: now, _REST: integer(0, 64)}
         variables: dict[str, Any] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
-                if isinstance(kind, kinds.String | kinds.Vector):
+                if isinstance(kind, kinds.String):
                     continue
                 variables[name] = cells[address] = _variable(name, kind)
                 if isinstance(kind, kinds.Time | kinds.Duration):
                     most = MAX_TIME + (1 << 32)
                     known += [variables[name] >= -most, variables[name] <= most]
-            for name, (address, kind) in component.records.items():
-                variables[name] = tuple(
-                    number_at(made, integer(address + at, 32), size) for at, size in self._parts(kind)
-                )
         budgets = {context: z3.BitVec(f"budget of {context}", 64) for context in self._module.budgets}
         for context, address in self._module.budgets.items():
             known += [budgets[context] >= 0, budgets[context] <= BUDGET]
@@ -242,30 +219,7 @@ class Validation:
             known.append(throttles[key] >= 0)
             cells[address] = throttles[key]
         message = z3.Array("message", z3.BitVecSort(32), z3.BitVecSort(8))
-        return Beginning(message, size, now, variables, budgets, throttles), cells, made, known
-
-    def _parts(self, kind: Type, at: int = 0) -> Iterator[tuple[int, int]]:
-        """Where each number, string and array of any length of a message that is kept stands in it, and its bytes."""
-        if is_array(kind) or not isinstance(kind, kinds.Record | kinds.Vector):
-            yield at, struct_size(struct_code(kind) or "") or 8
-            return
-        end = at
-        for field in (
-            [kind.element] * (kind.length or 0)
-            if isinstance(kind, kinds.Vector)
-            else self._values.fields(kind)
-        ):
-            for place, size in self._parts(field, at):
-                yield place, size
-                end = place + size
-            at = end
-
-    def _kept_ends(self, meant: Result) -> Iterator[tuple[int, Term]]:
-        """What must stand at the end in messages that are kept, and where."""
-        for component in self._module.cells:
-            for name, (address, kind) in component.records.items():
-                for (at, _), part in zip(self._parts(kind), meant.variables[name], strict=True):
-                    yield address + at, part
+        return Beginning(message, size, now, variables, budgets, throttles), cells, known
 
     def _ends(self, meant: Result) -> Iterator[tuple[int, Term]]:
         """What each cell must hold at the end."""
@@ -278,17 +232,7 @@ class Validation:
 
     def _check_undone(self, done: Done, topic: str) -> None:
         taken_back = {address for address, _ in self._module.feeds[topic].undo}
-        scratch = set(self._module.budgets.values()) | {
-            address
-            for address in done.stored
-            if any(address in place for place in self._module.places)
-            and not any(address in place for place in self._lasting)
-        }
-        words = {
-            address if address % 8 == 0 else address - address % 8: address
-            for address in done.stored - scratch
-        }
-        for address in sorted(words.keys() - taken_back):
+        for address in sorted(done.stored - set(self._module.budgets.values()) - taken_back):
             raise DiffersError(f"what it writes at {address} is not taken back")
 
 

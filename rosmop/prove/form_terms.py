@@ -7,14 +7,14 @@
 - What it measures of the values that a specification holds, once in a megabyte that it says it will make, is left out.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
 import z3
 
-from rosmop.fast.deferred_output import BYTES, HEAD, Line, Publication
+from rosmop.fast.deferred_output import BYTES, HEAD, Line
 from rosmop.form import nodes
 from rosmop.prove.terms import (
     AT,
@@ -41,7 +41,7 @@ from rosmop.prove.terms import (
     with_number,
 )
 from rosmop.runtime import times
-from rosmop.runtime.context import BYTES_PER_INSTRUCTION, OUTPUT_COST, UNMEASURED
+from rosmop.runtime.context import BYTES_PER_INSTRUCTION, UNMEASURED
 from rosmop.runtime.values import Values, struct_code, struct_size
 from rosmop.runtime.wire import MAX_EMPTY
 from rosmop.types import kinds
@@ -57,10 +57,6 @@ class _View:
     message: Term
     start: Term
     count: Term
-
-
-_Made = tuple[Term, ...]
-"""A message that is made or kept: the bits of each of its numbers, as they are sent; of a string address and length."""
 
 
 class UnknownError(Exception):
@@ -99,20 +95,18 @@ def _word(value: Term, kind: Type) -> Term:
 
 class Meaning:
     """One event. `functions` are those of its set, `values` the types of its messages; `lines` are what the module puts
-    out, by number, and `strings` where constants stand in it.
+    out, by number.
     """
 
-    def __init__(  # noqa: PLR0917  as `result` names them
+    def __init__(
         self,
         functions: Mapping[str, nodes.Function],
         values: Values,
         beginning: Beginning,
         name: str,
-        lines: Sequence[Line | Publication] = (),
-        strings: Mapping[bytes, int] = MappingProxyType({}),
+        lines: Sequence[Line] = (),
     ) -> None:
         self._lines = lines
-        self._strings = strings
         self._noted: list[Noted] = []
         self._context = functions[name].context
         self._functions = functions
@@ -233,16 +227,6 @@ class Meaning:
     def _drop(self, _node: nodes.Drop, state: State) -> None:
         state.slots[_DROPPED] = z3.BoolVal(True)
 
-    def _publish(self, node: nodes.Publish, state: State) -> None:
-        made = self._leaves(node.kind, node.value, state)
-        kinds_of = list(self._kinds(node.kind))
-        size = sum(leaf.size() // 8 for leaf in made)
-        cost = integer(OUTPUT_COST + size, 64)
-        for leaf, kind in zip(made, kinds_of, strict=True):
-            if isinstance(kind, kinds.String):
-                cost = cost + z3.ZeroExt(32, z3.Extract(63, 32, leaf))
-        self._put_out(node, made, cost, state)
-
     def _log(self, node: nodes.Log, state: State) -> None:
         """A line costs the most that it can."""
         line = Line("", node)
@@ -256,10 +240,8 @@ class Meaning:
                 words.append(_word(value, expression.type))
         self._put_out(node, words, cost, state)
 
-    def _put_out(
-        self, node: nodes.Log | nodes.Publish, parts: Sequence[Term], cost: Term, state: State
-    ) -> None:
-        """Note a line or publication: its number among those of the module, the frame, and its parts."""
+    def _put_out(self, node: nodes.Log, parts: Sequence[Term], cost: Term, state: State) -> None:
+        """Note a line: its number among those of the module, the frame, and its parts."""
         numbers = [
             integer(number, 32)
             for number, line in enumerate(self._lines)
@@ -275,8 +257,7 @@ class Meaning:
         state.slots[_SAID] = begin + (offset + 7 & ~7)
 
     def _pending(self, node: nodes.Pending, state: State) -> None:
-        """Only `Whole` asks for it."""
-        state.slots[self._frame, node.name] = node.writes
+        """Only `Whole` asks for it, of which no module is written."""
 
     def _require(self, node: nodes.Require, state: State) -> None:
         test = self._value(node.test, state)
@@ -421,116 +402,6 @@ class Meaning:
         rest = z3.If(rest < 0, rest + billion, rest)
         return (value - rest) / billion, rest
 
-    # Messages that are made or kept
-
-    def _kinds(self, kind: Type) -> Iterator[Type]:
-        """The types of the numbers, times and strings in a value, in order."""
-        parts: Sequence[Type] = self._values.fields(kind) if isinstance(kind, kinds.Record) else ()
-        if isinstance(kind, kinds.Vector):
-            if kind.length is None:
-                raise UnknownError("an array of any length in a message that is made")
-            parts = [kind.element] * kind.length
-        elif not isinstance(kind, kinds.Record):
-            yield kind
-        for part in parts:
-            yield from self._kinds(part)
-
-    def _leaves(self, kind: Type, node: nodes.Expression, state: State) -> _Made:
-        """A value as it stands in a message that is made."""
-        if isinstance(kind, kinds.String) and isinstance(node, nodes.Literal | nodes.Zero):
-            raw = node.value if isinstance(node, nodes.Literal) else b""
-            place = self._strings.get(raw) if isinstance(raw, bytes) else None
-            if not isinstance(raw, bytes) or place is None:
-                raise UnknownError("a constant string")
-            return (z3.Concat(integer(len(raw), 32), integer(place, 32)),)
-        value = self._value(node, state)
-        if isinstance(value, tuple):
-            return value
-        if not isinstance(value, _View):
-            return (self._packed(value, kind, state),)
-        if isinstance(kind, kinds.String):
-            return (_text(value),)
-        found, offset = [], 0
-        for leaf in self._kinds(kind):
-            number = self._part(value, offset, leaf)
-            found.append(self._packed(number, leaf, state))
-            offset += self._size(leaf)
-        return tuple(found)
-
-    def _span(self, kind: Type, number: int) -> tuple[int, int]:
-        """Where a field or element begins among the parts of a value, and ends."""
-        if isinstance(kind, kinds.Vector):
-            size = len(list(self._kinds(kind.element)))
-            return number * size, (number + 1) * size
-        assert isinstance(kind, kinds.Record)  # noqa: S101  what has parts is one of the two
-        counts = [len(list(self._kinds(field))) for field in self._values.fields(kind)]
-        begin = sum(counts[:number])
-        return begin, begin + counts[number]
-
-    def _path(self, node: nodes.Expression) -> tuple[nodes.Read, int]:
-        """The variable that a place is in, and where it begins among its parts."""
-        if isinstance(node, nodes.Item):
-            variable, begin = self._path(node.base)
-            return variable, begin + self._span(node.base.type, node.number)[0]
-        if not isinstance(node, nodes.Read):
-            raise UnknownError("an element of a message that is made")
-        return node, 0
-
-    def _change(self, node: nodes.Call, state: State) -> Any:
-        """Put a value into a field, or an element that is known."""
-        base, where, new = node.arguments
-        number = where.value if isinstance(where, nodes.Literal) else None
-        if not isinstance(number, int) or nodes.acts(new):
-            raise UnknownError("an element of a message that is made")
-        variable, begin = self._path(base)
-        whole = self._read(variable, state)
-        if not isinstance(whole, tuple):
-            raise UnknownError("a message that is changed")
-        if isinstance(base.type, kinds.Vector):
-            self._leave_to_python(state, z3.BoolVal(not 0 <= number < (base.type.length or 0)))
-        first, last = (begin + one for one in self._span(base.type, number))
-        kind = new.type if isinstance(base.type, kinds.Vector) else self._field(base.type, number)
-        put = self._leaves(kind, new, state)
-        own = (self._frame, variable.name)
-        state.slots[own if own in state.slots else ("shared", variable.name)] = (
-            *whole[:first],
-            *put,
-            *whole[last:],
-        )
-
-    def _field(self, kind: Type, number: int) -> Type:
-        assert isinstance(kind, kinds.Record)  # noqa: S101  what has slots
-        return self._values.fields(kind)[number]
-
-    def _whole(self, node: nodes.Whole, state: State) -> Any:
-        """The message at hand, with the fields that were assigned."""
-        self._make(z3.ZeroExt(32, self._beginning.size), state)
-        at, found = nodes.Spot(None, 0), []
-        for number, kind in enumerate(self._kinds(node.type)):
-            if isinstance(kind, kinds.String):
-                name = f"text {number} of {node.pending}"
-                self._read_value(nodes.ReadValue(-1, name, f"{name} end", at, kind), state)
-                found.append(_text(state.slots[self._frame, name]))
-                at = nodes.Spot(f"{name} end", 0)
-                continue
-            self._within(at, self._size(kind), state)
-            value = self._number(state.slots[_MESSAGE], self._place(at, state), kind)
-            found.append(self._packed(value, kind, state))
-            at = at.plus(self._size(kind))
-        for write in state.slots[self._frame, node.pending]:
-            flag, kind, begin = state.slots[self._frame, write.flag], node.type, 0
-            for step in write.path:
-                if not isinstance(step, int):
-                    raise UnknownError("a part of a time that was assigned")
-                begin += self._span(kind, step)[0]
-                kind = kind.element if isinstance(kind, kinds.Vector) else self._field(kind, step)
-            wanted = state.where(flag)
-            put = self._leaves(kind, write.value, wanted)
-            state.alive = either(wanted.alive, state.where(opposite(flag)).alive)
-            for place, leaf in enumerate(put, begin):
-                found[place] = choice(flag, leaf, found[place])
-        return tuple(found)
-
     # Expressions
 
     def _value(self, node: nodes.Expression, state: State) -> Any:
@@ -552,16 +423,11 @@ class Meaning:
         return z3.BoolVal(bool(value)) if isinstance(kind, kinds.Bool) else integer(value, width(kind))
 
     def _zero(self, node: nodes.Zero, state: State) -> Any:
-        if isinstance(node.type, kinds.Record):
-            return tuple(self._nothing(kind) for kind in self._kinds(node.type))
         if isinstance(node.type, kinds.Floating):
             return self._literal(nodes.Literal(node.type, 0.0), state)
         if not isinstance(node.type, kinds.Bool | kinds.Integer | kinds.Time | kinds.Duration):
             raise UnknownError(f"a zero of type {node.type}")
         return self._whole_number(0, node.type)
-
-    def _nothing(self, kind: Type) -> Term:
-        return integer(0, 64 if isinstance(kind, kinds.String) else 8 * self._size(kind))
 
     def _read(self, node: nodes.Read, state: State) -> Any:
         own, shared = (self._frame, node.name), ("shared", node.name)
@@ -572,11 +438,7 @@ class Meaning:
 
     def _assign(self, node: nodes.Assign, state: State) -> Any:
         value = self._value(node.value, state)
-        if isinstance(value, tuple) and isinstance(node.value, nodes.Read | nodes.Item | nodes.Assign):
-            raise UnknownError("two names of one message")
         where: int | str = "shared" if node.name in self._shared else self._frame
-        if isinstance(node.type, kinds.Record) and isinstance(value, _View) and where == "shared":
-            value = self._leaves(node.type, node.value, state)
         if where == "shared" and node.name not in self._beginning.variables:
             raise UnknownError(f"a variable of type {node.type}")
         state.slots[where, node.name] = value
@@ -751,12 +613,6 @@ class Meaning:
 
     def _item(self, node: nodes.Item, state: State) -> Any:
         view = self._value(node.base, state)
-        if isinstance(view, tuple):
-            if isinstance(node.type, kinds.String):
-                raise UnknownError("a string in a message that is made")
-            first, last = self._span(node.base.type, node.number)
-            made = isinstance(node.type, kinds.Record | kinds.Vector)
-            return view[first:last] if made else self._decoded(view[first], node.type)
         if not isinstance(view, _View) or not isinstance(node.base.type, kinds.Record):
             raise UnknownError("a part of a value")
         before = self._values.fields(node.base.type)[: node.number]
@@ -773,9 +629,6 @@ class Meaning:
 
     def _copy(self, node: nodes.Copy, state: State) -> Any:
         view, kind = self._value(node.value, state), node.type
-        if isinstance(view, tuple):
-            self._pay_arrays(kind, state)
-            return view
         if isinstance(kind, kinds.Vector) and struct_code(kind.element) is not None:
             self._make(view.count * self._values.width(kind.element), state)
         elif not isinstance(kind, kinds.Record) or any(
@@ -784,22 +637,10 @@ class Meaning:
             raise UnknownError(f"a copy of type {kind}")
         return view
 
-    def _pay_arrays(self, kind: Type, state: State) -> None:
-        """A copy costs what its arrays take."""
-        parts: Sequence[Type] = self._values.fields(kind) if isinstance(kind, kinds.Record) else ()
-        if isinstance(kind, kinds.Vector):
-            length = kind.length or 0
-            self._make(integer(length * self._values.width(kind.element), 64), state)
-            parts = [kind.element] * length
-        for part in parts:
-            self._pay_arrays(part, state)
-
     def _call(self, node: nodes.Call, state: State) -> Any:
         name, arguments = node.function, node.arguments
         if name in ("a_part",):
             return self._with_part(node, state)
-        if name in ("a_slot", "a_put"):
-            return self._change(node, state)
         values = [self._value(argument, state) for argument in arguments]
         kind = arguments[0].type if arguments else kinds.VOID
         if name in _OF_VIEWS and isinstance(values[0], _View):

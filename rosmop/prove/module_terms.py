@@ -4,7 +4,6 @@ Three kinds of places are known, and an address that is none of them is a differ
 
 - cells, 8 bytes each at constant addresses: variables, budgets, times, and where the log ends (`UNDO`);
 - the message, from the address that the function is handed: everything that is read or written is within its size;
-- messages that are made, kept or published, and what says whether one may be, at constant addresses;
 - what is put out, in order;
 - the log, by which a message that is left is put back: whatever is written into the message was noted there before,
   address, size and the bytes that stood there, and a note is never written again.
@@ -51,7 +50,7 @@ POSITION, UNDO, SAID = 0, 8, 12
 """Where the frame, the end of the log and that of the lines stand."""
 
 _ENTRY = 16  # bytes of a note: address, size (4 bytes each), what stood there
-_MESSAGE, _NOTE, _LINES, _MADE = "message", "note", "lines", "made"
+_MESSAGE, _NOTE, _LINES = "message", "note", "lines"
 _SORTS: Mapping[str, Any] = MappingProxyType(
     {"i32": z3.BitVecSort(32), "i64": z3.BitVecSort(64), "f32": SINGLE, "f64": DOUBLE}
 )
@@ -89,14 +88,12 @@ class Done:
     stored: frozenset[int]
     lines: Term
     said: Term
-    slots: Mapping[Any, Any]
 
 
 class Execution:
     """One event's function, by its number, begun with these cells (truths are numbers, too).
 
-    `strings` are the addresses of strings, and of the cells that say where they are; `messages` those of messages that
-    are made or kept, and of what says whether one may be published; what stands there is `made`.
+    `strings` are the addresses of strings, and of the cells that say where they are.
     """
 
     def __init__(  # noqa: PLR0917  as `done` names them
@@ -107,12 +104,9 @@ class Execution:
         size: Term,
         cells: Mapping[int, Term],
         strings: Sequence[range] = (),
-        messages: Sequence[range] = (),
-        made: Term = None,
     ) -> None:
         self._functions = functions
         self._strings = strings
-        self._messages = messages
         self._size = size
         self._trapped: list[Term] = []
         self._outside: list[Term] = []
@@ -129,11 +123,6 @@ class Execution:
             ("cell", SAID): Pointer("lines", integer(0, 32)),
             ("cell", POSITION): FRAME,
         }
-        slots |= {
-            (_MADE, address): z3.Select(made, integer(address, 32))
-            for message in messages
-            for address in message
-        }
         slots |= {("cell", address): value for address, value in cells.items()}
         self._state = State(z3.BoolVal(True), slots)
         self._number = number
@@ -149,7 +138,7 @@ class Execution:
         }
         return Done(
             either(*self._trapped), either(*self._outside), bits, state.slots[_MESSAGE], cells,
-            frozenset(self._stored), state.slots[_LINES], state.slots["cell", SAID].offset, state.slots,
+            frozenset(self._stored), state.slots[_LINES], state.slots["cell", SAID].offset,
         )  # fmt: skip
 
     def _call(self, number: int, arguments: Sequence[Any], state: State) -> Any:
@@ -261,11 +250,10 @@ class Execution:
             size = int(how.partition("_")[0] or bits) // 8
             value = number_at(state.slots[_MESSAGE], self._within(address, int(offset), size, state), size)
             return _loaded(value, family, how)
-        size = int(how.partition("_")[0] or bits) // 8
-        place = self._cell(address, int(offset), size)
-        if self._is_made(place):
-            return _loaded(made_at(state.slots, place, size), family, how)
+        place = self._cell(address, int(offset))
         value = state.slots.get(("cell", place))
+        if value is MIXED:
+            raise NotProvedError("uses a variable for an address and a number")
         if how or value is None or not _fits(value, family):
             raise DiffersError(
                 f"it reads {each_name(family, how)} at {place}, where nothing of that kind stands"
@@ -285,13 +273,7 @@ class Execution:
                 address, int(offset), size, value, state
             )
             return
-        place = self._cell(address, int(offset), size)
-        if self._is_made(place):
-            bits = _stored(value, size)
-            for byte in range(size):
-                state.slots[_MADE, place + byte] = z3.Extract(8 * byte + 7, 8 * byte, bits)
-            self._stored.add(place)
-            return
+        place = self._cell(address, int(offset))
         if place == UNDO and not how:
             self._add_note(value, state)
             return
@@ -306,20 +288,13 @@ class Execution:
         if place != SAID:
             self._stored.add(place)
 
-    def _is_made(self, place: int) -> bool:
-        return any(place in message for message in self._messages)
-
-    def _cell(self, address: Any, offset: int, size: int) -> int:
-        """A constant address of what is no string; all of it is in one message, or in none."""
+    def _cell(self, address: Any, offset: int) -> int:
+        """A constant address of what is no string."""
         number = z3.simplify(_bits(address))
         known = z3.is_bv_value(number)
         place = int(number.as_long()) + offset if known else -1
-        if self._messages and not known:
-            raise NotProvedError("uses an element of a message that is made, kept or published")
-        if any((place in message) != (place + size - 1 in message) for message in self._messages):
-            raise DiffersError(f"it looks at {size} bytes at {place}, of which some are a message's")
         if any(place in string for string in self._strings) or (self._strings and not known):
-            raise NotProvedError("uses a constant string, or a string or vector that is kept or made")
+            raise NotProvedError("uses a constant string, or one that is kept")
         if not known:
             raise DiffersError("it looks at an address that is nowhere in the message")
         return place
@@ -368,12 +343,6 @@ class Execution:
         state.slots["cell", UNDO] = value
         for part in (0, 4, 8):
             del state.slots["part", part]
-
-
-def made_at(slots: Mapping[Any, Any], place: int, size: int) -> Term:
-    """What so many bytes of a message are that is made or kept, as they are stored together if they were."""
-    every = [slots[_MADE, place + byte] for byte in reversed(range(size))]
-    return z3.simplify(z3.Concat(*every) if size > 1 else every[0])
 
 
 def _loaded(value: Term, family: str, how: str) -> Term:

@@ -45,11 +45,6 @@ def struct_size(codes: str) -> int:
     return sum({"?": 1, "b": 1, "h": 2, "i": 4, "q": 8, "f": 4, "d": 8}[code.lower()] for code in codes)
 
 
-def is_array(kind: Type) -> bool:
-    """Whether it is an array of any length of numbers, truths or times."""
-    return isinstance(kind, kinds.Vector) and kind.length is None and struct_code(kind.element) is not None
-
-
 class Values:
     """The values of the types of a set of message definitions. What deals with those of a type is made once."""
 

@@ -65,8 +65,6 @@ class Fed:
         """What was put out since it was checked last."""
         self.published: list[Published] = []
         """The same of what was published."""
-        self.publishing = True
-        """Whether publications are only counted."""
         self.counting = False
         """Whether verdicts are only counted."""
         self._inside = False
@@ -120,17 +118,11 @@ class Fed:
             if walker is not None and self.monitors.walks(walker, time):
                 before = position
                 counted = [self.counting] * len(walker.verdicts)
-                publishing = [self.publishing] * len(walker.publishes)
-                prepared = walker.prepare(loud=False, told=(), counted=counted, published=publishing)
+                prepared = walker.prepare(loud=False, told=(), counted=counted)
                 walked = walker.walk(view, position, run, pieces, time, prepared)
                 for verdict, count in zip(walker.verdicts, walked.told if walked else (), strict=False):
                     self.counts[named(verdict)] += count
-                output = [each for _, each in walked.output] if walked else []
-                self.lines += (each for each in output if isinstance(each, LogLine))
-                published = [each for each in output if isinstance(each, Published)]
-                if published:
-                    self.came["published together"] += len(published)
-                self.published += published
+                self.lines += (line for _, line in walked.output) if walked else ()
                 position, run = (len(view), run) if walked is None else (walked.position, walked.run)
                 self.came["together"] += position > before
                 if position == len(view):
@@ -188,7 +180,6 @@ def test_random_specifications_and_messages(seed: int, wild: list[bytes]) -> Non
     for number in range(4):
         traffic = messages.traffic()
         fed.counting = bool(seed + number & 2)
-        fed.publishing = bool(seed + number & 3)
         fed.check([*traffic.bodies(), *wild], traffic.topic, number)
 
 
@@ -204,7 +195,7 @@ def test_most_of_that_is_taken_together_and_everything_comes_up() -> None:
         for traffic in (messages.traffic() for _ in range(6)):
             fed.check(list(traffic.bodies()), traffic.topic)
         came += fed.came
-    found = ("fault", "dropped", "changed", "passed", "together", "published together")
+    found = ("fault", "dropped", "changed", "passed", "together")
     assert min(came[what] for what in found) > 3
 
 
@@ -618,8 +609,8 @@ def test_what_happened_and_what_was_dropped_is_counted() -> None:
         ('ROS_INFO("each");', True),
         ('std::string s = "x" + std::to_string(count);', False),
         ("n = down(3);", False),
-        ("v.push_back(1);", True),
-        ("std::reverse(v.begin(), v.end());", True),
+        ("v.push_back(1);", False),
+        ("if (count > 3) { std::reverse(v.begin(), v.end()); }", True),
         ("n = cos(count);", False),
     ],
 )

@@ -20,9 +20,7 @@ def test_every_fault_is_found_or_none(text: str) -> None:
     told = Counter(faulty(FAULTY[text]))
     kinds, answers = {kind for kind, _ in told}, {answer for _, answer in told}
     assert kinds == {*FAULTS, "operand"}
-    unproved = {
-        "uses an element of a message that is made, kept or published"
-    }  # an address that is not constant
+    unproved = {"uses a variable for an address and a number", "uses Publish"}
     assert answers - unproved == {"equal", "not equal"}
     found = sum(count for (_, answer), count in told.items() if answer == "not equal")
     assert found > 90

@@ -25,7 +25,6 @@ from appliance.relay.monitors.passage import Passage
 from appliance.relay.monitors.places import HEAD, Place, Senders, Sighting
 from appliance.relay.monitors.trials import Trials
 from rosmop.run.outcomes import Outcome
-from rosmop.runtime.context import Published
 
 if TYPE_CHECKING:
     from rosmop.fast.wasm_runner import Prepared, Walked, Walker
@@ -182,16 +181,11 @@ class Lane:
         return walked.paused or passage.position == passage.end
 
     def _say(self, walked: Walked, passage: Passage) -> None:
-        """Tell what was put out, and publish what was published."""
+        """Tell what was put out."""
         middle, monitors = self._middle, self._middle.monitors
         assert monitors is not None  # noqa: S101  they have put it out
         head = HEAD if monitors.stamped(self._place[1]) else 0
-        published = [said for _, said in walked.output if isinstance(said, Published)]
-        if published:
-            middle.observer.published(published, self._place, passage.time)
         for position, said in walked.output:
-            if isinstance(said, Published):
-                continue
             first = position + 4
             size = _unpack_length(passage.view, position)[0]
             sighting = Sighting(passage, position, bytes(passage.view[first : first + min(size, head)]))
@@ -212,7 +206,6 @@ class Lane:
                 counted=[observer.hides_verdict(verdict, place) for verdict in walker.verdicts],
                 source=self._source,
                 changed=counts.changed,
-                published=[observer.hides_publication(*each, place) for each in walker.publishes],
             )
         self._walker, self._sight = walker, self._middle.sight
         self._until = _NEVER if monitors.next_due is None else monitors.next_due

@@ -401,20 +401,15 @@ class Middle:
                     told=[True] * len(walker.events),
                     counted=[observer.hides_verdict(verdict, place) for verdict in walker.verdicts],
                     source=self.senders.number(place),
-                    published=[observer.hides_publication(*each, place) for each in walker.publishes],
                 )
             return prepared
 
         try:
             fuel = self.pace(place).fuel(now, self.budget)
-            outcome = monitors.taken(way, body, now, prepare, fuel)
+            return monitors.taken(way, body, now, prepare, fuel)
         except Exception as error:  # noqa: BLE001  a defect of the walk must not end the relay
             observer.defect(error, place, now)
             return None
-        if outcome is not None and outcome.published:
-            observer.published(outcome.published, place, now)
-            outcome.published = ()
-        return outcome
 
     # --- time ---
 

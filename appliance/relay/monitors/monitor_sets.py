@@ -48,7 +48,7 @@ def prepare() -> None:
 
 _NOTHING = Part(
     Compiled((), (), {}, (), {}, Messages(Definitions({})), ()),
-    FeedModule(b"", 0, 0, 0, {}, (), {}, (), 0, {}),
+    FeedModule(b"", 0, 0, 0, {}, (), {}, (), 0),
 )
 
 

@@ -80,10 +80,6 @@ class Observer:
         """Whether the next such verdict at a place is only counted."""
         return self._observations.told("verdict", verdict.monitor, place, named(verdict))
 
-    def hides_publication(self, monitor: str, topic: str, place: Place) -> bool:
-        """Whether the next message that a monitor publishes on a topic, because of one at a place, is only counted."""
-        return self._observations.told(f"{self._prefix}publish", monitor, _of_publication(place, topic))
-
     def asks(self, verdict: Verdict, source: int) -> bool:
         """Whether a verdict is told in full, and so explained: as many as `_EXPLAINED` in a second are."""
         place = self.senders.place(source) or NOWHERE
@@ -125,17 +121,6 @@ class Observer:
                 size=len(published.data),
             )
             self._publish(published)
-
-    def published(self, messages: Iterable[Published], place: Place, time: int) -> None:
-        """Publish what comes of messages at this place, of which is told only how many there were."""
-        counts: dict[tuple[str, str], int] = {}
-        for message in messages:
-            key = message.monitor, message.topic
-            counts[key] = counts.get(key, 0) + 1
-            self._publish(message)
-        for (monitor, topic), count in counts.items():
-            where = _of_publication(place, topic)
-            self._observations.add(f"{self._prefix}publish", monitor, where, time, count)
 
     def said(self, line: LogLine, place: Place, time: int, sighting: Sighting | None = None) -> None:
         """Tell a line of output."""

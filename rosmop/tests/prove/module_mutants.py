@@ -133,9 +133,9 @@ FAULTY = {
     "a string and what stands behind it": """s() { int n = 0; double d = 0;
         event e(std::string f, double a) /stamped own/Stamped '{frame:f, values[1]:a}' when (f == "abc") {
             n = f.size(); d = a; } }""",
-    "messages that are made, kept and published": event(
-        "std_msgs::Int32 m; m.data = x + 1; if (x > 3) { PUBLISH(/out, std_msgs/Int32, m); told = m; n += x; }"
-        ' if (n > 7) { ROS_INFO("%d", n); PUBLISH(/told, std_msgs/Int32, told); }',
+    "output, and what the module leaves": event(
+        'if (x > 3) { ROS_INFO("%d", x + 1); n += x; } if (n > 7) { ROS_WARN("%d %d", n, x); }'
+        " if (n == 5) { PUBLISH(/told, std_msgs/Int32, told); }",
         "int x", "count:x", "std_msgs::Int32 told; int n = 0;",
     ),
 }  # fmt: skip
