@@ -185,7 +185,8 @@ def check(programs: Programs, count: int, directory: Path | None) -> Fed:
     return fed
 
 
-@pytest.mark.parametrize(("numbers", "taken"), [(True, 10), (False, 1)], ids=["numbers", "others"])
+# Statements with vectors, messages and most strings are for the engine: a program may have no others.
+@pytest.mark.parametrize(("numbers", "taken"), [(True, 4), (False, 0)], ids=["numbers", "others"])
 @pytest.mark.parametrize("seed", range(examples(12)))
 def test_effects_come_in_the_order_of_the_compiler(
     seed: int, *, numbers: bool, taken: int, tmp_path: Path
