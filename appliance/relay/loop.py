@@ -54,7 +54,7 @@ QUANTUM = RELAY_TURN.bounds.host * 1000
 _DIRECT = 64  # descriptors of a payer in the loop's epoll: those in one of its own cost 0.7 µs more each time
 _PAYERS = 512  # payers beyond which those that have nothing are forgotten
 _COSTLY = 3 * QUANTUM  # payers whose handlers stop when the quantum is over use less in one go
-_LITTLE = 1e-4  # seconds that nobody is charged for when nobody else has anything to do
+_LITTLE = 1e-4  # seconds that are not charged while no other payer is ready
 
 # Python takes memory for so many each time: for more of them not from where that is quick
 _EVENTS_PER_TURN = 64

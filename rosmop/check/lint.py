@@ -1,4 +1,4 @@
-"""What is probably not meant: events no property uses, handlers that never run, properties that say nothing."""
+"""Find probable mistakes: events no property uses, handlers that never run, properties that say nothing."""
 
 import re
 from collections.abc import Sequence

@@ -476,7 +476,7 @@ class Slices:
                     )
                     self._await(slice_)
 
-    # What is kept
+    # State
 
     def keep(self) -> None:
         """Note from now on which bindings change; those that there are now, at once."""

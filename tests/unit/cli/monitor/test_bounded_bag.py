@@ -61,7 +61,7 @@ def message(seconds: int, text: bytes) -> bytes:
 
 
 def refusal(place: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    """What is said of a bag that is refused."""
+    """Return the message for a bag that is rejected."""
     with pytest.raises(typer.Exit) as ended:
         list(Recorded(place, ["*"]).messages())
     assert ended.value.exit_code == 2
