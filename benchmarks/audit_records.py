@@ -21,8 +21,8 @@ from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.record import Record, RuleReference, Severity
 from appliance.audit.search import search
-from appliance.audit.verify import verify
-from appliance.forwarding.forwarder import Forwarder
+from appliance.audit.verification import verify
+from appliance.forwarding.log_forwarder import Forwarder
 from appliance.forwarding.receiver import StreamReceiver
 from appliance.forwarding.syslog import Formatter
 from benchmarks.syslog_sink import Sink

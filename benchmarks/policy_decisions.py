@@ -12,9 +12,9 @@ import random
 import statistics
 import time
 
-from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
 
 SIZES = (10, 100, 1_000, 10_000)
 REQUESTS = 4_000

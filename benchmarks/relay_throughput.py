@@ -30,7 +30,7 @@ from appliance.channel.messages import (
     UpstreamFound,
     UpstreamWanted,
 )
-from appliance.config import RecorderRules
+from appliance.configuration.settings import RecorderRules
 from appliance.supervisor.rings import Rings
 from tests.support.relay_driver import LOOPBACK, ChannelPeer, RelayProcess, call, free_port
 from tests.support.stated import stated

@@ -21,7 +21,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from appliance.store.state import RegistrationRow, StateStore
+from appliance.store.state_file import RegistrationRow, StateStore
 
 Keep = Callable[[RegistrationRow], None]
 

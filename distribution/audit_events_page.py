@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import appliance
 from appliance.audit.events import EVENTS, SEVERITIES
-from appliance.audit.kinds import ABOUT
 from appliance.audit.record import Severity
+from appliance.audit.repetition import ABOUT
 
 _FIELDS = frozenset(
     {"severity", "host", "caller_id", "category", "resource", "rule", "decision", "more", "reads", "reason"}

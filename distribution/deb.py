@@ -15,7 +15,7 @@ from email.utils import formatdate
 from pathlib import Path
 
 from appliance import __version__
-from appliance.inventory import RUNS
+from appliance.configuration.inventory import RUNS
 from appliance.supervisor.users import NUMERIC_IDS
 from distribution.checkout import ROOT, facts, revision, time_of_commit
 from distribution.environment import ARCHITECTURES, INTERPRETERS, Architecture, make_environment

@@ -21,7 +21,7 @@ from cyclonedx.output.json import JsonV1Dot6
 from packageurl import PackageURL
 
 from appliance import __version__
-from appliance.inventory import debian_licences, debian_packages, python_licences
+from appliance.configuration.inventory import debian_licences, debian_packages, python_licences
 
 SYSTEM = "debian-12"
 _PYTHON = "opt/rosrv/lib/python3*/site-packages/"

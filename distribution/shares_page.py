@@ -2,7 +2,7 @@
 
 import sys
 
-from appliance.shares.table import SHARES
+from appliance.quotas.table import SHARES
 
 _HEAD = """# Shares: what is finite, and who may have how much of it
 

@@ -284,14 +284,14 @@ inline give_subscription(s) {
 
 /* --- the relay: monitors ---------------------------------------------------------------------------------- */
 
-/* = appliance/relay/engine.py Engine._let_monitor */
+/* = appliance/relay/relay.py Engine._let_monitor */
 inline let_monitor(p) {
     through[p] = blocked || monitored[has];
     decided[p] = has
 }
 
-/* = appliance/relay/engine.py Engine._monitors_changed
-   = appliance/relay/monitors/middle.py Middle.look_again */
+/* = appliance/relay/relay.py Engine._monitors_changed
+   = appliance/relay/monitors/interceptor.py Middle.look_again */
 inline monitors_changed() {
     for (i : 0 .. PUBLISHERS - 1) {
 #ifndef MUTANT_STALE_LANE
@@ -308,7 +308,7 @@ inline monitors_changed() {
 }
 
 /* A set of monitors takes the place of the one before, between two messages.
-   = appliance/relay/monitors/middle.py Middle.loaded */
+   = appliance/relay/monitors/interceptor.py Middle.loaded */
 inline swap(revision, how) {
     has = revision;
     blocked = false;
@@ -327,8 +327,8 @@ inline swap(revision, how) {
 
 /* --- the relay: connections ------------------------------------------------------------------------------- */
 
-/* = appliance/relay/engine.py Engine._remove_topic
-   = appliance/relay/connections/topic.py RelayedTopic.cut_all */
+/* = appliance/relay/relay.py Engine._remove_topic
+   = appliance/relay/connections/relayed_topic.py RelayedTopic.cut_all */
 inline remove_topic(p) {
     placed[p] = false;
     flowing[p] = false;
@@ -349,7 +349,7 @@ inline remove_topic(p) {
     }
 }
 
-/* = appliance/relay/connections/topic.py RelayedTopic._pass_on
+/* = appliance/relay/connections/relayed_topic.py RelayedTopic._pass_on
    = appliance/relay/connections/subscriber.py Subscriber.deliver */
 inline pass_on(p, sequence, sent_under, judge) {
     for (j : 0 .. SUBSCRIBERS - 1) {
@@ -371,11 +371,11 @@ inline pass_on(p, sequence, sent_under, judge) {
 
 #define AS_BEFORE (has && !blocked && len(compiling) == 0 && number == has)
 
-/* = appliance/relay/engine.py Engine._carry_out */
+/* = appliance/relay/relay.py Engine._carry_out */
 inline carry_out() {
     to_relay?message, number, flags;
     if
-    /* = appliance/relay/monitors/middle.py Middle.state
+    /* = appliance/relay/monitors/interceptor.py Middle.state
        = appliance/relay/monitors/loader.py Loader.later */
     :: message == spec ->
         if
@@ -393,20 +393,20 @@ inline carry_out() {
             assert(nfull(compiling));
             compiling!number, flags | AHEAD
         fi
-    /* = appliance/relay/engine.py Engine._state
-       = appliance/relay/engine.py Engine._place_topic */
+    /* = appliance/relay/relay.py Engine._state
+       = appliance/relay/relay.py Engine._place_topic */
     :: message == place ->
         listening[number] = true;
         if
         :: !placed[number] -> placed[number] = true; let_monitor(number)
         :: else
         fi
-    /* = appliance/relay/engine.py Engine._withdrawn */
+    /* = appliance/relay/relay.py Engine._withdrawn */
     :: message == withdraw -> remove_topic(number)
-    /* = appliance/relay/grants.py StatedTable.state */
+    /* = appliance/relay/granted.py StatedTable.state */
     :: message == grant -> allowed[PAIR(number, flags)] = true
-    /* = appliance/relay/grants.py StatedTable.withdraw
-       = appliance/relay/engine.py Engine._cut_by
+    /* = appliance/relay/granted.py StatedTable.withdraw
+       = appliance/relay/relay.py Engine._cut_by
        = appliance/relay/connections/subscriber.py Subscriber.cut */
     :: message == revoke ->
         allowed[PAIR(number, flags)] = false;
@@ -417,7 +417,7 @@ inline carry_out() {
         :: else
         fi
 #endif
-    /* = appliance/relay/engine.py Engine._upstream_answered
+    /* = appliance/relay/relay.py Engine._upstream_answered
        = appliance/relay/connections/upstream.py Publisher.found
        = appliance/relay/connections/upstream.py Publisher._flow */
     :: message == found ->
@@ -442,7 +442,7 @@ end:
     /* It registers, once: a turn of control.
        = appliance/master/calls/registration.py RegistrationCalls.register_publisher
        = appliance/master/graph/graph.py Graph.registered
-       = appliance/master/reach/relays.py RelayControl.place */
+       = appliance/master/endpoints/relay_control.py RelayControl.place */
     :: atomic {
         !came_p[me] -> came_p[me] = true;
         if
@@ -473,7 +473,7 @@ end:
         fi
        }
     /* It is told a list (publisherUpdate): it drops whom the list has no more, and asks whom it is not connected to.
-       = appliance/master/reach/delivery.py Delivery.push */
+       = appliance/master/endpoints/delivery.py Delivery.push */
     :: atomic {
         news[me]?list ->
         for (i : 0 .. PUBLISHERS - 1) {
@@ -533,10 +533,10 @@ end:
        }
     /* The relay takes the connection, when it has carried out what control has told it. Who lacks something that is
        held back waits.
-       = appliance/relay/engine.py Engine._introduced
-       = appliance/relay/connections/links.py Link.catch_up
+       = appliance/relay/relay.py Engine._introduced
+       = appliance/relay/connections/loop_channel.py Link.catch_up
        = appliance/relay/connections/admission.py missing
-       = appliance/relay/engine.py Engine._subscribe */
+       = appliance/relay/relay.py Engine._subscribe */
     :: atomic {
         up && (awaited || len(to_relay) == 0) && listening[p] && connection[PAIR(p, s)] == KNOCKED ->
         if
@@ -560,7 +560,7 @@ inline find_upstream(p) {
 }
 
 /* What the relay says.
-   = appliance/master/reach/relays.py RelayControl._received */
+   = appliance/master/endpoints/relay_control.py RelayControl._received */
 proctype RVMaster() POSSIBLE {
 end:
     do
@@ -568,7 +568,7 @@ end:
     :: atomic { said == taken && waiting -> settle() }
     /* = appliance/specifications/rollout.py Rollout._refused */
     :: atomic { said == refused && waiting -> take_back_trial() }
-    /* = appliance/master/reach/relays.py RelayControl._find_upstream */
+    /* = appliance/master/endpoints/relay_control.py RelayControl._find_upstream */
     :: atomic { asked[0] == ASKING -> find_upstream(0) }
 #if PUBLISHERS > 1
     :: atomic { asked[1] == ASKING -> find_upstream(1) }
@@ -583,11 +583,11 @@ end:
         fi
        }
 #ifdef TRACE
-    /* = appliance/master/reach/traffic.py Carried.opened
-       = appliance/master/reach/traffic.py Carried.closed */
+    /* = appliance/master/endpoints/traffic.py Carried.opened
+       = appliance/master/endpoints/traffic.py Carried.closed */
     :: atomic { reports?[opened] && NEXT_IS(opened, 0, 0) -> reports?opened; at++ }
     :: atomic { reports?[closed] && NEXT_IS(closed, 0, 0) -> reports?closed; at++ }
-    /* = appliance/master/upkeep/reminders.py Reminders._remind */
+    /* = appliance/master/reconcile/reminders.py Reminders._remind */
     :: atomic { linked && subscribed[0] && len(news[0]) == 0 && connection[0] == NONE && !request[0] -> tell(0) }
 #endif
     /* The relay does not answer in time.
@@ -597,7 +597,7 @@ end:
 }
 
 /* Monitors are loaded, replaced and removed, one change after the other.
-   = appliance/specifications/monitors.py Monitors._change
+   = appliance/specifications/specifications.py Monitors._change
    = appliance/specifications/rollout.py Rollout._try */
 proctype Specifications() POSSIBLE {
 end:
@@ -674,7 +674,7 @@ end:
 #define HOLDS_NOTHING_BACK !awaited
 #endif
 
-/* = appliance/relay/engine.py Engine.take */
+/* = appliance/relay/relay.py Engine.take */
 proctype Relay() POSSIBLE {
     mtype message;
 end:
@@ -687,7 +687,7 @@ end:
         up && len(compiling) > 0 -> compiling?number, flags;
         if
         :: taken_by_relay[number] -> swap(number, flags)
-        /* = appliance/relay/monitors/middle.py Middle._refuse */
+        /* = appliance/relay/monitors/interceptor.py Middle._refuse */
         :: else ->
             awaited = awaited && !(flags & AHEAD);
             if
@@ -712,9 +712,9 @@ end:
         up && placed[p] && !flowing[p] && asked[p] == NOT && (through[p] || connected_to(p)) ->
         asked[p] = ASKING
        }
-    /* = appliance/relay/connections/topic.py RelayedTopic.received
-       = appliance/relay/monitors/lane.py Lane.through
-       = appliance/relay/monitors/lane.py Lane._prepare */
+    /* = appliance/relay/connections/relayed_topic.py RelayedTopic.received
+       = appliance/relay/monitors/topic_pipeline.py Lane.through
+       = appliance/relay/monitors/topic_pipeline.py Lane._prepare */
     :: atomic {
         up && flowing[p] && len(upstream[p]) > 0 ->
 #ifdef MUTANT_GIVEN_AGAIN
@@ -764,7 +764,7 @@ end:
 }
 
 /* The relay dies, and is started again; control states everything afresh.
-   = appliance/supervisor/life.py Life */
+   = appliance/supervisor/process_handle.py Life */
 proctype Supervisor() POSSIBLE {
 #ifdef MUTANT_STATED_LATER
     bool later;
@@ -803,9 +803,9 @@ end:
         :: else
         fi
        }
-    /* = appliance/master/reach/relays.py RelayControl.attach
+    /* = appliance/master/endpoints/relay_control.py RelayControl.attach
        = appliance/specifications/rollout.py Rollout.statement
-       = appliance/master/reach/relays.py RelayControl._place
+       = appliance/master/endpoints/relay_control.py RelayControl._place
        = appliance/control/process.py _Control._relay_link
        = appliance/master/graph/graph.py Graph.tell_everybody */
     :: atomic {

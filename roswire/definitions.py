@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Self, TypeVar
 
 from roswire.errors import DefinitionError
-from roswire.layout import Layout, LayoutBuilder, LayoutTooLargeError
+from roswire.message_layout import Layout, LayoutBuilder, LayoutTooLargeError
 from roswire.message_text import (
     BUILTINS,
     PRIMITIVES,

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from appliance.network import links
+from appliance.network import interfaces
 from appliance.network.namespaces import Namespace, has_privileges
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance
@@ -121,7 +121,7 @@ def pytest_configure(config: pytest.Config) -> None:
     inside = contextlib.ExitStack()
     inside.enter_context(namespace.entered())
     config.add_cleanup(inside.close)
-    links.set_link(Namespace.own(), "lo", up=True)
+    interfaces.set_link(Namespace.own(), "lo", up=True)
     namespace.delete()  # only the name: it ends with the worker's last process
 
 

@@ -23,10 +23,10 @@ from appliance.api.problems import ProblemError, too_many
 from appliance.api.rates import Buckets, peer_key
 from appliance.channel.answers.tokens import TokenRole
 from appliance.channel.messages.api import Asked, TokenKept
-from appliance.config import is_loopback
-from appliance.order_proof import reading_hash, reading_id
-from appliance.shares.pool import Standing
-from appliance.store.tokens import is_secret, parse_token
+from appliance.configuration.settings import is_loopback
+from appliance.quotas.pool import Standing
+from appliance.signing.request_signing import reading_hash, reading_id
+from appliance.store.access_tokens import is_secret, parse_token
 
 _KNOWN_SECONDS = 900.0
 _MOST_KNOWN = 1024

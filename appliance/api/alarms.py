@@ -8,7 +8,7 @@ import msgspec
 
 from appliance.channel.answers.field_docs import told
 from appliance.channel.answers.status import Status
-from appliance.channel.health import no_relay, probe_failed
+from appliance.channel.status_summary import no_relay, probe_failed
 
 
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):

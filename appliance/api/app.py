@@ -30,7 +30,7 @@ from appliance.api.control import ControlAwayError
 from appliance.api.parameters import only_known
 from appliance.api.problems import REASON, BadInput, ProblemError, bad_input, defect
 from appliance.api.services import Services
-from appliance.wrong_values import refusal
+from appliance.base.validation_messages import refusal
 
 _DESCRIPTION = """\
 The appliance's own interface for scripts and other programs. Every call but the health probes needs a bearer token

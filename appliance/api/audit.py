@@ -27,21 +27,21 @@ from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
 from appliance.api.streams import Held, Streams, in_thread, peer_of, turn
 from appliance.api.unrecorded import unrecorded
+from appliance.audit.chain_findings import Verification
+from appliance.audit.chain_proofs import evidence, evidence_line
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
-from appliance.audit.database import LogUnreadableError
-from appliance.audit.evidence import evidence, evidence_line
-from appliance.audit.findings import Verification
-from appliance.audit.output import Entry, as_json, as_object, without_contents
+from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Severity
+from appliance.audit.record_format import Entry, as_json, as_object, without_contents
 from appliance.audit.schema import json_schema
 from appliance.audit.search import Follower, Shown, export, search, show
 from appliance.audit.signatures import KeyUnreadableError
-from appliance.audit.verify import verify
+from appliance.audit.verification import verify
 from appliance.channel.admin import PolicyWanted
 from appliance.channel.answers.policy import Granted, Why
 from appliance.policy.grant import UngrantableError
-from appliance.shares.table import REST_STREAM_PEERS, REST_STREAMS
+from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
 _T = TypeVar("_T")
 _SEARCHES = 4

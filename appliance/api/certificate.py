@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from appliance.whole_files import write_whole
+from appliance.base.atomic_files import write_whole
 
 CERTIFICATE = "certificate.pem"
 KEY = "key.pem"

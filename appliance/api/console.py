@@ -22,7 +22,7 @@ from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 from appliance.api.problems import ProblemError
-from appliance.config import Settings
+from appliance.configuration.settings import Settings
 
 VIEWS = ("now", "graph", "audit", "policy", "monitors", "hosts", "recordings")
 _PREFIX = "/console/static/"

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import msgspec
 
-from appliance.audit.kinds import KIND
-from appliance.audit.output import rule_text
 from appliance.audit.record import Record
+from appliance.audit.record_format import rule_text
+from appliance.audit.repetition import KIND
 from appliance.channel.messages.relay import NO_GRANT
 from appliance.policy.grant import Asked, UngrantableError, asked
 from appliance.policy.model import Category

@@ -30,7 +30,7 @@ from appliance.api.services import Services
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
 from appliance.channel.answers.hosts import NewCertificate
-from appliance.ipsec.kit import archive, members
+from appliance.ipsec.enrolment_kit import archive, members
 
 _ALL = "all"
 _ALL_PER_MINUTE = 60

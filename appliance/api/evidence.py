@@ -14,7 +14,7 @@ from appliance.api.roles import Investigator, Reader, problem_of
 from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
 from appliance.api.streams import Held, in_thread, peer_of
-from appliance.audit.database import LogUnreadableError
+from appliance.audit.log_database import LogUnreadableError
 from appliance.channel.admin import AdminAnswer, AdminRequest
 from appliance.evidence.bundle import BundleError, Kept, Span, export
 

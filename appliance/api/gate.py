@@ -30,8 +30,8 @@ from appliance.api.journal import Journal
 from appliance.api.problems import REASON, ProblemError, defect, too_many
 from appliance.api.rates import Buckets
 from appliance.channel.messages.api import Asked
-from appliance.config import ApiLimits
-from appliance.order_proof import HEADER
+from appliance.configuration.settings import ApiLimits
+from appliance.signing.request_signing import HEADER
 
 _log = structlog.get_logger()
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network

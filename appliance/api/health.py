@@ -13,7 +13,7 @@ from appliance.api.roles import add_look
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.channel.admin import InventoryWanted, StatusWanted
-from appliance.channel.health import unserved
+from appliance.channel.status_summary import unserved
 
 _PATIENCE_SECONDS = 1.0
 

@@ -22,7 +22,7 @@ from appliance.api.routing import ETAG, Responses, Routes, Tagged, answer, body,
 from appliance.api.services import Services
 from appliance.channel import admin
 from appliance.channel.answers import hosts as answers
-from appliance.ipsec.kit import archive
+from appliance.ipsec.enrolment_kit import archive
 from appliance.ipsec.requests import make_key, signing_request
 
 SLOW_SECONDS = 45.0  # charon may have to be started first

@@ -19,14 +19,14 @@ from appliance.channel.admin import PolicyLoad
 from appliance.channel.answers.graph import Registration
 from appliance.channel.answers.policy import Granted, PolicyKnown, Why
 from appliance.policy.actions import BadWordError, check_resource, find_hosts
-from appliance.policy.compiler import compile_policy
 from appliance.policy.diff import diff
 from appliance.policy.explain import Explanation, explain
-from appliance.policy.findings import PolicyError
 from appliance.policy.grant import UngrantableError, grant
 from appliance.policy.judgement import Judged, Known, judge
-from appliance.policy.live import Live, endings
+from appliance.policy.live_rights import Live, endings
 from appliance.policy.model import Category, Request
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import PolicyError
 from appliance.policy.rights import needs_node
 
 _GRANTED = (

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from appliance.channel.answers.hosts import KitParts
-from appliance.ipsec.kit import Kit
-from appliance.network.protect import parse_ports, parse_services, protection
+from appliance.ipsec.enrolment_kit import Kit
+from appliance.network.close_ports import parse_ports, parse_services, protection
 
 
 @dataclass(frozen=True)

@@ -26,15 +26,15 @@ from uvicorn.config import Config
 from uvicorn.server import ServerState
 
 from appliance.api.rates import peer_key
-from appliance.config import ApiLimits
+from appliance.configuration.settings import ApiLimits
 from appliance.policy.model import Address
+from appliance.quotas.descriptors import connections_within
+from appliance.quotas.pool import Standing
+from appliance.quotas.table import REST_CONNECTIONS
 from appliance.rpc.acceptor import Acceptor
+from appliance.rpc.connection_table import Stage, Visitors
 from appliance.rpc.front import Front, HttpLimits
 from appliance.rpc.processor_time import ProcessorTime
-from appliance.rpc.visitors import Stage, Visitors
-from appliance.shares.descriptors import connections_within
-from appliance.shares.pool import Standing
-from appliance.shares.table import REST_CONNECTIONS
 
 _HANDSHAKE_SECONDS = 0.002  # of processor time, that a TLS handshake takes on a slow machine
 _KEEP_ALIVE_SECONDS = 30

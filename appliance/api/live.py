@@ -25,7 +25,7 @@ from appliance.api.services import Services
 from appliance.api.streams import Held, Streams, peer_of
 from appliance.channel.admin import GraphWanted
 from appliance.channel.answers.status import Status
-from appliance.shares.table import REST_STREAM_PEERS, REST_STREAMS
+from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
 _PING_SECONDS = 15
 _SHARE = 20  # of the time it takes to make the graph, that is how long one waits before the next

@@ -21,8 +21,8 @@ from appliance.channel.admin import MetricsWanted
 from appliance.channel.answers.hosts import Host
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import ForwardingState, ProcessInfo
-from appliance.channel.health import no_relay, probe_failed, process_names
-from appliance.metrics import METRICS, Metric
+from appliance.channel.status_summary import no_relay, probe_failed, process_names
+from appliance.telemetry.metrics import METRICS, Metric
 
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 _Samples = Iterable[tuple[tuple[str, ...], Any]]

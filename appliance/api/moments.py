@@ -12,8 +12,8 @@ from typing import Any
 import msgspec
 
 from appliance.api.problems import ProblemError
-from appliance.audit.moment import parse_moment
-from appliance.audit.output import rfc3339
+from appliance.audit.record_format import rfc3339
+from appliance.audit.timestamps import parse_moment
 from appliance.channel.answers.field_docs import UNIT
 
 _UTC = "_utc"

@@ -16,8 +16,8 @@ from appliance.api.problems import ProblemError
 from appliance.api.roles import Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes, Tagged, file, tagged
 from appliance.api.services import Services
-from appliance.audit.output import Entry, rfc3339, without_contents
 from appliance.audit.query import Filter
+from appliance.audit.record_format import Entry, rfc3339, without_contents
 from appliance.audit.search import search
 from appliance.channel.admin import MonitorRevisions, MonitorRevisionWanted, MonitorsWanted
 from appliance.channel.answers.monitors import MonitorRevisionList, Monitors, MonitorState, RevisionTexts

@@ -3,7 +3,7 @@
 from fastapi import Request
 
 from appliance.api.problems import BadInput, bad_input
-from appliance.wrong_values import meant
+from appliance.base.validation_messages import meant
 
 _MOST_SHOWN = 5
 

@@ -20,7 +20,6 @@ import structlog
 import uvloop
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from appliance import late
 from appliance.api.access import Doorkeeper
 from appliance.api.certificate import pin_of, renew, tls_context
 from appliance.api.control import ControlLink
@@ -30,10 +29,11 @@ from appliance.api.history import History, measures_of
 from appliance.api.journal import FOLD_SECONDS, Journal
 from appliance.api.listener import Listener
 from appliance.api.services import Services
+from appliance.base import lazy_imports
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages.api import ApiLink
-from appliance.config import Settings, load_resolved
+from appliance.configuration.settings import Settings, load_resolved
 
 _log = structlog.get_logger()
 _WITHOUT_CONTROL_SECONDS = 30.0
@@ -61,7 +61,7 @@ class _Application:
         await self._made(scope, receive, send)
 
     def _make(self) -> ASGIApp:
-        made: ASGIApp = late.load("appliance.api.app").build_app(self._services)
+        made: ASGIApp = lazy_imports.load("appliance.api.app").build_app(self._services)
         return made
 
 

@@ -18,7 +18,7 @@ from fastapi import APIRouter, Depends, Request, Response
 from appliance.api.moments import in_full
 from appliance.api.preconditions import etag
 from appliance.api.problems import BadInput, ProblemError, bad_input
-from appliance.wrong_values import body_refusal, meant
+from appliance.base.validation_messages import body_refusal, meant
 
 A = TypeVar("A")
 Responses = dict[int | str, dict[str, Any]]

@@ -9,8 +9,8 @@ from appliance.api.control import ControlLink
 from appliance.api.history import History
 from appliance.api.journal import Journal
 from appliance.api.streams import Streams
-from appliance.config import Settings
-from appliance.shares.table import REST_EXPORTS
+from appliance.configuration.settings import Settings
+from appliance.quotas.table import REST_EXPORTS
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,8 @@ from starlette.types import Receive, Scope, Send
 from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
 from appliance.channel.answers.tokens import TokenRole
-from appliance.shares.pool import Pool, Standing
-from appliance.shares.table import Share
+from appliance.quotas.pool import Pool, Standing
+from appliance.quotas.table import Share
 
 _PATIENCE_SECONDS = 5.0
 A = TypeVar("A", str, bytes)

@@ -2,8 +2,8 @@
 
 from appliance.audit.events import EVENTS
 from appliance.audit.query import Filter
+from appliance.base.validation_messages import meant
 from appliance.policy.model import Category
-from appliance.wrong_values import meant
 
 CATEGORIES = (*Category, "monitor", "parameter", "publication", "rest", "service", "subscription", "topic")
 """What a record may be about: what the policy decides, and what else there is."""

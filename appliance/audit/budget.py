@@ -15,8 +15,8 @@ from collections import deque
 from collections.abc import Callable
 
 from appliance.audit.record import Record
-from appliance.shares.pool import Bounds, Pool, Standing
-from appliance.shares.table import AUDIT_BYTES, AUDIT_RESERVE
+from appliance.quotas.pool import Bounds, Pool, Standing
+from appliance.quotas.table import AUDIT_BYTES, AUDIT_RESERVE
 
 RATE = 64 << 10
 """Bytes a second that a host pays off; on a disk that is nearly full a `_SCARCE` part of it."""

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import msgspec
 
-from appliance.audit.findings import Kind, LogFinding
+from appliance.audit.chain_findings import Kind, LogFinding
 from appliance.audit.signatures import ASKED_AT_ONCE, signature_is_right
-from appliance.sealed_texts import Checkpoint, checkpoint_hash, parse_checkpoint
+from appliance.signing.signed_statements import Checkpoint, checkpoint_hash, parse_checkpoint
 
 _HASH = 32
 _HEADER = 8

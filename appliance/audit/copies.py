@@ -18,11 +18,11 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.audit.database import LogUnreadableError, reading
-from appliance.audit.findings import Elsewhere, Kind, LogFinding
+from appliance.audit.chain_findings import Elsewhere, Kind, LogFinding
+from appliance.audit.log_database import LogUnreadableError, reading
 from appliance.audit.signatures import signature_is_right
-from appliance.given_files import open_given
-from appliance.sealed_texts import Checkpoint, parse_checkpoint
+from appliance.base.input_files import open_given
+from appliance.signing.signed_statements import Checkpoint, parse_checkpoint
 
 SYSLOG_ELEMENT = "rosrvCheckpoint@32473"
 _LONGEST_LINE = 65_536

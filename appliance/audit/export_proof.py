@@ -13,13 +13,13 @@ from typing import NamedTuple
 import msgspec
 
 from appliance.audit.chain import follows, link
+from appliance.audit.chain_findings import Kind, LogFinding
+from appliance.audit.chain_proofs import Chain
 from appliance.audit.columns import to_columns
 from appliance.audit.copies import SignedCheckpoint
-from appliance.audit.evidence import Chain
-from appliance.audit.findings import Kind, LogFinding
-from appliance.audit.output import Entry, entry_of
+from appliance.audit.record_format import Entry, entry_of
 from appliance.audit.signatures import signature_is_right
-from appliance.given_files import lines_given
+from appliance.base.input_files import lines_given
 
 _LONGEST_LINE = 16 << 20
 _MOST_FINDINGS = 1000

@@ -19,7 +19,8 @@ budget (`Record.folds`). Invariants:
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from appliance.audit.kinds import (
+from appliance.audit.record import Record
+from appliance.audit.repetition import (
     ALL,
     HOST,
     KIND,
@@ -33,9 +34,8 @@ from appliance.audit.kinds import (
     subject,
     summary,
 )
-from appliance.audit.record import Record
-from appliance.shares.pool import Bounds, Pool, Standing
-from appliance.shares.table import AUDIT_KINDS, AUDIT_READ_KINDS
+from appliance.quotas.pool import Bounds, Pool, Standing
+from appliance.quotas.table import AUDIT_KINDS, AUDIT_READ_KINDS
 
 _Holder = tuple[str | None, Standing]
 

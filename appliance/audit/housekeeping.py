@@ -15,13 +15,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from appliance.audit.database import LogUnreadableError
+from appliance.audit.log_database import LogUnreadableError
+from appliance.audit.log_writer import ChainWriter
 from appliance.audit.record import Record, Severity
 from appliance.audit.removal import Remover
 from appliance.audit.signatures import Signatures
 from appliance.audit.waiters import Waiter, answer
-from appliance.audit.writer import ChainWriter
-from appliance.sealed_texts import parse_checkpoint
+from appliance.signing.signed_statements import parse_checkpoint
 
 WRITE_ERRORS = (sqlite3.Error, OSError, LogUnreadableError)
 _TEXT_BACKLOG = 20_000

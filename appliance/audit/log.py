@@ -26,22 +26,22 @@ import msgspec
 import structlog
 
 from appliance.audit.budget import Budget
-from appliance.audit.database import LogUnreadableError
+from appliance.audit.disk_space import Room
 from appliance.audit.folding import Folder, FoldSettings
-from appliance.audit.holders import holders
 from appliance.audit.housekeeping import WRITE_ERRORS, Checkpoints, Housekeeping
 from appliance.audit.ids import IdSource
-from appliance.audit.kinds import summary
+from appliance.audit.lock_holders import holders
+from appliance.audit.log_database import LogUnreadableError
+from appliance.audit.log_writer import ChainWriter
 from appliance.audit.losses import Lost
 from appliance.audit.record import Record, Repeated, Severity
 from appliance.audit.removal import Remover
+from appliance.audit.repetition import summary
 from appliance.audit.retention import Retention
-from appliance.audit.room import Room
 from appliance.audit.signatures import RemovalSigner, Signatures, Signer
 from appliance.audit.waiters import Waiter, answer
-from appliance.audit.writer import ChainWriter
-from appliance.shares.pool import Standing
-from appliance.shares.table import AUDIT_RESERVE
+from appliance.quotas.pool import Standing
+from appliance.quotas.table import AUDIT_RESERVE
 
 Durability = Literal["strict", "batched"]
 _GATHER_SECONDS = 0.02

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from appliance.audit.database import TEXT_OF_RECORD
+from appliance.audit.log_database import TEXT_OF_RECORD
 from appliance.audit.record import Severity
 
 _LONGEST_PATTERN = 256

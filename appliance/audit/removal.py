@@ -8,11 +8,11 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+from appliance.audit.log_writer import ChainWriter, RemovedRange
 from appliance.audit.record import Record
 from appliance.audit.retention import Retention, worth_keeping
 from appliance.audit.signatures import RemovalSigner, Signatures
-from appliance.audit.writer import ChainWriter, RemovedRange
-from appliance.sealed_texts import Removal, limit_of_removal
+from appliance.signing.signed_statements import Removal, limit_of_removal
 
 _AT_ONCE = 512
 _LOOK_SECONDS = 5.0

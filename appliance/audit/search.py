@@ -14,10 +14,10 @@ import msgspec
 
 from appliance.audit.chain import StoredColumns
 from appliance.audit.columns import from_columns
-from appliance.audit.database import COLUMNS, LogUnreadableError, open_for_reading
 from appliance.audit.ids import ID_LENGTH
-from appliance.audit.output import Entry
+from appliance.audit.log_database import COLUMNS, LogUnreadableError, open_for_reading
 from appliance.audit.query import Condition, Filter, FilterError, conditions, text_condition, text_match
+from appliance.audit.record_format import Entry
 
 LARGEST_PAGE = 10_000
 _SELECTIVE = 20_000

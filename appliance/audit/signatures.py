@@ -14,9 +14,9 @@ from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_public_key
 
-from appliance.audit.writer import ChainWriter
-from appliance.given_files import read_given
-from appliance.whole_files import write_whole
+from appliance.audit.log_writer import ChainWriter
+from appliance.base.atomic_files import write_whole
+from appliance.base.input_files import read_given
 
 Signer = Callable[[int, bytes], None]
 RemovalSigner = Callable[[int, bytes, bytes], None]

@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from appliance.audit.output import rule_text
 from appliance.audit.record import Record
+from appliance.audit.record_format import rule_text
 
 
 def lines_of(record: Record) -> Iterator[str]:

@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Self
 
 from appliance.backup.contents import AUDIT_LOG, KEPT_PARTS, MOST_FILES, BackupError, belongs, trouble_with
-from appliance.given_files import open_given
+from appliance.base.input_files import open_given
 
 _PIECE = 1 << 20
 

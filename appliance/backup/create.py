@@ -33,7 +33,7 @@ from appliance.backup.contents import (
     is_passing,
     trouble_with,
 )
-from appliance.backup.database import copy_database
+from appliance.backup.database_copy import copy_database
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from appliance.backup.contents import BackupError
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.state import StateDirectory, foreign
+from appliance.supervisor.state_directory import StateDirectory, foreign
 
 _SMALL = 64 << 10
 """Bytes up to which a file is written over."""

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.shipped import SHIPPED
 from appliance.cli.output import refused
-from appliance.shipped import SHIPPED
 
 
 def demo(

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from appliance.channel.admin import StatusWanted
-from appliance.channel.health import unserved
+from appliance.channel.status_summary import unserved
 from appliance.cli.admin_socket import AdminSocket, NotRunningError
 
 _STATE = "/var/lib/rosrv"  # the default of the configuration's key `state`

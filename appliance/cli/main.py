@@ -15,47 +15,47 @@ _CONFIRM = "Keep what was loaded with --confirm-within; exit status 1 when there
 
 VERBS: dict[str, Verb | Group] = {
     "up": Verb("up:up"),
-    "status": Verb("status:status"),
+    "status": Verb("status_verb:status"),
     "selftest": Verb("selftest.verb:selftest"),
     "demo": Verb("demo:demo"),
-    "protect": Verb("protect:protect", "Close the ROS ports of this machine to all but the appliance."),
+    "protect": Verb("protect_verb:protect", "Close the ROS ports of this machine to all but the appliance."),
     "audit": Group(
         "Review the audit log and prove that it is complete.",
         {
-            "why": Verb("policy.grant:why"),
-            "search": Verb("audit.verbs:search"),
-            "tail": Verb("audit.verbs:tail"),
-            "show": Verb("audit.verbs:show"),
-            "verify": Verb("audit.verbs:verify"),
-            "checkpoints": Verb("audit.verbs:checkpoints"),
-            "export": Verb("audit.verbs:export"),
+            "why": Verb("policy.grant_verb:why"),
+            "search": Verb("audit.audit_verbs:search"),
+            "tail": Verb("audit.audit_verbs:tail"),
+            "show": Verb("audit.audit_verbs:show"),
+            "verify": Verb("audit.audit_verbs:verify"),
+            "checkpoints": Verb("audit.audit_verbs:checkpoints"),
+            "export": Verb("audit.audit_verbs:export"),
         },
     ),
     "evidence": Group(
         "Evidence: what happened, in one file that proves itself elsewhere.",
         {
-            "export": Verb("evidence:export_evidence"),
-            "verify": Verb("evidence:verify"),
-            "verifier": Verb("evidence:verifier"),
+            "export": Verb("evidence_verbs:export_evidence"),
+            "verify": Verb("evidence_verbs:verify"),
+            "verifier": Verb("evidence_verbs:verifier"),
         },
     ),
     "policy": Group(
         "Check, explain, test, compare, learn and change access policies.",
         {
-            "learn": Verb("policy.learning:learn_policy"),
-            "reload": Verb("policy.in_force:reload"),
+            "learn": Verb("policy.learn_verb:learn_policy"),
+            "reload": Verb("policy.live_verbs:reload"),
             "rollback": Verb(
-                "policy.in_force:rollback", "Bring a kept revision of the policy into force again."
+                "policy.live_verbs:rollback", "Bring a kept revision of the policy into force again."
             ),
-            "confirm": Verb("policy.in_force:confirm", _CONFIRM),
+            "confirm": Verb("policy.live_verbs:confirm", _CONFIRM),
             "revisions": Verb(
-                "policy.in_force:revisions", "List the kept revisions of the policy, the newest first."
+                "policy.live_verbs:revisions", "List the kept revisions of the policy, the newest first."
             ),
-            "grant": Verb("policy.grant:grant"),
-            "check": Verb("policy.verbs:check"),
-            "explain": Verb("policy.verbs:explain_request"),
-            "test": Verb("policy.verbs:test"),
-            "diff": Verb("policy.verbs:compare"),
+            "grant": Verb("policy.grant_verb:grant"),
+            "check": Verb("policy.policy_verbs:check"),
+            "explain": Verb("policy.policy_verbs:explain_request"),
+            "test": Verb("policy.policy_verbs:test"),
+            "diff": Verb("policy.policy_verbs:compare"),
         },
     ),
     "monitor": Group(
@@ -92,33 +92,34 @@ VERBS: dict[str, Verb | Group] = {
     ),
     "topic": Group(
         "What is said on the topics of the running robot.",
-        {"echo": Verb("topic:echo"), "info": Verb("topic:info")},
+        {"echo": Verb("topic_verbs:echo"), "info": Verb("topic_verbs:info")},
     ),
     "record": Group(
         "The flight recorder: what was said before and after something happened.",
         {
-            "now": Verb("record:now"),
-            "list": Verb("record:list_recordings"),
-            "show": Verb("record:show"),
-            "timeline": Verb("record:show_timeline"),
-            "messages": Verb("record:messages"),
-            "fetch": Verb("record:fetch"),
-            "remove": Verb("record:remove"),
+            "now": Verb("record_verbs:now"),
+            "list": Verb("record_verbs:list_recordings"),
+            "show": Verb("record_verbs:show"),
+            "timeline": Verb("record_verbs:show_timeline"),
+            "messages": Verb("record_verbs:messages"),
+            "fetch": Verb("record_verbs:fetch"),
+            "remove": Verb("record_verbs:remove"),
         },
     ),
     "sign": Verb("sign:sign"),
     "version": Verb("version:version"),
     "config": Group(
-        "Check or show the configuration.", {"check": Verb("config:check"), "show": Verb("config:show")}
+        "Check or show the configuration.",
+        {"check": Verb("config_verbs:check"), "show": Verb("config_verbs:show")},
     ),
     "host": Group(
         "Enrol, list and revoke hosts that come through IPsec tunnels.",
         {
-            "add": Verb("host.verbs:add"),
-            "kit": Verb("host.verbs:kit"),
-            "list": Verb("host.verbs:list_hosts"),
-            "reload": Verb("host.verbs:reload"),
-            "revoke": Verb("host.verbs:revoke"),
+            "add": Verb("host.host_verbs:add"),
+            "kit": Verb("host.host_verbs:kit"),
+            "list": Verb("host.host_verbs:list_hosts"),
+            "reload": Verb("host.host_verbs:reload"),
+            "revoke": Verb("host.host_verbs:revoke"),
         },
     ),
     "backup": Verb("backup:backup"),

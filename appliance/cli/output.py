@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.text import Text
 
 from appliance.api.moments import in_full
-from appliance.whole_files import NotLastingError, write_where_told
+from appliance.base.atomic_files import NotLastingError, write_where_told
 
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
 

@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.channel.answers.status import ClockState, ProcessInfo
-from appliance.channel.health import process_names
+from appliance.channel.status_summary import process_names
 from appliance.cli.tables import table_of
 
 _YELLOW = "yellow"

@@ -21,12 +21,14 @@ from appliance.cli.admin_socket import AdminSocket, NotRunningError
 from appliance.cli.output import Json, printable, say_json, usage_error
 
 if TYPE_CHECKING:
-    from appliance.cli.audit.rest import RestLog
+    from appliance.cli.audit.log_over_rest import RestLog
     from appliance.cli.audit.source import FileLog
     from appliance.cli.rest.orders import RestWay
     from appliance.cli.rest.session import RestClient
 
-DEFAULT_STATE = Path("/var/lib/rosrv")  # as appliance.config has it, which is not imported for every verb
+DEFAULT_STATE = Path(
+    "/var/lib/rosrv"
+)  # as appliance.configuration.settings has it, which is not imported for every verb
 TOKEN = "ROSRV_TOKEN"  # noqa: S105  the name of the variable that has it
 State = Annotated[
     Path,

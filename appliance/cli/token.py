@@ -8,8 +8,8 @@ import typer
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke
 from appliance.channel.answers.tokens import TokenRole
 from appliance.cli import completion
+from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say, say_json
-from appliance.cli.spans import span_given
 from appliance.cli.target import Appliance, speaks
 
 

@@ -10,12 +10,12 @@ import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
 
-from appliance.config import Settings
-from appliance.given_files import read_given_text
-from appliance.policy.findings import PolicyError
+from appliance.base.input_files import read_given_text
+from appliance.configuration.settings import Settings
 from appliance.policy.judgement import Known, judge
 from appliance.policy.policy import DEFAULT_PORTS
-from appliance.site_keys import read_signature
+from appliance.policy.policy_findings import PolicyError
+from appliance.signing.site_keys import read_signature
 from appliance.supervisor.errors import StartError
 
 _DISK = "disk"
@@ -69,7 +69,7 @@ def _require_specifications(folder: Path, site_keys: Sequence[str]) -> None:
 
 
 def _wrong_with(folder: Path, site_keys: Sequence[str]) -> str:
-    from appliance.specifications.files import (  # noqa: PLC0415  the compiler: not where there are none
+    from appliance.specifications.specification_files import (  # noqa: PLC0415  the compiler: not where there are none
         SpecificationsRefusedError,
         check,
         read_folder,

@@ -3,7 +3,7 @@
 from appliance.channel.admin import InventoryWanted
 from appliance.cli.output import say, say_json
 from appliance.cli.target import Appliance, speaks
-from appliance.inventory import inventory
+from appliance.configuration.inventory import inventory
 
 
 @speaks

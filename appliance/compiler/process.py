@@ -16,12 +16,12 @@ import resource
 import socket
 from typing import Any
 
-from appliance import late
+from appliance.base import lazy_imports
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.channel.child import Child
-from appliance.shares.table import DRY_RUNS
-from appliance.specifications.files import SpecificationsRefusedError
+from appliance.channel.child_process import Child
+from appliance.quotas.table import DRY_RUNS
+from appliance.specifications.specification_files import SpecificationsRefusedError
 
 _MEMORY = 1 << 30  # bytes of addresses: its own libraries are 50 MiB of that
 _WORK_SECONDS = 60  # of processor time, for one question of an order
@@ -92,7 +92,7 @@ def answer(wanted: _Question) -> messages.ContentsFound | messages.PartsMade | m
     ends = int(_used()) + _budget(wanted) + _SPARE_SECONDS
     resource.setrlimit(resource.RLIMIT_CPU, (ends, resource.RLIM_INFINITY))
     try:
-        checking = late.load("appliance.specifications.checking")
+        checking = lazy_imports.load("appliance.specifications.checking")
         if isinstance(wanted, messages.PartsWanted):
             return messages.PartsMade(wanted.number, checking.parts(wanted.compiled, wanted.parts))
         return messages.ContentsFound(wanted.number, checking.contents(wanted.files, wanted.definitions))

@@ -10,29 +10,34 @@ import typing
 from collections.abc import Awaitable, Callable
 from typing import Any, NamedTuple
 
+from appliance.base.withdrawal import WithdrawnError, require_awaited
 from appliance.channel import admin
 from appliance.channel.admin import A
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
-from appliance.control.looks import Looks
 from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
+from appliance.control.queries import Looks
 from appliance.control.recording_orders import RecorderAwayError, RecordingOrders
-from appliance.control.tokens import TokenRefusedError, Tokens
+from appliance.control.token_orders import TokenRefusedError, Tokens
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import CheckedPorts
-from appliance.hosts.hosts import Hosts
+from appliance.hosts.enrolment import Hosts
+from appliance.hosts.host_table import (
+    HostForbiddenError,
+    HostRefusedError,
+    HostsChangedError,
+    UnknownHostError,
+)
 from appliance.hosts.self_service import SelfService
-from appliance.hosts.table import HostForbiddenError, HostRefusedError, HostsChangedError, UnknownHostError
-from appliance.master.reach.topic_looks import TooManyLooksError
-from appliance.specifications.files import SpecificationsRefusedError
-from appliance.specifications.monitors import (
+from appliance.master.endpoints.topic_taps_control import TooManyLooksError
+from appliance.specifications.specification_files import SpecificationsRefusedError
+from appliance.specifications.specifications import (
     DryRunUnderWayError,
     Monitors,
     MonitorsChangedError,
     UnknownMonitorError,
 )
-from appliance.store.database import StoreError
-from appliance.withdrawal import WithdrawnError, require_awaited
+from appliance.store.writer_thread import StoreError
 
 # The first that an error is.
 _TROUBLES: dict[type[Exception], admin.Trouble] = {
@@ -99,7 +104,7 @@ class Administration:
         """Do what is asked on behalf of `who` (the name of a token, or `operator` for the admin socket).
 
         What somebody did is in the audit log when it is answered: who then searches finds it. An order whose client
-        gave up is not begun (`appliance/withdrawal.py`, which says when one that was begun is withdrawn).
+        gave up is not begun (`appliance/base/withdrawal.py`, which says when one that was begun is withdrawn).
         """
         answer = await self._answer(request, who)
         if self._methods[type(request)].orders:

@@ -12,30 +12,35 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from ipaddress import ip_address, ip_network
 
-from appliance import late
-from appliance.audit_trail import AuditTrail
+from appliance.base import lazy_imports
 from appliance.channel import messages
-from appliance.config import Settings
-from appliance.control.doors import Doors, value_limits
-from appliance.control.lifeline import ControlLifeline
+from appliance.configuration.settings import Settings
+from appliance.control.listener_limits import Doors, value_limits
 from appliance.control.monitor_states import published_now
 from appliance.control.policies import Policies
+from appliance.control.quota_class import HostStanding
 from appliance.control.recording_orders import RecordingOrders
-from appliance.control.standing import HostStanding
+from appliance.control.supervisor_link import ControlLifeline
 from appliance.master import rosout
 from appliance.master.calls.call import served
+from appliance.master.calls.call_table import MASTER_CALLS, master_table
 from appliance.master.calls.execution import Execution
 from appliance.master.calls.gate import Gate, HostLimits
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.monitor_calls import MonitorCalls
 from appliance.master.calls.multicall import Multicall
 from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
+from appliance.master.calls.parameter_calls import ParameterCalls, ParameterSearch
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.calls.parameters import ParameterCalls, ParameterSearch
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
 from appliance.master.calls.repetition import Repetitions
-from appliance.master.calls.table import MASTER_CALLS, master_table
+from appliance.master.endpoints.delivery import Delivery
+from appliance.master.endpoints.endpoint_addresses import Addresses, Places
+from appliance.master.endpoints.node_api import NodeApi
+from appliance.master.endpoints.proxy_endpoints import Faces, InnerFace
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.endpoints.traffic import Carried
 from appliance.master.graph.effects import Effects
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph
@@ -44,31 +49,26 @@ from appliance.master.graph.registry import Life, Registry
 from appliance.master.graph.revocation import Revocation, revoked
 from appliance.master.parameter_charges import ParameterCharges
 from appliance.master.parameter_mirror import ParameterMirror
-from appliance.master.reach.delivery import Delivery
-from appliance.master.reach.faces import Faces, InnerFace
-from appliance.master.reach.node_api import NodeApi
-from appliance.master.reach.places import Addresses, Places
-from appliance.master.reach.relays import RelayControl
-from appliance.master.reach.traffic import Carried
+from appliance.master.reconcile.arrivals import Arrivals
+from appliance.master.reconcile.enactor import Enactor
+from appliance.master.reconcile.entries import Entries
+from appliance.master.reconcile.liveness import Liveness, Watchlist
+from appliance.master.reconcile.moves import Moving
+from appliance.master.reconcile.publisher import OwnPublisher
+from appliance.master.reconcile.reconciler import Reconciler
+from appliance.master.reconcile.reminders import Reminders
 from appliance.master.rosmaster import RosMaster, limits_of_answers, own_parameters
-from appliance.master.upkeep.arrivals import Arrivals
-from appliance.master.upkeep.enactor import Enactor
-from appliance.master.upkeep.entries import Entries
-from appliance.master.upkeep.liveness import Liveness, Watchlist
-from appliance.master.upkeep.moves import Moving
-from appliance.master.upkeep.publisher import OwnPublisher
-from appliance.master.upkeep.reconcile import Reconciler
-from appliance.master.upkeep.reminders import Reminders
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
-from appliance.recorder.plan import RecordingPlan
+from appliance.quotas.pool import Pool
+from appliance.quotas.table import PARAMETER_BYTES
+from appliance.recorder.recording_plan import RecordingPlan
 from appliance.rpc.bulk import LargeWrites, bulk_turns
-from appliance.shares.pool import Pool
-from appliance.shares.table import PARAMETER_BYTES
 from appliance.specifications.allocation import Allocation
-from appliance.specifications.compiler import SpecificationCompiler
-from appliance.specifications.monitors import ALLOCATION, Monitors
-from appliance.store.state import StateStore
+from appliance.specifications.compiler_link import SpecificationCompiler
+from appliance.specifications.specifications import ALLOCATION, Monitors
+from appliance.store.state_file import StateStore
+from appliance.telemetry.audit_trail import AuditTrail
 from roswire import log_message
 
 RVMASTER, INNER = "rvmaster", "inner"
@@ -397,5 +397,7 @@ def _make_mirror(base: Foundation) -> ParameterMirror:
 
 
 def _header_of_rosout() -> messages.OwnHeaderStated:
-    stated: messages.OwnHeaderStated = rosout.header(late.load("roswire.standard").standard_definitions())
+    stated: messages.OwnHeaderStated = rosout.header(
+        lazy_imports.load("roswire.standard").standard_definitions()
+    )
     return stated

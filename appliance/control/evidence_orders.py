@@ -3,9 +3,9 @@
 import asyncio
 
 from appliance.audit.log import AuditLog
-from appliance.audit_trail import AuditTrail
 from appliance.channel import admin
 from appliance.channel.answers.evidence import Sealed
+from appliance.telemetry.audit_trail import AuditTrail
 
 SEAL_SECONDS = 10.0
 

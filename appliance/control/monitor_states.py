@@ -7,7 +7,7 @@ from appliance.channel.answers.status import MonitorsState
 from appliance.channel.messages import Approach, MarginRow
 from appliance.master.graph.registry import Kind, Registry
 from appliance.specifications.live_topics import Published
-from appliance.specifications.monitors import Monitors
+from appliance.specifications.specifications import Monitors
 from rosmop.form.positions import line_of
 
 

@@ -7,8 +7,8 @@ from msgspec.structs import asdict
 
 from appliance.channel.answers.graph import Connection, Graph, Node, Publisher, Service, Topic
 from appliance.control.assembly import Parts
+from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.registry import Incarnation, Kind, Life
-from appliance.master.reach.relays import RelayControl
 from appliance.specifications.allocation import SERVICE, TOPIC
 
 

@@ -18,22 +18,22 @@ from typing import Any
 
 import structlog
 
-from appliance.audit_trail import AuditTrail
+from appliance.base.input_files import read_given_text
+from appliance.base.withdrawal import require_awaited, take_effect
 from appliance.channel import admin
 from appliance.channel.answers import policy as answers
 from appliance.channel.answers.policy import Loaded
 from appliance.control.errors import UnknownThingError
-from appliance.fingerprints import fingerprint
-from appliance.given_files import read_given_text
-from appliance.policy.findings import PolicyError
-from appliance.policy.hosts import Network
+from appliance.policy.host_sets import Network
 from appliance.policy.judgement import Known, judge
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
-from appliance.site_keys import read_signature, signer
+from appliance.policy.policy_findings import PolicyError
+from appliance.signing.fingerprints import fingerprint
+from appliance.signing.site_keys import read_signature, signer
 from appliance.store.revisions import Trial, UnknownRevisionError, wanted
-from appliance.store.state import RevisionRow, StateStore
-from appliance.withdrawal import require_awaited, take_effect
+from appliance.store.state_file import RevisionRow, StateStore
+from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
 _DISK = "disk"

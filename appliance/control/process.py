@@ -22,50 +22,50 @@ from appliance.audit.budget import Budget
 from appliance.audit.ids import IdSource
 from appliance.audit.log import AuditLog
 from appliance.audit.retention import Retention
-from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.admin import HostsReload, PolicyReload
 from appliance.channel.answers.status import AuditState, ProcessInfo
 from appliance.channel.channel import Channel
 from appliance.channel.messages.api import ApiLink
-from appliance.config import Settings, load_resolved
-from appliance.control.admin import AdminServer
+from appliance.configuration.settings import Settings, load_resolved
+from appliance.control.admin_socket import AdminServer
 from appliance.control.administration import Administration
 from appliance.control.assembly import INNER, RVMASTER, Foundation, Parts
-from appliance.control.clock import Clock
-from appliance.control.doors import Doors
+from appliance.control.clock_check import Clock
 from appliance.control.evidence_orders import EvidenceOrders
-from appliance.control.forwarder import Forwarded
-from appliance.control.lifeline import ControlLifeline
-from appliance.control.looks import Looks
+from appliance.control.forwarder_link import Forwarded
+from appliance.control.listener_limits import Doors
 from appliance.control.policies import Policies, PolicyRefusedError, RevisionChangedError
+from appliance.control.queries import Looks
+from appliance.control.quota_class import HostStanding, charged_to
 from appliance.control.rest import RestLink
 from appliance.control.robot import master_address, robot_addresses
 from appliance.control.signing import Signing
 from appliance.control.spare_memory import SpareMemory
-from appliance.control.standing import HostStanding, charged_to
+from appliance.control.supervisor_link import ControlLifeline
 from appliance.control.switched_off import SwitchedOffWatch
-from appliance.control.tokens import Tokens
-from appliance.hosts.authority import Authority
+from appliance.control.token_orders import Tokens
+from appliance.hosts.certificate_requests import Authority
 from appliance.hosts.certification import Certification
-from appliance.hosts.endpoint import find_endpoint
-from appliance.hosts.hosts import Hosts
+from appliance.hosts.enrolment import Hosts
+from appliance.hosts.host_table import HostRefusedError, HostTable
 from appliance.hosts.hosts_file import Declared
 from appliance.hosts.rest_place import rest_place
-from appliance.hosts.table import HostRefusedError, HostTable
-from appliance.hosts.tunnels import Tunnels
+from appliance.hosts.tunnel_address import find_endpoint
+from appliance.hosts.tunnel_state import Tunnels
+from appliance.master.endpoints.endpoint_addresses import NoPortError
 from appliance.master.graph.registry import Life, Registry
-from appliance.master.reach.places import NoPortError
-from appliance.master.upkeep.enactor import restore
-from appliance.recorder.plan import RecordingPlan
+from appliance.master.reconcile.enactor import restore
+from appliance.quotas.pool import Standing
+from appliance.quotas.table import AUDIT_RESERVE
+from appliance.recorder.recording_plan import RecordingPlan
 from appliance.rpc.server import listen
-from appliance.shares.pool import Standing
-from appliance.shares.table import AUDIT_RESERVE
 from appliance.specifications.allocation import TOPIC
-from appliance.specifications.compiler import SpecificationCompiler
-from appliance.specifications.files import SpecificationsRefusedError
-from appliance.store.database import StoreError
-from appliance.store.state import StateStore
+from appliance.specifications.compiler_link import SpecificationCompiler
+from appliance.specifications.specification_files import SpecificationsRefusedError
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
+from appliance.telemetry.audit_trail import AuditTrail
 from roswire.uris import node_uri
 
 _log = structlog.get_logger()

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, TypeVar
 
-from appliance.audit_trail import AuditTrail
 from appliance.channel import admin, messages
 from appliance.channel.answers.recordings import (
     OPERATORS,
@@ -19,10 +18,11 @@ from appliance.channel.answers.recordings import (
 from appliance.channel.answers.status import RecorderState
 from appliance.channel.channel import ChannelClosedError, ChannelFullError
 from appliance.channel.link import Link
-from appliance.config import RecorderRules
+from appliance.configuration.settings import RecorderRules
 from appliance.control.errors import SenselessError, UnknownThingError
-from appliance.recorder.plan import RecordingPlan
-from appliance.recorder.shelf import MOST_LENT
+from appliance.recorder.recording_plan import RecordingPlan
+from appliance.recorder.recording_store import MOST_LENT
+from appliance.telemetry.audit_trail import AuditTrail
 
 _PATIENCE_SECONDS = 10.0
 _LONGEST_NOTE = 300

@@ -6,7 +6,7 @@ Invariants, so that an api that is flooded or has fallen to a stranger cannot ho
    nodes. Those that wait for others (`WaitingRequest`, at most `_MOST_SLOW`) hold up nobody else.
 2. What is not of the link ends it; an api that does not read its answers loses the link.
 3. Nothing that can be asked here makes an access token, and no decision of RVMaster depends on the api.
-4. What no client waits for any more is withdrawn before it takes effect (`appliance/withdrawal.py`).
+4. What no client waits for any more is withdrawn before it takes effect (`appliance/base/withdrawal.py`).
 5. Everything is asked in the name of a token that was shown and whose role may; a change is what the client asked for,
    with its proof (`rest_proof.py`). What is not is refused and recorded, by control itself.
 """
@@ -20,7 +20,7 @@ from typing import Any
 import structlog
 
 from appliance.audit.record import Severity
-from appliance.audit_trail import AuditTrail
+from appliance.base.withdrawal import awaited
 from appliance.channel import messages
 from appliance.channel.admin import (
     ORDERS,
@@ -42,8 +42,8 @@ from appliance.channel.messages.api import (
 )
 from appliance.control.administration import Administration
 from appliance.control.rest_proof import Askers, UnprovenError
-from appliance.control.tokens import Tokens
-from appliance.withdrawal import awaited
+from appliance.control.token_orders import Tokens
+from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
 _MOST_WAITING = 64

@@ -22,8 +22,8 @@ from appliance.channel.answers.tokens import Challenge, TokenRole, may
 from appliance.channel.messages.api import Asked, RequestMade
 from appliance.control.challenges import SECONDS, ChallengeRefusedError, Challenges
 from appliance.control.rest_meaning import NoOrderError, meant
-from appliance.control.tokens import Tokens
-from appliance.order_proof import (
+from appliance.control.token_orders import Tokens
+from appliance.signing.request_signing import (
     HEADER,
     BadProofError,
     is_signed,
@@ -33,7 +33,7 @@ from appliance.order_proof import (
     reading_id,
     statement,
 )
-from appliance.store.tokens import TokenRow, is_secret, parse_token
+from appliance.store.access_tokens import TokenRow, is_secret, parse_token
 
 _ITSELF = "the host itself"
 

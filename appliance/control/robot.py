@@ -5,7 +5,7 @@ import socket
 import struct
 from pathlib import Path
 
-from appliance.config import Settings
+from appliance.configuration.settings import Settings
 from appliance.policy.model import Address
 
 _ROUTES = Path("/proc/net/route")

@@ -12,12 +12,12 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-from appliance.audit_trail import AuditTrail
 from appliance.channel.answers.status import SwitchedOff
 from appliance.control.policies import Policies
 from appliance.policy.sections import DECIDERS
-from appliance.specifications.monitors import Monitors
-from appliance.store.state import StateStore
+from appliance.specifications.specifications import Monitors
+from appliance.store.state_file import StateStore
+from appliance.telemetry.audit_trail import AuditTrail
 
 _SETTING = "switched off"
 _LOOK_SECONDS = 60.0

@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 import msgspec
 
 from appliance.audit.chain import StoredColumns
-from appliance.audit.database import COLUMNS, LogUnreadableError, reading
-from appliance.audit.evidence import Places
+from appliance.audit.chain_proofs import Places
+from appliance.audit.log_database import COLUMNS, LogUnreadableError, reading
 from appliance.audit.signatures import pinned_key_path
 from appliance.channel.admin import (
     A,
@@ -41,11 +41,11 @@ from appliance.channel.admin import (
 )
 from appliance.channel.answers.recordings import Recording
 from appliance.evidence.page import Page
-from appliance.fingerprints import file_name
+from appliance.signing.fingerprints import file_name
 
 FORMAT = "rosrv evidence 1"
 MOST_RECORDS = 1_000_000
-VERIFIER = Path(__file__).with_name("verify.py")
+VERIFIER = Path(__file__).with_name("bundle_verifier.py")
 Ask = Callable[[AdminRequest[Any]], AdminAnswer[Any]]
 Member = tuple[str, Iterable[bytes]]
 _PAGE = 500

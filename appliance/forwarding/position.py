@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from appliance.whole_files import write_whole
+from appliance.base.atomic_files import write_whole
 
 
 class Position(msgspec.Struct, frozen=True):

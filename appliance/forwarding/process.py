@@ -14,9 +14,9 @@ from typing import Any
 
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.channel.child import Child
-from appliance.config import Settings, Syslog, load_resolved
-from appliance.forwarding.forwarder import Forwarder
+from appliance.channel.child_process import Child
+from appliance.configuration.settings import Settings, Syslog, load_resolved
+from appliance.forwarding.log_forwarder import Forwarder
 from appliance.forwarding.receiver import DatagramReceiver, Receiver, StreamReceiver, tls_context
 from appliance.forwarding.syslog import LONGEST_DATAGRAM, LONGEST_IN_STREAM, Formatter
 

@@ -16,8 +16,8 @@ from datetime import UTC, datetime
 import msgspec
 
 from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
-from appliance.audit.output import Entry, fields_of, printable
 from appliance.audit.record import Severity
+from appliance.audit.record_format import Entry, fields_of, printable
 
 ELEMENT = "rosrv@32473"  # 32473 is kept for examples (RFC 5612): the project has no number of its own
 LONGEST_DATAGRAM, LONGEST_IN_STREAM = 2048, 8192  # RFC 5426, 3.2; RFC 5425, 4.3.1

@@ -14,18 +14,18 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from appliance.audit_trail import AuditTrail
 from appliance.channel import admin
 from appliance.channel.answers.hosts import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
-from appliance.hosts.authority import Authority, AuthorityError
+from appliance.hosts.certificate_requests import Authority, AuthorityError
 from appliance.hosts.enrolment_tokens import Awaited
+from appliance.hosts.host_table import HostForbiddenError, HostRefusedError, HostTable
 from appliance.hosts.rest_place import RestPlace
-from appliance.hosts.table import HostForbiddenError, HostRefusedError, HostTable
-from appliance.hosts.tunnels import Tunnels
+from appliance.hosts.tunnel_state import Tunnels
 from appliance.hosts.view import soon
-from appliance.store.database import StoreError
-from appliance.store.state import StateStore
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
+from appliance.telemetry.audit_trail import AuditTrail
 
 _SERVED_SECONDS = 10.0
 

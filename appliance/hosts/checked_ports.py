@@ -8,9 +8,9 @@ from appliance.audit.record import Severity
 from appliance.channel import admin
 from appliance.channel.answers.hosts import PortsTold
 from appliance.hosts.certification import Certification
-from appliance.hosts.table import HostRefusedError
+from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.view import HostView
-from appliance.store.hosts import PortsRow
+from appliance.store.host_tables import PortsRow
 
 _CLOCKS_DIFFER = 86_400.0
 _MOST_PORTS = 100

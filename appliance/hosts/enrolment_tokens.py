@@ -13,7 +13,7 @@ import re
 import secrets
 import time
 
-from appliance.store.hosts import AwaitedRow, HostTables
+from appliance.store.host_tables import AwaitedRow, HostTables
 
 _FORM = re.compile(r"rosrv-enrol_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 LONGEST_SECONDS = 7 * 86_400.0

@@ -18,9 +18,9 @@ from typing import Any
 
 import yaml
 
-from appliance.given_files import read_given_text
-from appliance.policy.findings import quoted
-from appliance.wrong_values import meant, not_yaml
+from appliance.base.input_files import read_given_text
+from appliance.base.validation_messages import meant, not_yaml
+from appliance.policy.policy_findings import quoted
 
 _LARGEST = 1 << 20
 _MOST_GROUPS = 32

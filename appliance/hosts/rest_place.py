@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from appliance.config import Settings, is_loopback
+from appliance.configuration.settings import Settings, is_loopback
 
 NO_TUNNELS = (
     "isolation: none has no tunnels, for no firewall keeps their addresses from being forged: start the appliance with"

@@ -3,8 +3,8 @@
 import asyncio
 import time
 
-from appliance.hosts.authority import Authority
-from appliance.hosts.table import HostTable
+from appliance.hosts.certificate_requests import Authority
+from appliance.hosts.host_table import HostTable
 
 _SIGNED_SECONDS = 60.0
 

@@ -12,7 +12,7 @@ Invariants:
 import time
 from collections.abc import Iterable, Set
 
-from appliance.store.hosts import HostTables, RevokedRow
+from appliance.store.host_tables import HostTables, RevokedRow
 
 AFTER_END_SECONDS = 86_400.0  # that clocks may differ by
 _KEPT_SECONDS = 400 * 86_400.0  # after the end

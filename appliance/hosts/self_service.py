@@ -16,14 +16,14 @@ import asyncio
 import ipaddress
 import time
 
+from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import admin
 from appliance.channel.answers.hosts import KitParts, NewCertificate, Renewed
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment_tokens import BadEnrolmentTokenError
-from appliance.hosts.table import HostForbiddenError, HostRefusedError
+from appliance.hosts.host_table import HostForbiddenError, HostRefusedError
 from appliance.hosts.view import span
-from appliance.store.hosts import HostRow
-from appliance.withdrawal import WithdrawnError, take_effect
+from appliance.store.host_tables import HostRow
 
 _ANSWER_SECONDS = 1.0  # until the answer to a host has left through its tunnel
 _RENEWALS = 20  # in the life of a certificate: each leaves one on the list of revoked ones

@@ -8,9 +8,9 @@ from typing import cast
 from appliance.channel.answers.hosts import Host, Machine, PortsSeen, PortsState, State
 from appliance.channel.answers.status import IpsecState
 from appliance.hosts.enrolment_tokens import Awaited
-from appliance.hosts.table import HostTable
-from appliance.hosts.tunnels import Tunnels
-from appliance.store.hosts import AwaitedRow, HostRow
+from appliance.hosts.host_table import HostTable
+from appliance.hosts.tunnel_state import Tunnels
+from appliance.store.host_tables import AwaitedRow, HostRow
 
 SOON_SECONDS = 14 * 86_400.0
 _NEVER = PortsSeen("unknown", None, [], "")

@@ -18,8 +18,8 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
-from appliance.ipsec.files import SignerKeyError, require_private
-from appliance.whole_files import write_whole
+from appliance.base.atomic_files import write_whole
+from appliance.ipsec.key_files import SignerKeyError, require_private
 
 Kind = Literal["ecdsa", "ed25519"]
 Key = ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey

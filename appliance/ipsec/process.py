@@ -28,16 +28,16 @@ from typing import Any, TypeVar
 
 import structlog
 
+from appliance.base.atomic_files import write_whole
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.channel.child import Child
+from appliance.channel.child_process import Child
 from appliance.ipsec.charon import PROGRAM, CharonError, Vici
-from appliance.ipsec.files import SignerKeyError, require_private
+from appliance.ipsec.key_files import SignerKeyError, require_private
 from appliance.ipsec.leftovers import clear_leftovers
 from appliance.ipsec.refusals import Refusal, Refusals
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.ipsec.strongswan import configuration
-from appliance.whole_files import write_whole
 
 KEY_FILE = "appliance.key"
 TUN = Path("/dev/net/tun")

@@ -12,8 +12,8 @@ signer, which has the settings and its own memory, looks at neither the log nor 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.ipsec.checkpoints import SignedCheckpoints, read_checkpoint
-from appliance.sealed_texts import Checkpoint, Removal, checkpoint_hash
+from appliance.ipsec.signed_checkpoints import SignedCheckpoints, read_checkpoint
+from appliance.signing.signed_statements import Checkpoint, Removal, checkpoint_hash
 
 LARGEST_RECORD = 64 << 10
 """Bytes of a record with the longest details; no log has larger ones on average."""

@@ -28,17 +28,17 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 
-from appliance.ages import AgeClock
+from appliance.base.age_clock import AgeClock
+from appliance.base.atomic_files import write_whole
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.channel.child import Child
-from appliance.ipsec.authority import Authority
+from appliance.channel.child_process import Child
 from appliance.ipsec.authority_key import Kind, read_passphrase
-from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints, newest_signing
-from appliance.ipsec.files import SignerKeyError, require_private
-from appliance.ipsec.proof import RequestRefusedError
+from appliance.ipsec.certificate_authority import Authority
+from appliance.ipsec.key_files import SignerKeyError, require_private
+from appliance.ipsec.proof_of_possession import RequestRefusedError
 from appliance.ipsec.removals import Kept, RemovalRefusedError, Removals
-from appliance.whole_files import write_whole
+from appliance.ipsec.signed_checkpoints import CheckpointRefusedError, SignedCheckpoints, newest_signing
 
 KEY_FILE = "audit.key"
 PUBLIC_KEY_FILE = "audit.pub"

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from appliance.channel.messages import APPLIANCE_NAME, Esp, TunnelHost, TunnelsStated
-from appliance.shares.table import IKE_HANDSHAKES
+from appliance.quotas.table import IKE_HANDSHAKES
 
 USER_SPACE_INTERFACE = "ipsec0"
 IKE_PROPOSALS = ("aes256gcm16-prfsha384-x25519", "aes256gcm16-prfsha384-ecp384")

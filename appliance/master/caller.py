@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from appliance.audit_trail import Asker
 from appliance.master.graph.registry import Incarnation
 from appliance.rpc.server import Peer
+from appliance.telemetry.audit_trail import Asker
 from roswire.uris import NodeUri
 from roswire.xmlrpc import Value
 

@@ -17,8 +17,8 @@ from dataclasses import dataclass, field
 from typing import Protocol, cast
 
 from appliance.policy.model import Address, address_of
+from appliance.quotas.pool import Pool
 from appliance.rpc.bulk import text_weight
-from appliance.shares.pool import Pool
 from roswire.errors import ProtocolError
 from roswire.parameter_tree import Tree, parts_of
 from roswire.xmlrpc import Value

@@ -17,8 +17,8 @@ from appliance.master.parameter_charges import (
     member_weight,
 )
 from appliance.policy.model import Address
+from appliance.quotas.pool import Pool
 from appliance.rpc.bulk import text_weight
-from appliance.shares.pool import Pool
 from roswire.errors import ProtocolError
 from roswire.parameter_tree import Tree, parts_of, standing_at
 from roswire.xmlrpc import Value

@@ -26,7 +26,7 @@ from typing import Any, TypeVar
 import structlog
 
 from appliance.master.caller import Answer
-from appliance.rpc.client import BrokenOffError, CallFailedError, RefusedError, XmlRpcClient
+from appliance.rpc.xmlrpc_client import BrokenOffError, CallFailedError, RefusedError, XmlRpcClient
 from roswire.errors import EncodingError
 from roswire.parameter_tree import Tree
 from roswire.uris import NodeUri

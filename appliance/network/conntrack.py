@@ -13,7 +13,7 @@ from pyroute2 import NFCTSocket
 from pyroute2.netlink.exceptions import NetlinkError
 from pyroute2.netlink.nfnetlink.nfctsocket import NFCTAttrTuple
 
-from appliance.network import links
+from appliance.network import interfaces
 from appliance.network.namespaces import Namespace, NetworkError
 
 _FAMILIES = (socket.AF_INET, socket.AF_INET6)
@@ -24,7 +24,7 @@ def forget(namespace: Namespace, ports: Iterable[int]) -> int:
 
     Entries of what the machine forwards for others stay. Raises: NetworkError when the kernel refuses.
     """
-    own = {address.partition("/")[0] for address in links.addresses(namespace)}
+    own = {address.partition("/")[0] for address in interfaces.addresses(namespace)}
     try:
         return namespace.run(
             lambda: sum(_forget(family, port, own) for family in _FAMILIES for port in ports)

@@ -40,14 +40,13 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from appliance.base.atomic_files import write_whole
 from appliance.channel.answers.status import FirewallRule
-from appliance.network import links
+from appliance.network import interfaces
 from appliance.network.endings import end_processes
-from appliance.network.endpoint import Endpoint, outward_address
 from appliance.network.firewall import iptables
 from appliance.network.firewall.firewall import statuses
-from appliance.network.firewall.nft import NftBackend
-from appliance.network.firewall.rules import (
+from appliance.network.firewall.firewall_rules import (
     LOOPBACK,
     Chain,
     Family,
@@ -57,10 +56,11 @@ from appliance.network.firewall.rules import (
     Verdict,
     family_of,
 )
-from appliance.network.forwarding import Forwarding
-from appliance.network.listeners import listening_ports, udp_ports_in_use
+from appliance.network.firewall.nft import NftBackend
+from appliance.network.ip_forwarding import Forwarding
+from appliance.network.listening_sockets import listening_ports, udp_ports_in_use
 from appliance.network.namespaces import Namespace, NetworkError, require_privileges
-from appliance.whole_files import write_whole
+from appliance.network.public_address import Endpoint, outward_address
 
 INSIDE = "eth0"
 _CANDIDATES = 64
@@ -96,7 +96,7 @@ class IsolationSettings:
     @property
     def link(self) -> str:
         """The host's end of the veth pair."""
-        return f"veth-{self.name}"[: links.IFNAMSIZ]
+        return f"veth-{self.name}"[: interfaces.IFNAMSIZ]
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ class Isolation:
 
     def host_address_for(self, peer: str) -> str:
         """Return the address by which `peer` reaches the host: what nodes on that peer are to be told."""
-        return links.source_address_for(self._host, peer)
+        return interfaces.source_address_for(self._host, peer)
 
     def endpoint(self) -> Endpoint:
         """Where hosts of other networks reach the host. Raises: NetworkError when that cannot be told."""
@@ -220,13 +220,15 @@ class Isolation:
     def _build(self) -> None:
         settings, inside = self.settings, self.namespace
         inside.create()
-        links.set_link(inside, "lo", up=True)
-        links.create_veth(self._host, settings.link, inside, INSIDE)
+        interfaces.set_link(inside, "lo", up=True)
+        interfaces.create_veth(self._host, settings.link, inside, INSIDE)
         for family, ends in self.ends.items():
-            links.add_address(self._host, settings.link, f"{ends.host}/{ends.length}")
-            links.add_address(inside, INSIDE, f"{ends.appliance}/{ends.length}")
-            links.add_near_route(self._host, settings.link, ends.appliance, source=ends.host, hop_limit=255)
-            links.add_route(inside, "default", ends.host)
+            interfaces.add_address(self._host, settings.link, f"{ends.host}/{ends.length}")
+            interfaces.add_address(inside, INSIDE, f"{ends.appliance}/{ends.length}")
+            interfaces.add_near_route(
+                self._host, settings.link, ends.appliance, source=ends.host, hop_limit=255
+            )
+            interfaces.add_route(inside, "default", ends.host)
             if family == 4:  # so that packets the host sends from 127.0.0.1 may leave on this link
                 self._host.sysctl(f"net/ipv4/conf/{settings.link}/route_localnet", "1")
         routers = tuple(family for family in self.ends if self._forwarding.before(family))
@@ -235,7 +237,7 @@ class Isolation:
         self._forwarding.enable(tuple(self.ends))
 
     def _choose_subnets(self) -> None:
-        taken = [ipaddress.ip_network(text) for text in links.networks(self._host)]
+        taken = [ipaddress.ip_network(text) for text in interfaces.networks(self._host)]
         self.ends = {4: _choose(self.settings.subnet, _POOL, 30, taken)}
         if self._forwarding.has_ipv6():
             self.ends[6] = _choose(self.settings.subnet6, _POOL6, 64, taken)
@@ -247,7 +249,7 @@ class Isolation:
                 f"there is a network namespace {name} that this appliance has not made: "
                 f"`sudo ip netns delete {name}` if nobody needs it, or give the appliance another name"
             )
-        if link in links.links(self._host):
+        if link in interfaces.links(self._host):
             raise NetworkError(
                 f"there is an interface {link} that this appliance has not made: `ip link delete {link}`"
             )
@@ -314,7 +316,7 @@ class Isolation:
             ) from error
         self._forwarding.restore(settings)  # before the chain that keeps the host from being a router goes
         self._backend.remove()
-        links.delete_link(self._host, link)
+        interfaces.delete_link(self._host, link)
         end_processes(leftover.processes())
         leftover.delete()
         with contextlib.suppress(FileNotFoundError):

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 
-from appliance.network.listeners import listening_addresses
+from appliance.network.listening_sockets import listening_addresses
 from appliance.network.namespaces import Namespace, NetworkError
-from appliance.network.progress import run
+from appliance.network.patience import run
 
 PROBE_UID = 61099  # nobody's: neither root nor one of the appliance's users
 _CONNECT_SECONDS = 1.0

@@ -2,14 +2,14 @@
 
 import ipaddress
 
+from appliance.base.validation_messages import meant
 from appliance.policy.commands import ALIASES, COMMANDS, DECIDED_ELSEWHERE
-from appliance.policy.findings import quoted
-from appliance.policy.hosts import Network, canonical_address
+from appliance.policy.host_sets import Network, canonical_address
 from appliance.policy.keys import is_parameter_key
 from appliance.policy.model import Address, Category
 from appliance.policy.policy import Policy
+from appliance.policy.policy_findings import quoted
 from appliance.policy.sections import PARAMETERS
-from appliance.wrong_values import meant
 from roswire.names import is_global_name
 
 VERBS = {"use-node" if category is Category.NODE else category.value: category for category in Category}

@@ -18,14 +18,14 @@ from dataclasses import dataclass
 
 import yaml
 
+from appliance.base.validation_messages import meant, not_yaml
 from appliance.policy.actions import BadWordError, find_hosts, parse_action
-from appliance.policy.compiler import compile_policy
-from appliance.policy.findings import Finding, Findings, Severity, quoted
-from appliance.policy.hosts import canonical_address
+from appliance.policy.host_sets import canonical_address
 from appliance.policy.model import Address, Decision, Request
 from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import Finding, Findings, Severity, quoted
 from appliance.policy.rights import decide, needs_node, rights_of
-from appliance.wrong_values import meant, not_yaml
 from roswire.names import is_global_name
 
 MAXIMUM_CHARACTERS = 1024 * 1024

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from appliance.policy import commands
-from appliance.policy.limits import NO_LIMIT, Part
 from appliance.policy.model import Category, Decision, Request, Rule, told_of
 from appliance.policy.policy import CompiledRule, Policy
+from appliance.policy.rate_limits import NO_LIMIT, Part
 from appliance.policy.rights import Right, decide_right, rights_of
 from appliance.policy.sections import PARAMETERS
 

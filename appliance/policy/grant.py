@@ -10,13 +10,13 @@ import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from appliance.policy.compiler import compile_policy
-from appliance.policy.findings import Findings, PolicyError
+from appliance.policy.ini_reader import Entry, SectionText, Word, read
 from appliance.policy.judgement import Known, judge
 from appliance.policy.keys import levels
 from appliance.policy.model import Address, Category, Request, Rule
 from appliance.policy.policy import Policy
-from appliance.policy.reader import Entry, SectionText, Word, read
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import Findings, PolicyError
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
 from appliance.policy.sections import BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
 from appliance.policy.settings import TAKEOVERS

@@ -5,11 +5,11 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
-from appliance.policy.findings import Findings, quoted
-from appliance.policy.hosts import EVERYONE, Atom, HostTable, Network, canonical_network
+from appliance.base.validation_messages import meant
+from appliance.policy.host_sets import EVERYONE, Atom, HostTable, Network, canonical_network
+from appliance.policy.ini_reader import Entry, SectionText, Word
 from appliance.policy.model import Address
-from appliance.policy.reader import Entry, SectionText, Word
-from appliance.wrong_values import meant
+from appliance.policy.policy_findings import Findings, quoted
 
 ROBOT = "robot"
 _HOST = "host:"

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Self
 
 from appliance.policy.cases import CaseResult, run_cases
-from appliance.policy.compiler import compile_policy
-from appliance.policy.findings import Finding, PolicyError, Severity
-from appliance.policy.hosts import Network
+from appliance.policy.host_sets import Network
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
-from appliance.site_keys import UnsignedError, signer
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import Finding, PolicyError, Severity
+from appliance.signing.site_keys import UnsignedError, signer
 
 
 @dataclass(frozen=True, slots=True)

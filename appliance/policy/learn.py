@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 
 from appliance.policy.actions import BadWordError, check_resource
 from appliance.policy.commands import ALIASES
-from appliance.policy.hosts import Network, canonical_address
+from appliance.policy.host_sets import Network, canonical_address
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.rights import rights_of_call
 from appliance.policy.sections import DECIDERS, PARAMETERS

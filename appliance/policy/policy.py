@@ -13,13 +13,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from appliance.policy import commands
-from appliance.policy.findings import Finding, quoted
-from appliance.policy.hosts import Atom, HostTable, Network, canonical_address
+from appliance.policy.host_sets import Atom, HostTable, Network, canonical_address
 from appliance.policy.keys import Key, is_parameter_key
-from appliance.policy.limits import NO_LIMIT, LimitRule, LimitTable, Part, Rate
 from appliance.policy.model import Address, Category, Decision, Request, Rule
+from appliance.policy.name_tree import KeyTree
+from appliance.policy.policy_findings import Finding, quoted
+from appliance.policy.rate_limits import NO_LIMIT, LimitRule, LimitTable, Part, Rate
 from appliance.policy.sections import BY_CATEGORY, PARAMETERS
-from appliance.policy.tree import KeyTree
 from roswire.names import is_global_name
 
 DEFAULT_PORTS = range(19001, 26001)

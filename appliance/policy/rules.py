@@ -1,14 +1,14 @@
 """Compiles the lines of the deciding sections into rule tables, and notes what is wrong with them."""
 
+from appliance.base.validation_messages import meant
 from appliance.policy import commands
-from appliance.policy.findings import Findings, quoted
 from appliance.policy.groups import Groups
+from appliance.policy.ini_reader import Entry, SectionText, Word
 from appliance.policy.keys import BadKeyError, Key, command_key, parse_key
 from appliance.policy.model import Category, Rule
 from appliance.policy.policy import CompiledRule, RuleTable, place_of
-from appliance.policy.reader import Entry, SectionText, Word
+from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import DEFAULT, PARAMETERS, Decider
-from appliance.wrong_values import meant
 
 MAXIMUM_INNER_STARS = 1000
 """Keys with a star before the end, in all sections: they make looking up a name branch."""

@@ -4,12 +4,12 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from appliance.policy.findings import Findings, quoted
+from appliance.base.validation_messages import meant
+from appliance.policy.ini_reader import Entry, SectionText
 from appliance.policy.model import TELLS
 from appliance.policy.policy import DEFAULT_PORTS
-from appliance.policy.reader import Entry, SectionText
+from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.sections import DECIDERS
-from appliance.wrong_values import meant
 from roswire.names import is_global_name
 
 TAKEOVERS = ("same-host", "granted")

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Self
 
-from appliance.recorder.bag import (
+from appliance.recorder.bag_writer import (
     BAG,
     CHUNK,
     CHUNK_INFO,

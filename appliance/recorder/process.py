@@ -14,13 +14,13 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
-from appliance.ages import AgeClock
+from appliance.base.age_clock import AgeClock
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.channel.child import Child
-from appliance.config import Settings, load_resolved
+from appliance.channel.child_process import Child
+from appliance.configuration.settings import Settings, load_resolved
 from appliance.recorder.recorder import Recorder
-from appliance.recorder.shelf import Shelf
+from appliance.recorder.recording_store import Shelf
 
 _DAY = 86_400.0
 _T = TypeVar("_T")

@@ -21,16 +21,16 @@ from typing import Any
 import msgspec
 import structlog
 
-from appliance.audit.database import LogUnreadableError
 from appliance.audit.ids import IdSource
+from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter
 from appliance.audit.search import Follower, export, search
 from appliance.channel import messages
 from appliance.channel.answers.recordings import Recording, Trigger
-from appliance.config import RecorderRules
-from appliance.recorder.plan import KEPT, HourlyLimit, lane, span
+from appliance.configuration.settings import RecorderRules
 from appliance.recorder.recording import MOST_TRIGGERS, Progress, RecordingInProgress, load_progress
-from appliance.recorder.shelf import MOST_LENT, Shelf
+from appliance.recorder.recording_plan import KEPT, HourlyLimit, lane, span
+from appliance.recorder.recording_store import MOST_LENT, Shelf
 from appliance.recorder.triggers import trigger_of
 
 SETTLE_SECONDS = 0.5

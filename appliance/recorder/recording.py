@@ -18,16 +18,16 @@ from pathlib import Path
 
 import msgspec
 
-from appliance.audit.output import Entry, as_json
 from appliance.audit.record import Severity
+from appliance.audit.record_format import Entry, as_json
+from appliance.base.atomic_files import write_whole
 from appliance.channel.answers.recordings import OPERATORS, LeftOutTopic, RecordedTopic, Recording, Trigger
 from appliance.channel.messages import RevisionsStated
-from appliance.recorder.bag import BagWriter, Message
+from appliance.recorder.bag_writer import BagWriter, Message
 from appliance.recorder.never import NAMED
+from appliance.recorder.recording_store import ABOUT, BAG, PROGRESS
 from appliance.recorder.ring import LEFT_OUT
 from appliance.recorder.ring_reader import MOST_MESSAGES, Found, Place, RingReader
-from appliance.recorder.shelf import ABOUT, BAG, PROGRESS
-from appliance.whole_files import write_whole
 from roswire.log_message import ERROR, INFO, TYPE, WARN, log_message
 from roswire.standard import standard_definitions
 

@@ -15,8 +15,8 @@ from typing import Any, get_args
 
 import msgspec
 
-from appliance.audit.output import without_binding
 from appliance.audit.record import Severity
+from appliance.audit.record_format import without_binding
 from appliance.channel.answers.recordings import (
     EventKind,
     EventMarks,
@@ -28,8 +28,8 @@ from appliance.channel.answers.recordings import (
     Sender,
     Timeline,
 )
-from appliance.recorder.bag import INDEX_ENTRY
 from appliance.recorder.bag_reader import BagReader, Place
+from appliance.recorder.bag_writer import INDEX_ENTRY
 from appliance.recorder.recording import LOG, RECORDS
 from appliance.recorder.triggers import kinds_of
 from roswire.message_view import PublisherReader

@@ -6,8 +6,8 @@ missed while control dies and comes back.
 
 from collections.abc import Collection
 
-from appliance.audit.output import without_binding
 from appliance.audit.record import Record, Severity
+from appliance.audit.record_format import without_binding
 from appliance.channel.answers.recordings import APPLIANCE, Trigger, TriggerKind
 
 _BY_EVENT: dict[str, TriggerKind] = {

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from appliance.relay.bounds import Limits
 from appliance.relay.connections.frames import Scratch
 from appliance.relay.connections.memory import Memory
-from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
-from appliance.relay.monitors.middle import Middle
+from appliance.relay.monitors.interceptor import Middle
 from appliance.relay.report import Reporter
 
 

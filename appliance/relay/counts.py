@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from appliance.relay.monitors.places import Place
+from appliance.relay.monitors.observation_points import Place
 
 if TYPE_CHECKING:
     from rosmop.fast.wasm_runner import Walked, Walker

@@ -30,7 +30,7 @@ from collections import deque
 from collections.abc import Callable, Collection
 from typing import NamedTuple
 
-from appliance.shares.table import RELAY_TURN
+from appliance.quotas.table import RELAY_TURN
 
 READ = select.EPOLLIN
 WRITE = select.EPOLLOUT

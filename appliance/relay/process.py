@@ -23,14 +23,14 @@ from appliance.channel.messages import (
     StateGiven,
     Stop,
 )
-from appliance.relay.connections.links import Link
+from appliance.relay.bounds import Limits
+from appliance.relay.connections.loop_channel import Link
 from appliance.relay.connections.sockets import congestion_control
-from appliance.relay.engine import Engine
-from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
 from appliance.relay.monitors.keeper import Keeper
 from appliance.relay.monitors.state_memory import mapped
 from appliance.relay.recorder_ring import Recorded
+from appliance.relay.relay import Engine
 
 _DESCRIPTORS_BESIDE = 1024
 

@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable, Mapping
 
 from appliance.channel.messages import RingGiven
+from appliance.quotas.table import RECORDER_MEMORY
 from appliance.recorder.never import fits, left_out_because
 from appliance.recorder.ring import LEFT_OUT, RingWriter, Stream
-from appliance.shares.table import RECORDER_MEMORY
 
 _TOPIC_SHARE = 0.25
 _STEP = 100_000_000  # nanoseconds

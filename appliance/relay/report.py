@@ -23,9 +23,9 @@ from appliance.channel.messages import (
     TopicTraffic,
     TrafficReported,
 )
-from appliance.relay.connections.flow import Part
-from appliance.relay.connections.links import Link
-from appliance.relay.limits import Limits
+from appliance.relay.bounds import Limits
+from appliance.relay.connections.loop_channel import Link
+from appliance.relay.connections.rate_limit import Part
 
 _Refusal = tuple[str, str, str, str, str, str]
 _Limited = tuple[str, str, Part, str, str]

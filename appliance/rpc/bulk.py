@@ -11,10 +11,10 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any, ParamSpec, Self, TypeVar
 
 from appliance.policy.model import Address
+from appliance.quotas.pool import Bounds, Standing
+from appliance.quotas.table import LARGE_WRITES
+from appliance.rpc.fair_queue import Turns
 from appliance.rpc.processor_time import ProcessorTime
-from appliance.rpc.turns import Turns
-from appliance.shares.pool import Bounds, Standing
-from appliance.shares.table import LARGE_WRITES
 from roswire.xmlrpc import Value
 
 P = ParamSpec("P")

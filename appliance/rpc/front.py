@@ -21,7 +21,7 @@ from typing import Any
 import httptools
 
 from appliance.policy.model import Address, address_of
-from appliance.rpc.visitors import Stage, Visitors
+from appliance.rpc.connection_table import Stage, Visitors
 
 # A head of many short fields is as long as the bytes it came in.
 _FIELD_FRAMING = len(": \r\n")

@@ -20,7 +20,7 @@ from collections.abc import Callable, Coroutine, Generator, Hashable
 from typing import Any, Generic, TypeVar
 
 from appliance.policy.model import Address
-from appliance.shares.table import RVMASTER_TIME
+from appliance.quotas.table import RVMASTER_TIME
 
 TURN_SECONDS = RVMASTER_TIME.bounds.whole / 1e6
 _MOST_KEPT = 1024  # entries of what was used, before those that owe nothing are removed

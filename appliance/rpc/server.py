@@ -28,10 +28,10 @@ import structlog
 
 from appliance.policy.model import Address
 from appliance.rpc.acceptor import BACKLOG, Acceptor
+from appliance.rpc.connection_table import Stage, Visitors
+from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import Front, HttpLimits, plain_address
 from appliance.rpc.processor_time import ProcessorTime
-from appliance.rpc.turns import Turns
-from appliance.rpc.visitors import Stage, Visitors
 from roswire.xmlrpc import build_fault
 
 _log = structlog.get_logger()

@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from appliance.specifications.files import Checked
+from appliance.specifications.specification_files import Checked
 
 TOPIC, SERVICE = "topic", "service"
 Resource = tuple[str, str]

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 
 from appliance.channel.messages import Contents, PartNames
-from appliance.specifications.files import SpecificationsRefusedError
+from appliance.specifications.specification_files import SpecificationsRefusedError
 from rosmop.certify.properties import DEFECT, certificates_of
 from rosmop.certify.steps import StepDiffersError
 from rosmop.fast.serialization import decoded, encoded, encoded_part

@@ -6,7 +6,7 @@ reading of all its files in the loop that decides requests.
 
 from pathlib import Path
 
-from appliance.specifications.files import Sources, SpecificationsRefusedError, read_folder
+from appliance.specifications.specification_files import Sources, SpecificationsRefusedError, read_folder
 
 _Stamp = tuple[str, int, int, int, int]
 

@@ -8,8 +8,8 @@ specifications come into force, for what a change adds: what is in force already
 from collections.abc import Collection, Iterable, Mapping
 from typing import NamedTuple
 
-from appliance.specifications.files import Checked
-from appliance.wrong_values import meant
+from appliance.base.validation_messages import meant
+from appliance.specifications.specification_files import Checked
 
 Published = Mapping[str, Mapping[str, str]]
 """Which nodes publish a topic, each with the type that it registered."""

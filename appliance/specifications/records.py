@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from appliance.audit.record import Severity
-from appliance.audit_trail import AuditTrail
 from appliance.channel.messages import MonitorEvent
+from appliance.telemetry.audit_trail import AuditTrail
 
 _EVENTS = {
     "verdict": ("monitor verdict", Severity.NOTICE),

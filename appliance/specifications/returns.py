@@ -17,10 +17,10 @@ from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 import msgspec
 import structlog
 
-from appliance.specifications.files import SpecificationsRefusedError
 from appliance.specifications.rollout import Switch
-from appliance.store.database import StoreError
-from appliance.store.state import StateStore
+from appliance.specifications.specification_files import SpecificationsRefusedError
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
 
 LONGEST = 30 * 86_400.0
 """Seconds for which a monitor may be disabled with a return."""

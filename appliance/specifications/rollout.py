@@ -15,12 +15,12 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from appliance.audit.record import Severity
-from appliance.audit_trail import AuditTrail
+from appliance.base.withdrawal import take_effect
 from appliance.channel import messages
 from appliance.specifications.allocation import Allocation, Plan
-from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError
-from appliance.specifications.relays import Relays
-from appliance.withdrawal import take_effect
+from appliance.specifications.relay_needs import Relays
+from appliance.specifications.specification_files import Checked, Sources, SpecificationsRefusedError
+from appliance.telemetry.audit_trail import AuditTrail
 
 TRIAL: Literal["on trial"] = "on trial"
 Switch = bool | Literal["on trial"]

@@ -8,8 +8,8 @@ ones).
 
 from collections.abc import Mapping
 
-from appliance.specifications.files import Checked, SpecificationsRefusedError
 from appliance.specifications.rollout import TRIAL, Switch
+from appliance.specifications.specification_files import Checked, SpecificationsRefusedError
 from rosmop.form.connected_groups import sharing
 
 

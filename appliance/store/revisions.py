@@ -8,8 +8,8 @@ from typing import Protocol, TypeVar
 
 import structlog
 
-from appliance.store.database import StoreError
-from appliance.store.state import StateStore
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
 
 _log = structlog.get_logger()
 _AGAIN_SECONDS = 5.0

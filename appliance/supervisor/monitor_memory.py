@@ -19,8 +19,8 @@ from pathlib import Path
 import msgspec
 import structlog
 
+from appliance.base.atomic_files import write_whole
 from appliance.channel.messages import StateGiven
-from appliance.whole_files import write_whole
 
 FOLDER = "monitors"
 SIZE = 32 << 20

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import msgspec
 
-from appliance.relay.limits import Limits
+from appliance.relay.bounds import Limits
 from appliance.relay.process import main as relay
 
 

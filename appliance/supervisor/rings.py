@@ -14,7 +14,7 @@ from pathlib import Path
 from pydantic import ByteSize
 
 from appliance.channel.messages import RingGiven
-from appliance.config import RecorderRules
+from appliance.configuration.settings import RecorderRules
 from appliance.recorder.never import known_sums
 from appliance.supervisor.errors import StartError
 

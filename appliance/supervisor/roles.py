@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from appliance.shipped import DPKG
+from appliance.base.shipped import DPKG
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.ports import first_free
-from appliance.supervisor.walls.folders import around, runnable
-from appliance.supervisor.walls.plan import NETWORK, ROUTES, Walls
+from appliance.supervisor.port_check import first_free
+from appliance.supervisor.sandbox.folders import around, runnable
+from appliance.supervisor.sandbox.sandbox_plan import NETWORK, ROUTES, Walls
 
 ROSMASTER = Path("/usr/bin/rosmaster")
 _ROSMASTER_LOGGING = Path(__file__).with_name("rosmaster_logging.conf")

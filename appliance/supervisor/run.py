@@ -10,21 +10,21 @@ from pathlib import Path
 
 import structlog
 
-from appliance.config import Settings, Unasked
-from appliance.config_sources import plain
+from appliance.configuration.settings import Settings, Unasked
+from appliance.configuration.sources import plain
+from appliance.network.close_ports import local_port_range
 from appliance.network.firewall.iptables import load_modules
-from appliance.network.protect import local_port_range
 from appliance.supervisor import signals
-from appliance.supervisor.enclosure import Enclosure, Ports, enclosure_of
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.isolation_lifecycle import Enclosure, Ports, enclosure_of
 from appliance.supervisor.monitor_memory import MonitorMemory
-from appliance.supervisor.ports import free_port, require_free, spare_ports
+from appliance.supervisor.port_check import free_port, require_free, spare_ports
 from appliance.supervisor.privileges import keep_supervisors, raise_file_limit
 from appliance.supervisor.restore_mark import refuse_half_restored
 from appliance.supervisor.rings import Rings
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.service_manager import ServiceManager
-from appliance.supervisor.state import StateDirectory
+from appliance.supervisor.state_directory import StateDirectory
 from appliance.supervisor.supervisor import ControlReady, Supervisor
 
 _LIVES_A_MINUTE = 64  # of a rosout that keeps dying; the connections of each keep its port for so long

@@ -8,7 +8,7 @@ from contextlib import suppress
 import structlog
 
 from appliance.channel.messages import Stop
-from appliance.supervisor.post import Post
+from appliance.supervisor.process_slot import Post
 
 _STOP_SECONDS = 3.0
 _TERMINATE_SECONDS = 0.3

@@ -28,12 +28,14 @@ import structlog
 
 from appliance.channel import messages
 from appliance.ipsec.charon import PROGRAM as CHARON
-from appliance.supervisor import health, signals
-from appliance.supervisor.clock import clock_is_synchronised
-from appliance.supervisor.enclosure import Enclosure
+from appliance.supervisor import rosmaster_probe, signals
+from appliance.supervisor.clock_sync import clock_is_synchronised
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.guard import Guard
-from appliance.supervisor.life import (
+from appliance.supervisor.inherited_listeners import KeptSockets, RefusedSocketError
+from appliance.supervisor.isolation_lifecycle import Enclosure
+from appliance.supervisor.isolation_watchdog import Guard
+from appliance.supervisor.monitor_memory import MonitorMemory
+from appliance.supervisor.process_handle import (
     ANSWER_SECONDS,
     FIRST_ANSWER_SECONDS,
     LONGEST_START_SECONDS,
@@ -41,9 +43,7 @@ from appliance.supervisor.life import (
     Reports,
     link,
 )
-from appliance.supervisor.listeners import KeptSockets, RefusedSocketError
-from appliance.supervisor.monitor_memory import MonitorMemory
-from appliance.supervisor.post import Post
+from appliance.supervisor.process_slot import Post
 from appliance.supervisor.rings import Rings
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.shutdown import end_all
@@ -483,7 +483,7 @@ class Supervisor:
     async def answers(self, seconds: float) -> bool:
         """Whether ROSMaster answers within so many seconds."""
         inside = self._guard.enclosure.inside()
-        return await health.answers(self._facts.rosmaster_port, account_of("rosrv"), inside, seconds)
+        return await rosmaster_probe.answers(self._facts.rosmaster_port, account_of("rosrv"), inside, seconds)
 
     def died(self, life: Life, code: int) -> None:
         """A process has ended: see who follows."""

@@ -20,9 +20,9 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from appliance.base.shipped import SHIPPED
 from appliance.cli.output import say_json
 from appliance.network.namespaces import NetworkError, has_privileges
-from appliance.shipped import SHIPPED
 from examples.landshark.doorway import Doorway
 from examples.landshark.lab import Lab
 from examples.landshark.mistakes import Mistakes, Ways

@@ -22,7 +22,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from appliance.network import links
+from appliance.network import interfaces
 from appliance.network.endings import end_processes
 from appliance.network.namespaces import Namespace, NetworkError, namespaces, require_privileges
 
@@ -85,8 +85,8 @@ class Lab:
         clear_leftovers(self.prefix)
         try:
             self.switch.create()
-            links.set_link(self.switch, "lo", up=True)
-            links.create_bridge(self.switch, _BRIDGE)
+            interfaces.set_link(self.switch, "lo", up=True)
+            interfaces.create_bridge(self.switch, _BRIDGE)
         except BaseException:
             self.close()
             raise
@@ -106,22 +106,22 @@ class Lab:
         namespace = Namespace(f"{self._mark}.{name}").create()
         port = f"port{len(self.hosts)}"
         self.hosts[name] = host = Host(name, namespace, port, addresses)
-        links.set_link(namespace, "lo", up=True)
-        links.create_veth(namespace, INTERFACE, self.switch, port)
-        links.attach(self.switch, port, _BRIDGE)
+        interfaces.set_link(namespace, "lo", up=True)
+        interfaces.create_veth(namespace, INTERFACE, self.switch, port)
+        interfaces.attach(self.switch, port, _BRIDGE)
         for address in addresses:
-            links.add_address(namespace, INTERFACE, address)
+            interfaces.add_address(namespace, INTERFACE, address)
         if gateway is not None:
-            links.add_route(namespace, "default", gateway)
+            interfaces.add_route(namespace, "default", gateway)
         return host
 
     def unplug(self, host: Host) -> None:
         """Take the host's cable out: packets are lost from now on."""
-        links.set_link(self.switch, host.port, up=False)
+        interfaces.set_link(self.switch, host.port, up=False)
 
     def plug(self, host: Host) -> None:
         """Put the host's cable back in."""
-        links.set_link(self.switch, host.port, up=True)
+        interfaces.set_link(self.switch, host.port, up=True)
 
     def close(self) -> None:
         """End every process in the lab and delete it; closing twice is fine."""

@@ -25,7 +25,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from appliance.shipped import IS_CHECKOUT
+from appliance.base.shipped import IS_CHECKOUT
 from examples.landshark.doorway import Doorway
 from examples.landshark.lab import Host, Lab
 

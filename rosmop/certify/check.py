@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TypeVar
 
-from rosmop.certify import patterns, text
+from rosmop.certify import formula_reader, patterns
+from rosmop.certify.formula_reader import TooMuchError, UnreadError
 from rosmop.certify.future import Future, State, positive
 from rosmop.certify.guesses import Guesses
 from rosmop.certify.machines import Machine
-from rosmop.certify.past import Past
-from rosmop.certify.text import TooMuchError, UnreadError
+from rosmop.certify.past_formulas import Past
 from rosmop.certify.words import Words
 
 MOST_STEPS = 200_000
@@ -158,8 +158,8 @@ def _said(verdicts: Verdicts) -> str:
     return " and ".join(verdicts) or "nothing"
 
 
-def _check_past(grammar: text.Grammar, formula: str, events: Sequence[str], tables: Tables) -> int:
-    past = Past(text.formula(formula, events, grammar))
+def _check_past(grammar: formula_reader.Grammar, formula: str, events: Sequence[str], tables: Tables) -> int:
+    past = Past(formula_reader.formula(formula, events, grammar))
     steps: dict[tuple[object, str], tuple[tuple[bool, ...], bool]] = {}
 
     def step(state: tuple[tuple[bool, ...], bool], event: str) -> tuple[tuple[bool, ...], bool]:
@@ -179,7 +179,7 @@ def _check_past(grammar: text.Grammar, formula: str, events: Sequence[str], tabl
 
 def _check_words(formula: str, events: Sequence[str], tables: Tables) -> int:
     """`fail` once no continuation matches: nothing that a derivative leads to has the empty word."""
-    words = Words(text.expression(formula, events), MOST_WORK)
+    words = Words(formula_reader.expression(formula, events), MOST_WORK)
     dead: dict[int, bool] = {}
 
     def is_dead(state: int) -> bool:
@@ -217,7 +217,7 @@ def _dead(words: Words, start: int, events: Sequence[str]) -> dict[int, bool]:
 
 
 def _check_future(formula: str, events: Sequence[str], tables: Tables) -> int:
-    return _check_endless(text.formula(formula, events, text.LTL), events, events, tables)
+    return _check_endless(formula_reader.formula(formula, events, formula_reader.LTL), events, events, tables)
 
 
 def _check_pattern(formula: str, events: Sequence[str], tables: Tables) -> int:
@@ -228,7 +228,9 @@ def _check_pattern(formula: str, events: Sequence[str], tables: Tables) -> int:
 _SILENCE = "(silence)"
 
 
-def _check_endless(formula: text.Node, events: Sequence[str], letters: Sequence[str], tables: Tables) -> int:
+def _check_endless(
+    formula: formula_reader.Node, events: Sequence[str], letters: Sequence[str], tables: Tables
+) -> int:
     """`violation` once no endless continuation makes it true, `validation` once all do. Follows it and its opposite."""
     guesses = Guesses(formula, letters)
     future = Future(guesses.count, MOST_WORK)
@@ -277,8 +279,8 @@ _CHECKS: dict[str, Callable[[str, Sequence[str], Tables], int]] = {
     "ere": _check_words,
     "fsm": _check_machine,
     "ltl": _check_future,
-    "mtl": partial(_check_past, text.MTL),
+    "mtl": partial(_check_past, formula_reader.MTL),
     "pattern": _check_pattern,
-    "ptltl": partial(_check_past, text.PTLTL),
+    "ptltl": partial(_check_past, formula_reader.PTLTL),
     "tfsm": _check_machine,
 }

@@ -10,7 +10,7 @@ from rosmop.fast.abi import LEFT, SOONER, TOLD
 from rosmop.fast.batch_codegen import WrittenModule
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
-from rosmop.form.components import Group
+from rosmop.form.specification_groups import Group
 from rosmop.logics.interface import ClockedProperty, ClockedRun, CompiledProperty, FiniteProperty
 
 HAPPENED, DROPPED, CHANGED, ELSEWHERE, RESET = 1, 2, 4, 8, 16

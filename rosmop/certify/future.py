@@ -11,7 +11,7 @@ Whether a clause can come true: its ways from event to event are followed, and t
 
 from collections.abc import Sequence
 
-from rosmop.certify.text import Node, TooMuchError
+from rosmop.certify.formula_reader import Node, TooMuchError
 
 Clause = frozenset[Node]
 State = frozenset[Clause]

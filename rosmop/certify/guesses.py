@@ -8,7 +8,7 @@ exactly one guess keeps all rules, so a formula can come true with them where it
 from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
 
-from rosmop.certify.text import Node, TooMuchError
+from rosmop.certify.formula_reader import Node, TooMuchError
 
 MOST_LETTERS = 1024
 

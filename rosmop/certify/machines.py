@@ -5,7 +5,7 @@
 
 from collections.abc import Sequence
 
-from rosmop.certify.text import UnreadError, Words
+from rosmop.certify.formula_reader import UnreadError, Words
 
 FAIL = "fail"
 

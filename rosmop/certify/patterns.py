@@ -13,7 +13,7 @@ Strictly before and after: no event answers itself. An event that closes the sco
 
 from collections.abc import Sequence
 
-from rosmop.certify.text import Node, UnreadError, Words
+from rosmop.certify.formula_reader import Node, UnreadError, Words
 
 _FALSE: Node = ("false",)
 

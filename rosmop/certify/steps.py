@@ -43,7 +43,7 @@ from rosmop.fast.abi import AREA, Cells
 from rosmop.fast.batch_codegen import WrittenModule
 from rosmop.fast.wasm_instance import Machine, MachineTrap, translated
 from rosmop.form.compiled import Compiled
-from rosmop.form.components import groups
+from rosmop.form.specification_groups import groups
 from rosmop.logics.interface import ClockedProperty, ClockedRun, FiniteProperty
 
 MOST = 100_000

@@ -6,7 +6,7 @@ order, or twice, is the same. Then there are finitely many derivatives (Brzozows
 
 from collections.abc import Iterable
 
-from rosmop.certify.text import Node, TooMuchError, UnreadError
+from rosmop.certify.formula_reader import Node, TooMuchError, UnreadError
 
 LONGEST = 5_000
 """Symbols of an expression whose powers are written out."""

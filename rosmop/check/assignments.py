@@ -3,7 +3,7 @@
 A parameter that is bound to a field remembers that it was assigned, because only then the field is written.
 """
 
-from rosmop.check.places import (
+from rosmop.check.assignables import (
     CharacterPlace,
     ElementPlace,
     PartPlace,
@@ -16,7 +16,7 @@ from rosmop.check.places import (
 from rosmop.check.scope import Scope
 from rosmop.form import nodes
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
+from rosmop.types import value_types
 
 
 def require_place(target: Value, what: str) -> Place:
@@ -43,8 +43,8 @@ def require_original(target: Value) -> None:
 def note_copy(target: Value, value: Value) -> None:
     """Remember that a `char *` was given another's characters."""
     variable = root(target)
-    if variable is not None and value.place is not None and isinstance(value.type, kinds.Characters):
-        variable.copied = variable.copied or isinstance(variable.type, kinds.Characters)
+    if variable is not None and value.place is not None and isinstance(value.type, value_types.Characters):
+        variable.copied = variable.copied or isinstance(variable.type, value_types.Characters)
 
 
 def store(scope: Scope, target: Value, value: nodes.Expression) -> nodes.Expression:
@@ -59,14 +59,14 @@ def write_store(scope: Scope, target: Value, value: nodes.Expression) -> None:
     flag = mark(scope, target)
     scope.evaluate(_store(scope, place, value))
     if flag is not None:
-        scope.evaluate(nodes.Assign(kinds.BOOL, flag, nodes.Literal(kinds.BOOL, True)))
+        scope.evaluate(nodes.Assign(value_types.BOOL, flag, nodes.Literal(value_types.BOOL, True)))
 
 
 def marked(flag: str | None, change: nodes.Expression) -> nodes.Expression:
     """An expression that changes a place, which sets the flag for that, if there is one."""
     if flag is None:
         return change
-    assigned = nodes.Assign(kinds.BOOL, flag, nodes.Literal(kinds.BOOL, True))
+    assigned = nodes.Assign(value_types.BOOL, flag, nodes.Literal(value_types.BOOL, True))
     return nodes.Sequence(change.type, (assigned, change), 1)
 
 
@@ -93,7 +93,7 @@ def _store(scope: Scope, place: Place, value: nodes.Expression) -> nodes.Express
     if isinstance(place, ElementPlace):
         return nodes.Call(value.type, "a_put", (place.base.form, place.index, value), place.site)
     if isinstance(place, SlotPlace):
-        slot = nodes.Literal(kinds.INT, place.slot)
+        slot = nodes.Literal(value_types.INT, place.slot)
         return nodes.Call(value.type, "a_slot", (place.base.form, slot, value))
     return _store_part(scope, place, value)
 
@@ -103,7 +103,7 @@ def _store_part(scope: Scope, place: Place, value: nodes.Expression) -> nodes.Ex
     assert isinstance(place, CharacterPlace | PartPlace)  # the last kinds of places
     inner, base = require_place(place.base, "an assignment"), place.base.form
     if isinstance(place, PartPlace):
-        part = nodes.Literal(kinds.VOID, place.part.encode())
+        part = nodes.Literal(value_types.VOID, place.part.encode())
         return _store(scope, inner, nodes.Call(base.type, "a_part", (base, part, value), place.site))
     changed = nodes.Call(base.type, "a_character", (base, place.index, value), place.site)
     return _store(scope, inner, changed)

@@ -5,14 +5,14 @@ A cursor is an index into a vector that is known when the code is compiled; it i
 
 from collections.abc import Sequence
 
+from rosmop.check.assignables import Value
 from rosmop.check.assignments import mark, marked, require_place
 from rosmop.check.conversion import convert, number
-from rosmop.check.places import Value
 from rosmop.check.scope import Scope
 from rosmop.form import nodes
 from rosmop.form.positions import Position
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
+from rosmop.types import value_types
 
 ALGORITHMS = frozenset({"sort", "reverse", "accumulate"})
 """Functions of `<algorithm>` and `<numeric>` that take a vector from `begin` to `end`."""
@@ -22,35 +22,40 @@ def moved(operator: str, left: Value, right: Value, position: Position) -> Value
     """`begin + n`, `end - n`, `end - begin`; None if this is none of them."""
     if left.vector is None or operator not in ("+", "-"):
         return None
-    if kinds.is_number(right.type):
-        function, distance = "k_after" if operator == "+" else "k_before", number(right.form, kinds.LONG)
-        return Value(nodes.Call(kinds.INDEX, function, (left.form, distance)), position, vector=left.vector)
+    if value_types.is_number(right.type):
+        function, distance = (
+            "k_after" if operator == "+" else "k_before",
+            number(right.form, value_types.LONG),
+        )
+        return Value(
+            nodes.Call(value_types.INDEX, function, (left.form, distance)), position, vector=left.vector
+        )
     if right.vector is not None and operator == "-":
-        return Value(nodes.Call(kinds.LONG, "k_before", (left.form, right.form)), position)
+        return Value(nodes.Call(value_types.LONG, "k_before", (left.form, right.form)), position)
     return None
 
 
 def begin_or_end(base: Value, name: str, position: Position) -> Value:
     """`v.begin()` or `v.end()`."""
-    begin = nodes.Literal(kinds.INDEX, 0)
-    place = begin if name == "begin" else nodes.Call(kinds.INDEX, "l_len", (base.form,))
+    begin = nodes.Literal(value_types.INDEX, 0)
+    place = begin if name == "begin" else nodes.Call(value_types.INDEX, "l_len", (base.form,))
     return Value(place, position, vector=base)
 
 
 def erase(scope: Scope, base: Value, cursors: Sequence[Value], at: tuple[Position, int]) -> Value:
     """`v.erase(place)`, `v.erase(first, last)`."""
-    first, last = _index(base, cursors[0]), nodes.Literal(kinds.VOID, None)
+    first, last = _index(base, cursors[0]), nodes.Literal(value_types.VOID, None)
     arguments = (base.form, first, _index(base, cursors[1]) if len(cursors) > 1 else last)
-    return _changed(scope, base, nodes.Call(kinds.VOID, "k_erase", arguments, at[1]), at[0])
+    return _changed(scope, base, nodes.Call(value_types.VOID, "k_erase", arguments, at[1]), at[0])
 
 
 def insert(scope: Scope, base: Value, arguments: Sequence[Value], at: tuple[Position, int]) -> Value:
     """`v.insert(place, value)`."""
     kind = _vector(base, at[0])
     value = convert(scope, arguments[1], kind.element, at[1])
-    width = nodes.Literal(kinds.ULONG, scope.values.width(kind.element))
+    width = nodes.Literal(value_types.ULONG, scope.values.width(kind.element))
     handed = (base.form, _index(base, arguments[0]), value, width)
-    return _changed(scope, base, nodes.Call(kinds.VOID, "k_insert", handed, at[1]), at[0])
+    return _changed(scope, base, nodes.Call(value_types.VOID, "k_insert", handed, at[1]), at[0])
 
 
 def algorithm(scope: Scope, name: str, values: Sequence[Value], at: tuple[Position, int]) -> Value:
@@ -65,9 +70,9 @@ def algorithm(scope: Scope, name: str, values: Sequence[Value], at: tuple[Positi
         return _sum(values, span, at)
     if len(values) != 2:
         raise SpecificationError.at(values[2].position, f"`{name}` with a function of one's own is not known")
-    if name == "sort" and not kinds.is_scalar(kind.element):
+    if name == "sort" and not value_types.is_scalar(kind.element):
         raise SpecificationError.at(position, f"a {kind} has no order to sort by")
-    return _changed(scope, base, nodes.Call(kinds.VOID, f"k_{name}", span, site), position)
+    return _changed(scope, base, nodes.Call(value_types.VOID, f"k_{name}", span, site), position)
 
 
 def _sum(
@@ -75,21 +80,21 @@ def _sum(
     span: tuple[nodes.Expression, nodes.Expression, nodes.Expression],
     at: tuple[Position, int],
 ) -> Value:
-    if len(values) != 3 or not kinds.is_number(values[2].type):
+    if len(values) != 3 or not value_types.is_number(values[2].type):
         raise SpecificationError.at(
             at[0], "`accumulate` goes from `v.begin()` to `v.end()`, with a number to start from"
         )
     kind = values[2].type
     assert values[0].vector is not None  # the caller has looked
     element = _vector(values[0].vector, at[0]).element
-    if not kinds.is_number(element):
+    if not value_types.is_number(element):
         raise SpecificationError.at(at[0], f"{element} has no sum")
-    wide = kinds.common(kind, element)
+    wide = value_types.common(kind, element)
     return Value(nodes.Accumulate(kind, *span, values[2].form, wide, at[1]), at[0])
 
 
-def _vector(base: Value, position: Position) -> kinds.Vector:
-    if not isinstance(base.type, kinds.Vector):
+def _vector(base: Value, position: Position) -> value_types.Vector:
+    if not isinstance(base.type, value_types.Vector):
         raise SpecificationError.at(position, f"{base.type} has no elements")
     return base.type
 

@@ -3,11 +3,11 @@
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-from rosmop.check.functions import topics_of
+from rosmop.check.function_bodies import topics_of
 from rosmop.check.scope import SpecificationNames
 from rosmop.logics.interface import CompiledProperty
-from rosmop.logics.lint import TIME, Graph, graph_of, shortest_trace_to
 from rosmop.logics.pattern import ENFORCED, TimedPattern
+from rosmop.logics.property_lint import TIME, Graph, graph_of, shortest_trace_to
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
 from rosmop.types.messages import nearest, shown

@@ -5,20 +5,28 @@ import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from rosmop.check import assignments, calls, initializers, members, operators, order, vector_members
+from rosmop.check import (
+    assignments,
+    call_expressions,
+    initializers,
+    members,
+    operators,
+    order,
+    vector_members,
+)
+from rosmop.check.assignables import CharacterPlace, Value, Variable, VariablePlace
 from rosmop.check.conversion import condition, constant_value, convert, number
 from rosmop.check.margins import noted
-from rosmop.check.places import CharacterPlace, Value, Variable, VariablePlace
 from rosmop.check.scope import Scope
 from rosmop.check.standard_functions import CONSTANTS
 from rosmop.form import nodes
 from rosmop.form.positions import Finding, Position
 from rosmop.run.interpreter import constant_of
-from rosmop.runtime.context import FaultError
+from rosmop.runtime.action_context import FaultError
 from rosmop.runtime.numbers import f32
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
+from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.resolve import resolve
 
@@ -47,15 +55,15 @@ def literal_number(scope: Scope, node: tree.Number) -> Value:
 
 def _is_beyond_long(node: tree.Number) -> bool:
     """Whether it is a decimal integer without suffix that `long` does not hold."""
-    return bool(_DECIMAL.fullmatch(node.text)) and int(node.text) > kinds.LONG.most
+    return bool(_DECIMAL.fullmatch(node.text)) and int(node.text) > value_types.LONG.most
 
 
 def _floating(node: tree.Number, value: float, suffix: str) -> Value:
     if suffix not in ("", "f", "l"):
         raise SpecificationError.at(node.position, f"{shown(node.text)} is no number")
     if suffix == "f":
-        return constant_value(node.position, kinds.FLOAT, f32(value))
-    return constant_value(node.position, kinds.DOUBLE, value)
+        return constant_value(node.position, value_types.FLOAT, f32(value))
+    return constant_value(node.position, value_types.DOUBLE, value)
 
 
 def _integer(scope: Scope, node: tree.Number, text: str, suffix: str) -> Value:
@@ -66,7 +74,12 @@ def _integer(scope: Scope, node: tree.Number, text: str, suffix: str) -> Value:
         raise SpecificationError.at(
             node.position, f"{shown(node.text)} is no number; one that begins with 0 is octal"
         ) from None
-    candidates: list[kinds.Integer] = [kinds.INT, kinds.UINT, kinds.LONG, kinds.ULONG]
+    candidates: list[value_types.Integer] = [
+        value_types.INT,
+        value_types.UINT,
+        value_types.LONG,
+        value_types.ULONG,
+    ]
     if "l" in suffix:
         candidates = candidates[2:]
     candidates = [
@@ -75,12 +88,12 @@ def _integer(scope: Scope, node: tree.Number, text: str, suffix: str) -> Value:
     for kind in candidates:
         if value <= kind.most:
             return constant_value(node.position, kind, value)
-    if value <= kinds.ULONG.most:  # g++ has a type of 128 bits for it, and warns, too
+    if value <= value_types.ULONG.most:  # g++ has a type of 128 bits for it, and warns, too
         warning = (
             f"{shown(node.text)} is larger than `long` holds, and an `unsigned long` here; write `{text}u`"
         )
         scope.shared.findings.append(Finding(node.position, "warning", warning))
-        return constant_value(node.position, kinds.ULONG, value)
+        return constant_value(node.position, value_types.ULONG, value)
     raise SpecificationError.at(node.position, f"{shown(node.text)} is larger than any integer type holds")
 
 
@@ -94,7 +107,7 @@ def folded(operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
         if operand.constant is not None
     ]
     value = make(*known)
-    if not kinds.is_number(value.type):
+    if not value_types.is_number(value.type):
         return value
     try:
         constant = constant_of(value.form)
@@ -107,11 +120,11 @@ def folded(operands: tuple[Value, ...], make: Callable[..., Value]) -> Value:
 
 
 def _text(_scope: Scope, node: tree.Text) -> Value:
-    return constant_value(node.position, kinds.STRING, node.value)
+    return constant_value(node.position, value_types.STRING, node.value)
 
 
 def _character(_scope: Scope, node: tree.Character) -> Value:
-    return constant_value(node.position, kinds.CHAR, node.value)
+    return constant_value(node.position, value_types.CHAR, node.value)
 
 
 def _name(scope: Scope, node: tree.Name) -> Value:
@@ -157,14 +170,14 @@ def _message(scope: Scope, node: tree.Expression) -> Value:
         }.get(scope.role, "there is no message here")
         raise SpecificationError.at(node.position, f"`MESSAGE` has no meaning here: {hint}")
     scope.pending = scope.pending or scope.symbols.fresh("u")
-    whole = nodes.Whole(kinds.Record(scope.message_type), scope.pending, scope.lines.site)
+    whole = nodes.Whole(value_types.Record(scope.message_type), scope.pending, scope.lines.site)
     return Value(whole, node.position)
 
 
 def _unary(scope: Scope, node: tree.Unary) -> Value:
     if node.operator == "-" and isinstance(node.operand, tree.Number) and _is_beyond_long(node.operand):
-        if int(node.operand.text) == -kinds.LONG.least:
-            return constant_value(node.position, kinds.LONG, kinds.LONG.least)
+        if int(node.operand.text) == -value_types.LONG.least:
+            return constant_value(node.position, value_types.LONG, value_types.LONG.least)
         raise SpecificationError.at(
             node.position, f"{shown('-' + node.operand.text)} is less than any integer type holds"
         )
@@ -179,7 +192,7 @@ def _step(scope: Scope, node: tree.Step) -> Value:
     target = value_of(scope, node.target)
     assignments.require_place(target, f"`{node.operator}`")
     first, target = ([], target) if target.pure else order.settled(scope, target)
-    one = constant_value(node.position, kinds.INT, 1)
+    one = constant_value(node.position, value_types.INT, 1)
     operands = operators.Operands(scope, node.position, target, one, scope.site(node))
     changed = convert(scope, operators.binary(node.operator[0], operands), target.type)
     stored = assignments.store(scope, target, changed)
@@ -224,21 +237,21 @@ def assignment(scope: Scope, node: tree.Assign) -> tuple[order.First, Value, nod
     if node.operator == "=" and isinstance(node.value, tree.Elements):
         return order.of_assignment(scope, target, initializers.elements(scope, node.value, target.type))
     value, site = value_of(scope, node.value), scope.site(node.value)
-    if node.operator == "=" and (target.pure or kinds.is_number(target.type)):
+    if node.operator == "=" and (target.pure or value_types.is_number(target.type)):
         return order.of_assignment(scope, target, _assigned(scope, target, value, site))
     first, target, value = order.of_change(scope, target, value)
     if node.operator == "=":  # of a class: C++ looks at what is assigned when all places are known
         return first, target, _assigned(scope, target, value, site)
     operands = operators.Operands(scope, node.position, target, value, scope.site(node))
-    if node.operator == "+=" and isinstance(target.type, kinds.String):
+    if node.operator == "+=" and isinstance(target.type, value_types.String):
         return first, target, operators.extended(operands).form
     return first, target, convert(scope, operators.binary(node.operator[:-1], operands), target.type)
 
 
 def _assigned(scope: Scope, target: Value, value: Value, site: int) -> nodes.Expression:
     """What a place is given: C++ takes a character for a string, too."""
-    if isinstance(target.type, kinds.String) and value.type == kinds.CHAR:
-        return nodes.Call(kinds.STRING, "t_byte", (value.form,))
+    if isinstance(target.type, value_types.String) and value.type == value_types.CHAR:
+        return nodes.Call(value_types.STRING, "t_byte", (value.form,))
     assignments.note_copy(target, value)
     return convert(scope, value, target.type, site)
 
@@ -250,13 +263,13 @@ def _conditional(scope: Scope, node: tree.Conditional) -> Value:
 
 def _either(scope: Scope, position: Position, tested: Value, yes: Value, no: Value) -> Value:
     test = condition(tested)
-    if kinds.is_number(yes.type) and kinds.is_number(no.type):
-        kind = yes.type if yes.type == no.type else kinds.common(yes.type, no.type)
+    if value_types.is_number(yes.type) and value_types.is_number(no.type):
+        kind = yes.type if yes.type == no.type else value_types.common(yes.type, no.type)
         either = [number(side.form, kind) for side in (yes, no)]
-    elif kinds.convertible(no.type, yes.type):
-        kind = kinds.STRING if isinstance(yes.type, kinds.Characters) else yes.type
+    elif value_types.convertible(no.type, yes.type):
+        kind = value_types.STRING if isinstance(yes.type, value_types.Characters) else yes.type
         either = [
-            convert(scope, side, kind) if kinds.is_scalar(kind) or side.type != kind else side.form
+            convert(scope, side, kind) if value_types.is_scalar(kind) or side.type != kind else side.form
             for side in (yes, no)
         ]
     else:
@@ -277,12 +290,12 @@ def _index(scope: Scope, node: tree.Index) -> Value:
     indexed = value_of(scope, node.base), value_of(scope, node.index)
     first, base, (index,) = order.of_member(scope, indexed[0], indexed[1:])
     site = scope.site(node)
-    if isinstance(base.type, kinds.Vector):
+    if isinstance(base.type, value_types.Vector):
         return order.after(first, vector_members.element_value(base, index, node.position, site))
-    if isinstance(base.type, kinds.String | kinds.Characters):
-        at = convert(scope, index, kinds.LONG)
+    if isinstance(base.type, value_types.String | value_types.Characters):
+        at = convert(scope, index, value_types.LONG)
         place = CharacterPlace(base, at, site) if base.place is not None else None
-        character = nodes.Call(kinds.CHAR, "e_character", (base.form, at), site)
+        character = nodes.Call(value_types.CHAR, "e_character", (base.form, at), site)
         return order.after(first, Value(character, node.position, place))
     raise SpecificationError.at(node.position, f"{base.type} has no elements")
 
@@ -301,20 +314,20 @@ def _cast(scope: Scope, node: tree.Cast) -> Value:
 
 def _construct(scope: Scope, node: tree.Construct) -> Value:
     kind = resolve(node.type, scope.messages)
-    if kinds.is_number(kind) and len(node.arguments) == 1:
+    if value_types.is_number(kind) and len(node.arguments) == 1:
         return _cast(scope, tree.Cast(node.position, node.type, node.arguments[0]))
-    return calls.construct(scope, node.position, kind, node.arguments)
+    return call_expressions.construct(scope, node.position, kind, node.arguments)
 
 
 def _new(scope: Scope, node: tree.NewCharacters) -> Value:
-    size = convert(scope, value_of(scope, node.size), kinds.ULONG)
-    zeros = (size, nodes.Literal(kinds.CHAR, 0))
-    return Value(nodes.Call(kinds.CHARACTERS, "e_repeat", zeros, scope.site(node)), node.position)
+    size = convert(scope, value_of(scope, node.size), value_types.ULONG)
+    zeros = (size, nodes.Literal(value_types.CHAR, 0))
+    return Value(nodes.Call(value_types.CHARACTERS, "e_repeat", zeros, scope.site(node)), node.position)
 
 
 def _limit(scope: Scope, node: tree.Limit) -> Value:
     kind = resolve(node.type, scope.messages)
-    found = calls.limits_of(kind).get(node.name)
+    found = call_expressions.limits_of(kind).get(node.name)
     if found is None:
         raise SpecificationError.at(node.position, f"`numeric_limits<{kind}>::{node.name}()` is not known")
     return constant_value(node.position, kind, found)
@@ -340,7 +353,7 @@ _KINDS: Mapping[type[tree.Expression], Callable[[Scope, Any], Value]] = {
     tree.Index: _index,
     tree.Member: _member,
     tree.Cast: _cast,
-    tree.Call: calls.call,
+    tree.Call: call_expressions.call,
     tree.Construct: _construct,
     tree.NewCharacters: _new,
     tree.Limit: _limit,

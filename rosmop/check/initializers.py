@@ -5,8 +5,8 @@ from rosmop.check.scope import Scope
 from rosmop.form import nodes
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 
 def converted(scope: Scope, node: tree.Expression, target: Type) -> nodes.Expression:
@@ -18,7 +18,7 @@ def converted(scope: Scope, node: tree.Expression, target: Type) -> nodes.Expres
 
 def elements(scope: Scope, node: tree.Elements, target: Type) -> nodes.Expression:
     """`{a, b, c}` as a vector."""
-    if not isinstance(target, kinds.Vector):
+    if not isinstance(target, value_types.Vector):
         if len(node.items) == 1:
             return converted(scope, node.items[0], target)
         if not node.items:

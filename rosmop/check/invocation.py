@@ -2,14 +2,14 @@
 
 from collections.abc import Callable, Sequence
 
+from rosmop.check.assignables import Value
 from rosmop.check.assignments import mark, marked, require_place, store
 from rosmop.check.conversion import convert, number
-from rosmop.check.places import Value
 from rosmop.check.scope import Scope
 from rosmop.form import nodes
 from rosmop.form.positions import Position
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
+from rosmop.types import value_types
 
 
 class Invocation:
@@ -37,24 +37,24 @@ class Invocation:
     def index(self, position: int, default: int | None = None) -> nodes.Expression:
         """An argument as an index."""
         if default is not None and position >= len(self.arguments):
-            return nodes.Literal(kinds.ULONG, default)
+            return nodes.Literal(value_types.ULONG, default)
         value = self.arguments[position]
-        if not kinds.is_number(value.type):
+        if not value_types.is_number(value.type):
             raise SpecificationError.at(value.position, f"`{self.name}` needs a number; this is {value.type}")
-        return number(value.form, kinds.ULONG)
+        return number(value.form, value_types.ULONG)
 
     def text(self, position: int) -> nodes.Expression:
         """An argument as a string; a character is one of length 1."""
         value = self.arguments[position]
-        if value.type == kinds.CHAR:
-            return nodes.Call(kinds.STRING, "t_byte", (value.form,))
-        return convert(self.scope, value, kinds.STRING)
+        if value.type == value_types.CHAR:
+            return nodes.Call(value_types.STRING, "t_byte", (value.form,))
+        return convert(self.scope, value, value_types.STRING)
 
-    def called(self, kind: kinds.Type, function: str, *arguments: nodes.Expression) -> nodes.Call:
+    def called(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> nodes.Call:
         """A function of the form, of the base and these arguments."""
         return nodes.Call(kind, function, (self.base.form, *arguments), self.site)
 
-    def value(self, kind: kinds.Type, function: str, *arguments: nodes.Expression) -> Value:
+    def value(self, kind: value_types.Type, function: str, *arguments: nodes.Expression) -> Value:
         """The result, by a function of the form."""
         return Value(self.called(kind, function, *arguments), self.position)
 
@@ -67,11 +67,11 @@ class Invocation:
     def changes_in_place(self, function: str, *arguments: nodes.Expression) -> Value:
         """The result of a function of the form that changes the vector itself."""
         require_place(self.base, f"`{self.name}`")
-        if isinstance(self.base.type, kinds.Vector) and self.base.type.length is not None:
+        if isinstance(self.base.type, value_types.Vector) and self.base.type.length is not None:
             raise SpecificationError.at(
                 self.position, f"`{self.name}`: an array of fixed length stays so long"
             )
-        change = marked(mark(self.scope, self.base), self.called(kinds.VOID, function, *arguments))
+        change = marked(mark(self.scope, self.base), self.called(value_types.VOID, function, *arguments))
         return Value(change, self.position)
 
 
@@ -82,10 +82,10 @@ Method = Callable[[Invocation], Value]
 def length(call: Invocation) -> Value:
     """`size()`, `length()`."""
     call.count(0)
-    return call.value(kinds.ULONG, "l_len")
+    return call.value(value_types.ULONG, "l_len")
 
 
 def empty(call: Invocation) -> Value:
     """`empty()`."""
     call.count(0)
-    return call.value(kinds.BOOL, "l_empty")
+    return call.value(value_types.BOOL, "l_empty")

@@ -9,21 +9,21 @@ from rosmop.form.nodes import Spot
 from rosmop.form.sites import Symbols
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
 from rosmop.types.messages import Messages, UnknownNameError
-from roswire.layout import ArrayPart, FixedPart, Layout, Leaf, Part, StringPart
+from rosmop.types.value_types import Type
+from roswire.message_layout import ArrayPart, FixedPart, Layout, Leaf, Part, StringPart
 
 _PARTS_OF_TIME = {"sec": 0, "nsec": 4}
 
 
 def type_of_path(messages: Messages, record: str, path: tuple[tree.PathStep, ...]) -> Type:
     """The type of the field at a path; refuses a path that does not fit, with the nearest that does."""
-    kind: Type = kinds.Record(record)
+    kind: Type = value_types.Record(record)
     for step in path:
         kind = _step(messages, kind, step)
         if step.index is not None:
-            if not isinstance(kind, kinds.Vector):
+            if not isinstance(kind, value_types.Vector):
                 raise SpecificationError.at(
                     step.position, f"`{step.name}` is {kind}, no array; leave out the index"
                 )
@@ -36,14 +36,14 @@ def type_of_path(messages: Messages, record: str, path: tuple[tree.PathStep, ...
 
 
 def _step(messages: Messages, kind: Type, step: tree.PathStep) -> Type:
-    if isinstance(kind, kinds.Record):
+    if isinstance(kind, value_types.Record):
         try:
             return messages.slot(kind.name, step.name).type
         except UnknownNameError as error:
             raise SpecificationError.at(step.position, str(error)) from None
-    if isinstance(kind, kinds.Time | kinds.Duration) and step.name in _PARTS_OF_TIME:
-        return kinds.UINT if isinstance(kind, kinds.Time) else kinds.INT
-    hint = "; write an index first: `[0]`" if isinstance(kind, kinds.Vector) else ""
+    if isinstance(kind, value_types.Time | value_types.Duration) and step.name in _PARTS_OF_TIME:
+        return value_types.UINT if isinstance(kind, value_types.Time) else value_types.INT
+    hint = "; write an index first: `[0]`" if isinstance(kind, value_types.Vector) else ""
     raise SpecificationError.at(step.position, f"{kind} has no field `{step.name}`{hint}")
 
 

@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Sequence
 
+from rosmop.check.assignables import Value, Variable
 from rosmop.check.conversion import condition, convert, number
 from rosmop.check.order import settled
-from rosmop.check.places import Value, Variable
 from rosmop.check.scope import Loop, Scope
 from rosmop.check.vector_members import element_value
 from rosmop.form import nodes
@@ -12,9 +12,9 @@ from rosmop.form.positions import Position
 from rosmop.runtime.numbers import wrap
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
 from rosmop.types.resolve import resolve
+from rosmop.types.value_types import Type
 
 Write = Callable[[Scope, tree.Statement], None]
 """Writes a statement; handed in, because statements contain loops and loops contain statements."""
@@ -82,9 +82,9 @@ def write_range_for(scope: Scope, node: tree.RangeFor, write: Write) -> None:
         first, values = settled(scope, values)
         for each in first:
             scope.evaluate(each)
-    if not isinstance(values.type, kinds.Vector | kinds.String):
+    if not isinstance(values.type, value_types.Vector | value_types.String):
         raise SpecificationError.at(values.position, f"{values.type} has no elements to go through")
-    element = values.type.element if isinstance(values.type, kinds.Vector) else kinds.CHAR
+    element = values.type.element if isinstance(values.type, value_types.Vector) else value_types.CHAR
     kind = element if node.type.name == ("auto",) else resolve(node.type, scope.messages)
     _enter(scope, node, Loop(None))
     item = scope.temporary() if by_value else None
@@ -107,8 +107,8 @@ def write_range_for(scope: Scope, node: tree.RangeFor, write: Write) -> None:
 def _by_value(scope: Scope, node: tree.RangeFor, element: Type, kind: Type, item: str) -> None:
     charge(scope, node)
     read: nodes.Expression = nodes.Read(element, item)
-    if element == kinds.CHAR:  # of a string; those of a vector are in their range
-        read = nodes.Convert(kinds.CHAR, nodes.Read(kinds.UINT8, item))
+    if element == value_types.CHAR:  # of a string; those of a vector are in their range
+        read = nodes.Convert(value_types.CHAR, nodes.Read(value_types.UINT8, item))
     value = Value(read, node.position, owned=node.type.reference)
     variable = scope.local(node.name, kind, node.position, constant=node.type.constant)
     scope.evaluate(nodes.Assign(kind, variable.code, convert(scope, value, kind)))
@@ -116,23 +116,25 @@ def _by_value(scope: Scope, node: tree.RangeFor, element: Type, kind: Type, item
 
 def _first_index(scope: Scope, node: tree.RangeFor, values: Value, kind: Type) -> str:
     """The name of an index that stands before the first element."""
-    if not isinstance(values.type, kinds.Vector) or values.place is None:
+    if not isinstance(values.type, value_types.Vector) or values.place is None:
         raise SpecificationError.at(
             node.values.position, "a reference goes through a vector variable; leave out the `&`"
         )
     if values.type.element != kind:
         raise SpecificationError.at(node.type.position, f"the elements are {values.type.element}, not {kind}")
     index = scope.temporary("i")
-    scope.evaluate(nodes.Assign(kinds.LONG, index, nodes.Literal(kinds.LONG, -1)))
+    scope.evaluate(nodes.Assign(value_types.LONG, index, nodes.Literal(value_types.LONG, -1)))
     return index
 
 
 def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type, index: str) -> None:
     charge(scope, node)
-    site, at = scope.lines.site, nodes.Read(kinds.LONG, index)
-    one = nodes.Literal(kinds.LONG, 1)
-    scope.evaluate(nodes.Assign(kinds.LONG, index, nodes.Arithmetic(kinds.LONG, "+", at, one, site)))
-    length = nodes.Call(kinds.LONG, "l_len", (values.form,))
+    site, at = scope.lines.site, nodes.Read(value_types.LONG, index)
+    one = nodes.Literal(value_types.LONG, 1)
+    scope.evaluate(
+        nodes.Assign(value_types.LONG, index, nodes.Arithmetic(value_types.LONG, "+", at, one, site))
+    )
+    length = nodes.Call(value_types.LONG, "l_len", (values.form,))
     scope.add(nodes.If(site, nodes.Compare(">=", at, length, site), (nodes.Break(site),), ()))
     alias = element_value(values, Value(at, node.position), node.position, site)
     scope.declare(Variable(node.name, kind, index, node.position, alias=alias))
@@ -141,14 +143,14 @@ def _by_reference(scope: Scope, node: tree.RangeFor, values: Value, kind: Type, 
 def write_switch(scope: Scope, node: tree.Switch, write: Write) -> None:
     """`switch`: the index of the first case, then every block from there on until a `break`."""
     value = scope.value_of(node.value)
-    kind = kinds.promoted(value.type)
-    if not isinstance(kind, kinds.Integer):
+    kind = value_types.promoted(value.type)
+    if not isinstance(kind, value_types.Integer):
         raise SpecificationError.at(value.position, f"`switch` needs an integer; this is {value.type}")
     start, flag = scope.temporary(), scope.temporary("k")
     table, default = _cases(scope, node, kind)
     site = scope.lines.site
-    nothing = nodes.Literal(kinds.BOOL, False)
-    scope.evaluate(nodes.Assign(kinds.BOOL, flag, nothing))
+    nothing = nodes.Literal(value_types.BOOL, False)
+    scope.evaluate(nodes.Assign(value_types.BOOL, flag, nothing))
     scope.add(nodes.Select(site, start, number(value.form, kind), table, default))
     _enter(scope, node, Loop(None, flag=flag))
     with scope.block() as names, scope.nested() as statements:
@@ -157,7 +159,7 @@ def write_switch(scope: Scope, node: tree.Switch, write: Write) -> None:
                 with scope.nested() as inner:
                     _statements(scope, case.statements, write)
                 reached = nodes.Compare(
-                    "<=", nodes.Read(kinds.INT, start), nodes.Literal(kinds.INT, index), site
+                    "<=", nodes.Read(value_types.INT, start), nodes.Literal(value_types.INT, index), site
                 )
                 scope.add(nodes.If(site, reached, tuple(inner), ()))
         scope.add(nodes.Break(site))
@@ -168,10 +170,12 @@ def write_switch(scope: Scope, node: tree.Switch, write: Write) -> None:
     if loop.continued:
         with scope.nested() as going_on:
             write_continue(scope, node.position)
-        scope.add(nodes.If(site, nodes.Read(kinds.BOOL, flag), tuple(going_on), ()))
+        scope.add(nodes.If(site, nodes.Read(value_types.BOOL, flag), tuple(going_on), ()))
 
 
-def _cases(scope: Scope, node: tree.Switch, kind: kinds.Integer) -> tuple[tuple[tuple[int, int], ...], int]:
+def _cases(
+    scope: Scope, node: tree.Switch, kind: value_types.Integer
+) -> tuple[tuple[tuple[int, int], ...], int]:
     table: dict[int, int] = {}
     default = len(node.cases)
     for index, case in enumerate(node.cases):
@@ -203,7 +207,7 @@ def write_continue(scope: Scope, position: Position) -> None:
     loop = scope.loops[-1]
     if loop.flag is not None:
         loop.continued = True
-        scope.evaluate(nodes.Assign(kinds.BOOL, loop.flag, nodes.Literal(kinds.BOOL, True)))
+        scope.evaluate(nodes.Assign(value_types.BOOL, loop.flag, nodes.Literal(value_types.BOOL, True)))
         scope.add(nodes.Break(scope.lines.site))
         return
     if loop.step is not None:

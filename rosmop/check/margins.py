@@ -9,19 +9,19 @@ from dataclasses import replace
 
 import msgspec
 
+from rosmop.check.assignables import Value
 from rosmop.check.conversion import number
-from rosmop.check.places import Value
 from rosmop.check.scope import Scope
 from rosmop.form import nodes
 from rosmop.form.compiled import Comparison
 from rosmop.text import tree
-from rosmop.types import kinds
+from rosmop.types import value_types
 
 MOST_NOTED = 32
 """Comparisons of a specification; those that are compiled after them are not noted."""
 
 _COMPARED = frozenset({"<", "<=", ">", ">="})
-_TRUE, _FALSE = (nodes.Literal(kinds.BOOL, truth) for truth in (True, False))
+_TRUE, _FALSE = (nodes.Literal(value_types.BOOL, truth) for truth in (True, False))
 
 
 def noted(scope: Scope, node: tree.Binary, left: Value, right: Value, value: Value) -> Value:
@@ -31,7 +31,7 @@ def noted(scope: Scope, node: tree.Binary, left: Value, right: Value, value: Val
         not scope.notes
         or node.operator not in _COMPARED
         or not isinstance(compare, nodes.Compare)
-        or not kinds.is_number(compare.left.type)
+        or not value_types.is_number(compare.left.type)
     ):
         return value
     known = scope.names.comparisons
@@ -49,23 +49,23 @@ def noted(scope: Scope, node: tree.Binary, left: Value, right: Value, value: Val
         nodes.Assign(kind, side.name, operand)
         for side, operand in zip(sides, (compare.left, compare.right), strict=True)
     )
-    now = [number(side, kinds.DOUBLE) for side in sides]
+    now = [number(side, value_types.DOUBLE) for side in sides]
     answer = nodes.Conditional(
-        kinds.BOOL,
+        value_types.BOOL,
         msgspec.structs.replace(compare, left=sides[0], right=sides[1]),
-        nodes.Sequence(kinds.BOOL, (_note(now, comparison.when_true), _TRUE), -1),
-        nodes.Sequence(kinds.BOOL, (_note(now, comparison.when_false), _FALSE), -1),
+        nodes.Sequence(value_types.BOOL, (_note(now, comparison.when_true), _TRUE), -1),
+        nodes.Sequence(value_types.BOOL, (_note(now, comparison.when_false), _FALSE), -1),
     )
-    return replace(value, form=nodes.Sequence(kinds.BOOL, (*kept, answer), -1))
+    return replace(value, form=nodes.Sequence(value_types.BOOL, (*kept, answer), -1))
 
 
 def _note(now: list[nodes.Expression], variables: tuple[str, str]) -> nodes.Expression:
     """Keep the sides if they are nearer to each other than those that are kept."""
-    before = [nodes.Read(kinds.DOUBLE, name) for name in variables]
+    before = [nodes.Read(value_types.DOUBLE, name) for name in variables]
     nearer = nodes.Compare("<", _distance(*now), _distance(*before), -1)
-    kept = (nodes.Assign(kinds.DOUBLE, name, side) for name, side in zip(variables, now, strict=True))
-    return nodes.Logical("and", nearer, nodes.Sequence(kinds.BOOL, (*kept, _TRUE), -1))
+    kept = (nodes.Assign(value_types.DOUBLE, name, side) for name, side in zip(variables, now, strict=True))
+    return nodes.Logical("and", nearer, nodes.Sequence(value_types.BOOL, (*kept, _TRUE), -1))
 
 
 def _distance(left: nodes.Expression, right: nodes.Expression) -> nodes.Expression:
-    return nodes.Unary(kinds.DOUBLE, "abs", nodes.Arithmetic(kinds.DOUBLE, "-", left, right, -1))
+    return nodes.Unary(value_types.DOUBLE, "abs", nodes.Arithmetic(value_types.DOUBLE, "-", left, right, -1))

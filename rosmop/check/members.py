@@ -3,22 +3,22 @@
 from collections.abc import Mapping
 
 from rosmop.check import string_members, time_members, vector_members
+from rosmop.check.assignables import PartPlace, SlotPlace, Value
 from rosmop.check.conversion import constant_value
 from rosmop.check.invocation import Invocation, Method
-from rosmop.check.places import PartPlace, SlotPlace, Value
 from rosmop.check.scope import Scope
 from rosmop.form import nodes
 from rosmop.form.positions import Position
 from rosmop.runtime.numbers import f32
 from rosmop.text.errors import SpecificationError
 from rosmop.text.foreign import instead
-from rosmop.types import kinds
+from rosmop.types import value_types
 from rosmop.types.messages import PRIMITIVES, UnknownNameError, nearest, shown
 
 
 def field(scope: Scope, base: Value, name: str, position: Position, site: int) -> Value:
     """`base.name`."""
-    if isinstance(base.type, kinds.Record):
+    if isinstance(base.type, value_types.Record):
         try:
             slot = scope.messages.slot(base.type.name, name)
         except UnknownNameError as error:
@@ -28,8 +28,8 @@ def field(scope: Scope, base: Value, name: str, position: Position, site: int) -
         place = SlotPlace(base, slot.index) if base.place is not None else None
         item = nodes.Item(slot.type, base.form, slot.index)
         return Value(item, position, place, owned=base.owned)
-    if isinstance(base.type, kinds.Time | kinds.Duration) and name in ("sec", "nsec"):
-        kind = kinds.UINT if isinstance(base.type, kinds.Time) else kinds.INT
+    if isinstance(base.type, value_types.Time | value_types.Duration) and name in ("sec", "nsec"):
+        kind = value_types.UINT if isinstance(base.type, value_types.Time) else value_types.INT
         part = PartPlace(base, name, site) if base.place is not None else None
         return Value(nodes.Call(kind, f"m_{name}", (base.form,)), position, part)
     members = methods_of(base.type)
@@ -46,7 +46,7 @@ def constant(scope: Scope, message_type: str, name: str, position: Position) -> 
         raise SpecificationError.at(position, str(error)) from None
     kind = PRIMITIVES[found.type]
     value = found.value.encode("utf-8", "surrogateescape") if isinstance(found.value, str) else found.value
-    if kind == kinds.FLOAT and not isinstance(value, bytes):
+    if kind == value_types.FLOAT and not isinstance(value, bytes):
         value = f32(value)
     return constant_value(position, kind, value)
 
@@ -65,12 +65,12 @@ def call(invocation: Invocation) -> Value:
     return method(invocation)
 
 
-def methods_of(kind: kinds.Type) -> Mapping[str, Method]:
+def methods_of(kind: value_types.Type) -> Mapping[str, Method]:
     """The member functions of a type."""
-    if isinstance(kind, kinds.String):
+    if isinstance(kind, value_types.String):
         return string_members.TEXT_METHODS
-    if isinstance(kind, kinds.Vector):
+    if isinstance(kind, value_types.Vector):
         return vector_members.VECTOR_METHODS
-    if isinstance(kind, kinds.Time | kinds.Duration):
+    if isinstance(kind, value_types.Time | value_types.Duration):
         return time_members.MOMENT_METHODS
     return {}

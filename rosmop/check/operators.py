@@ -1,23 +1,23 @@
 """Operators, with the types C++ gives their results."""
 
 from rosmop.check import cursors, order
+from rosmop.check.assignables import Value
 from rosmop.check.conversion import (
     condition,
     convert,
     number,
 )
-from rosmop.check.places import Value
 from rosmop.check.scope import Scope
 from rosmop.form import nodes
 from rosmop.form.positions import Position
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 COMPARISONS = frozenset({"==", "!=", "<", ">", "<=", ">="})
 _BITS = frozenset({"&", "|", "^"})
-_TEXTS = (kinds.String, kinds.Characters)
-_MOMENTS = (kinds.Time, kinds.Duration)
+_TEXTS = (value_types.String, value_types.Characters)
+_MOMENTS = (value_types.Time, value_types.Duration)
 
 
 class Operands:
@@ -48,7 +48,7 @@ def binary(operator: str, operands: Operands) -> Value:
     if operator in ("&&", "||"):
         word = "and" if operator == "&&" else "or"
         return operands.value(nodes.Logical(word, condition(operands.left), condition(operands.right)))
-    if kinds.is_number(left) and kinds.is_number(right):
+    if value_types.is_number(left) and value_types.is_number(right):
         return _comparison(operator, operands) if operator in COMPARISONS else _arithmetic(operator, operands)
     if isinstance(left, _TEXTS) or isinstance(right, _TEXTS):
         return _texts(operator, operands)
@@ -57,7 +57,11 @@ def binary(operator: str, operands: Operands) -> Value:
     cursor = cursors.moved(operator, operands.left, operands.right, operands.position)
     if cursor is not None:
         return cursor
-    if operator in ("==", "!=") and left == right and not isinstance(left, kinds.Void | kinds.Index):
+    if (
+        operator in ("==", "!=")
+        and left == right
+        and not isinstance(left, value_types.Void | value_types.Index)
+    ):
         first, (one, other) = order.arguments(operands.scope, (operands.left, operands.right))
         return order.after(
             first, operands.value(nodes.Compare(operator, one.form, other.form, operands.site))
@@ -66,15 +70,15 @@ def binary(operator: str, operands: Operands) -> Value:
 
 
 def _hint(left: Type, right: Type) -> str:
-    if isinstance(left, kinds.Vector) != isinstance(right, kinds.Vector):
+    if isinstance(left, value_types.Vector) != isinstance(right, value_types.Vector):
         return "; write an index, `[0]`"
-    if isinstance(left, kinds.Record) or isinstance(right, kinds.Record):
+    if isinstance(left, value_types.Record) or isinstance(right, value_types.Record):
         return "; write a field, `.data`"
     return ""
 
 
 def _comparison(operator: str, operands: Operands) -> Value:
-    kind = kinds.common(operands.left.type, operands.right.type)
+    kind = value_types.common(operands.left.type, operands.right.type)
     left, right = (number(value.form, kind) for value in (operands.left, operands.right))
     return operands.value(nodes.Compare(operator, left, right, operands.site))
 
@@ -82,16 +86,16 @@ def _comparison(operator: str, operands: Operands) -> Value:
 def _arithmetic(operator: str, operands: Operands) -> Value:
     if operator in ("<<", ">>"):
         return _shift(operator, operands)
-    kind = kinds.common(operands.left.type, operands.right.type)
-    if isinstance(kind, kinds.Floating) and (operator == "%" or operator in _BITS):
+    kind = value_types.common(operands.left.type, operands.right.type)
+    if isinstance(kind, value_types.Floating) and (operator == "%" or operator in _BITS):
         raise operands.refused(operator, "; write `fmod(…)`" if operator == "%" else "")
     left, right = (number(value.form, kind) for value in (operands.left, operands.right))
     return operands.value(nodes.Arithmetic(kind, operator, left, right, operands.site))
 
 
 def _shift(operator: str, operands: Operands) -> Value:
-    kind, amount = kinds.promoted(operands.left.type), kinds.promoted(operands.right.type)
-    if not isinstance(kind, kinds.Integer) or not isinstance(amount, kinds.Integer):
+    kind, amount = value_types.promoted(operands.left.type), value_types.promoted(operands.right.type)
+    if not isinstance(kind, value_types.Integer) or not isinstance(amount, value_types.Integer):
         raise operands.refused(operator)
     left = number(operands.left.form, kind)
     return operands.value(nodes.Arithmetic(kind, operator, left, operands.right.form, operands.site))
@@ -107,7 +111,7 @@ def _texts(operator: str, operands: Operands) -> Value:
         raise operands.refused(operator)
     if not (isinstance(left.type, _TEXTS) and isinstance(right.type, _TEXTS)):
         raise operands.refused(operator, _text_hint(left, right))
-    one, other = (convert(operands.scope, value, kinds.STRING) for value in (left, right))
+    one, other = (convert(operands.scope, value, value_types.STRING) for value in (left, right))
     short = any(
         isinstance(value.constant, bytes) and len(value.constant) <= nodes.SHORT for value in (left, right)
     )
@@ -121,28 +125,28 @@ def extended(operands: Operands) -> Value:
 
 def _put_together(function: str, operands: Operands) -> Value:
     for value, other in ((operands.left, operands.right), (operands.right, operands.left)):
-        if isinstance(value.type, kinds.Characters) and isinstance(
-            other.type, kinds.Integer | kinds.Floating
+        if isinstance(value.type, value_types.Characters) and isinstance(
+            other.type, value_types.Integer | value_types.Floating
         ):
             hint = "; there is no arithmetic of pointers: write `std::string(…).substr(1)`"
             raise operands.refused("+", hint)
     texts = (_joined(operands, operands.left), _joined(operands, operands.right))
-    return operands.value(nodes.Call(kinds.STRING, function, texts, operands.site))
+    return operands.value(nodes.Call(value_types.STRING, function, texts, operands.site))
 
 
 def _text_hint(left: Value, right: Value) -> str:
     other = left if isinstance(right.type, _TEXTS) else right
-    if other.type == kinds.CHAR:
+    if other.type == value_types.CHAR:
         return "; a character is written 'a', a string \"a\""
-    return "; write an index, `[0]`" if isinstance(other.type, kinds.Vector) else ""
+    return "; write an index, `[0]`" if isinstance(other.type, value_types.Vector) else ""
 
 
 def _joined(operands: Operands, value: Value) -> nodes.Expression:
-    if isinstance(value.type, kinds.Integer) and value.type == kinds.CHAR:
-        return nodes.Call(kinds.STRING, "t_byte", (value.form,))
-    if kinds.is_number(value.type):
+    if isinstance(value.type, value_types.Integer) and value.type == value_types.CHAR:
+        return nodes.Call(value_types.STRING, "t_byte", (value.form,))
+    if value_types.is_number(value.type):
         raise SpecificationError.at(value.position, f"{value.type} is no string; write `std::to_string(…)`")
-    return convert(operands.scope, value, kinds.STRING)
+    return convert(operands.scope, value, value_types.STRING)
 
 
 def _moments(operator: str, operands: Operands) -> Value:
@@ -153,28 +157,28 @@ def _moments(operator: str, operands: Operands) -> Value:
         kind = _sum(operator, left.type, right.type)
         if kind is not None:
             return operands.value(nodes.Moment(kind, operator, left.form, right.form, site))
-    if operator == "*" and left.type == kinds.DURATION and kinds.is_number(right.type):
-        return operands.value(nodes.Call(kinds.DURATION, "o_scaled", (left.form, right.form), site))
+    if operator == "*" and left.type == value_types.DURATION and value_types.is_number(right.type):
+        return operands.value(nodes.Call(value_types.DURATION, "o_scaled", (left.form, right.form), site))
     raise operands.refused(operator, "; write `.toSec()` to calculate in seconds")
 
 
 def _sum(operator: str, left: Type, right: Type) -> Type | None:
-    if left == kinds.TIME and right == kinds.TIME and operator == "-":
-        return kinds.DURATION
-    if left == kinds.TIME and right == kinds.DURATION:
-        return kinds.TIME
-    return kinds.DURATION if left == right == kinds.DURATION else None
+    if left == value_types.TIME and right == value_types.TIME and operator == "-":
+        return value_types.DURATION
+    if left == value_types.TIME and right == value_types.DURATION:
+        return value_types.TIME
+    return value_types.DURATION if left == right == value_types.DURATION else None
 
 
 def unary(operator: str, operand: Value, position: Position, site: int) -> Value:
     """`!x`, `-x`, `+x`, `~x`."""
     if operator == "!":
         return Value(nodes.Not(condition(operand)), position)
-    if operator == "-" and operand.type == kinds.DURATION:
-        nothing = nodes.Literal(kinds.DURATION, 0)
-        return Value(nodes.Moment(kinds.DURATION, "-", nothing, operand.form, site), position)
-    kind = kinds.promoted(operand.type)
-    if not kinds.is_number(kind) or (operator == "~" and not isinstance(kind, kinds.Integer)):
+    if operator == "-" and operand.type == value_types.DURATION:
+        nothing = nodes.Literal(value_types.DURATION, 0)
+        return Value(nodes.Moment(value_types.DURATION, "-", nothing, operand.form, site), position)
+    kind = value_types.promoted(operand.type)
+    if not value_types.is_number(kind) or (operator == "~" and not isinstance(kind, value_types.Integer)):
         raise SpecificationError.at(position, f"`{operator}` has no meaning for {operand.type}")
     value = number(operand.form, kind)
     changed = value if operator == "+" else nodes.Unary(kind, operator, value)

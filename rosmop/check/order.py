@@ -8,7 +8,7 @@ looked at when all arguments are there. Where C++ leaves the order open, any wil
 from collections.abc import Sequence
 from dataclasses import replace
 
-from rosmop.check.places import (
+from rosmop.check.assignables import (
     CharacterPlace,
     ElementPlace,
     PartPlace,
@@ -19,8 +19,8 @@ from rosmop.check.places import (
 )
 from rosmop.check.scope import Scope
 from rosmop.form import nodes
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 First = list[nodes.Expression]
 """What is evaluated before, in order."""
@@ -101,7 +101,7 @@ def of_change(scope: Scope, target: Value, value: Value) -> tuple[First, Value, 
     """What `+=` and its like change, and by what: both are looked at when all places are known."""
     if target.pure and value.pure:
         return [], target, value
-    if kinds.is_number(value.type):  # of a class only the place is found first
+    if value_types.is_number(value.type):  # of a class only the place is found first
         value = replace(value, place=None)
     first, value = settled(scope, value)
     before, target = ([], target) if target.pure else settled(scope, target)

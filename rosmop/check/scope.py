@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
 
-from rosmop.check.places import Value, Variable
+from rosmop.check.assignables import Value, Variable
 from rosmop.form import nodes
 from rosmop.form.compiled import Comparison, Publication
 from rosmop.form.positions import Finding, Position
@@ -15,9 +15,9 @@ from rosmop.runtime.values import Values
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
 from rosmop.text.foreign import instead
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
 from rosmop.types.messages import Messages, nearest, shown
+from rosmop.types.value_types import Type
 
 Role = Literal["action", "timer", "handler", "init", "function"]
 ValueOf = Callable[["Scope", tree.Expression], Value]
@@ -171,7 +171,7 @@ class Scope:
         """Computes an expression."""
         self.context = names.context
         self.lines = Statements()
-        self.result: Type = kinds.VOID
+        self.result: Type = value_types.VOID
         self.references: tuple[Variable, ...] = ()
         self.message_type: str | None = None  # of the message that `MESSAGE` is
         self.pending: str | None = None  # `MESSAGE` was read: the code's name for what this action assigns
@@ -329,7 +329,7 @@ class Scope:
             except SpecificationError:
                 continue
             if variable is not None and variable.alias is None:
-                steady = kinds.is_scalar(variable.type) or isinstance(variable.type, kinds.String)
+                steady = value_types.is_scalar(variable.type) or isinstance(variable.type, value_types.String)
                 yield SiteVariable(name, variable.code, variable.type, steady)
 
 

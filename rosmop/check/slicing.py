@@ -6,17 +6,17 @@ one that gives the values that it binds, for which nothing else of the message i
 
 from collections.abc import Iterable, Sequence
 
-from rosmop.check.places import Variable
+from rosmop.check.assignables import Variable
 from rosmop.check.scope import Shared, SpecificationNames
 from rosmop.form import nodes
 from rosmop.form.compiled import EventCode, PropertyCode, Slicing
 from rosmop.form.positions import Finding
 from rosmop.logics.bounded import BoundedProperty
 from rosmop.logics.interface import CompiledProperty
-from rosmop.logics.past import PastProperty
+from rosmop.logics.past_monitors import PastProperty
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
+from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.resolve import resolve
 
@@ -30,7 +30,10 @@ def declare_parameters(shared: Shared, names: SpecificationNames, specification:
     for parameter in specification.parameters:
         try:
             kind = resolve(parameter.type, shared.messages)
-            if not (kinds.is_number(kind) or isinstance(kind, kinds.String | kinds.Time | kinds.Duration)):
+            if not (
+                value_types.is_number(kind)
+                or isinstance(kind, value_types.String | value_types.Time | value_types.Duration)
+            ):
                 text = f"a parameter of a specification is a string, a number or a time, and {kind} is none"
                 raise SpecificationError.at(parameter.position, text)
             if parameter.name in names.variables:
@@ -55,7 +58,8 @@ def declare_parameters(shared: Shared, names: SpecificationNames, specification:
 def check_own(names: SpecificationNames, variable: Variable) -> None:
     """Refuse a variable of which not each slice can have its own: what slices hold is bounded by their number."""
     if variable.sliced and not (
-        kinds.is_number(variable.type) or isinstance(variable.type, kinds.Time | kinds.Duration)
+        value_types.is_number(variable.type)
+        or isinstance(variable.type, value_types.Time | value_types.Duration)
     ):
         text = (
             f"each slice of {names.name} has its own {shown(variable.name)}, so it is a number or a time; "

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 
-from rosmop.check.calls import stream_of
+from rosmop.check.call_expressions import stream_of
 from rosmop.form.positions import Finding
 from rosmop.text import tree
 

@@ -13,26 +13,26 @@ from rosmop.check.enforcement import (
     topics_of_remedy,
     with_remedy,
 )
-from rosmop.check.events import compile_event
+from rosmop.check.event_functions import compile_event
 from rosmop.check.expressions import value_of
-from rosmop.check.functions import (
+from rosmop.check.function_bodies import (
     compile_function,
     compile_handler,
     compile_start,
     declare_functions,
     declare_variables,
 )
-from rosmop.check.lint import kept_slices, lint_property, unused_events
-from rosmop.check.reach import identity, reached
+from rosmop.check.reachable_types import identity, reached
 from rosmop.check.scope import Shared, SpecificationNames
 from rosmop.check.slicing import check_parameters, declare_parameters, slicing_of, unsliceable
 from rosmop.check.slips import slips
+from rosmop.check.specification_lint import kept_slices, lint_property, unused_events
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled, PropertyCode, SpecificationCode
 from rosmop.form.positions import Finding
 from rosmop.logics.catalogue import compile_property
 from rosmop.logics.interface import CompiledProperty, FormulaError
-from rosmop.runtime.context import MAX_BYTES
+from rosmop.runtime.action_context import MAX_BYTES
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
 from rosmop.types.messages import Messages, nearest, shown

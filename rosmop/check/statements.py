@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from rosmop.check import calls, loops
+from rosmop.check import call_expressions, loops
 from rosmop.check.assignments import write_store
 from rosmop.check.conversion import condition, convert
 from rosmop.check.expressions import assignment
@@ -18,7 +18,7 @@ from rosmop.form.positions import Position
 from rosmop.runtime import numbers
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
+from rosmop.types import value_types
 from rosmop.types.messages import shown
 from rosmop.types.resolve import record, resolve
 from roswire import names
@@ -65,18 +65,18 @@ def _declare(scope: Scope, node: tree.Declaration) -> None:
         scope.evaluate(nodes.Assign(kind, variable.code, value))
 
 
-def _is_copy(scope: Scope, declarator: tree.Declarator, kind: kinds.Type) -> bool:
+def _is_copy(scope: Scope, declarator: tree.Declarator, kind: value_types.Type) -> bool:
     """Whether a `char *` begins with the characters of another one."""
-    if kind != kinds.CHARACTERS or declarator.is_array or not isinstance(declarator.value, tree.Name):
+    if kind != value_types.CHARACTERS or declarator.is_array or not isinstance(declarator.value, tree.Name):
         return False
-    return isinstance(scope.value_of(declarator.value).type, kinds.Characters)
+    return isinstance(scope.value_of(declarator.value).type, value_types.Characters)
 
 
 def known(
-    scope: Scope, name: tree.TypeName, declarator: tree.Declarator, kind: kinds.Type
+    scope: Scope, name: tree.TypeName, declarator: tree.Declarator, kind: value_types.Type
 ) -> bool | int | float | None:
     """The value of a `const` number whose value is written down, for sizes of arrays and cases; None for others."""
-    if not name.constant or not kinds.is_number(kind) or declarator.is_array:
+    if not name.constant or not value_types.is_number(kind) or declarator.is_array:
         return None
     node = declarator.value
     if node is None and declarator.arguments is not None and len(declarator.arguments) == 1:
@@ -84,71 +84,75 @@ def known(
     if node is None or isinstance(node, tree.Elements):
         return None
     value = scope.value_of(node).constant
-    if isinstance(kind, kinds.Floating):
+    if isinstance(kind, value_types.Floating):
         return None if value is None or isinstance(value, bytes) else _rounded(float(value), kind)
     if not isinstance(value, int):
         return None
-    return numbers.wrap(value, kind.bits, kind.signed) if isinstance(kind, kinds.Integer) else bool(value)
+    return (
+        numbers.wrap(value, kind.bits, kind.signed) if isinstance(kind, value_types.Integer) else bool(value)
+    )
 
 
-def _rounded(value: float, kind: kinds.Floating) -> float:
+def _rounded(value: float, kind: value_types.Floating) -> float:
     return value if kind.bits == 64 else numbers.f32(value)
 
 
 def initial(
     scope: Scope, name: tree.TypeName, declarator: tree.Declarator
-) -> tuple[kinds.Type, nodes.Expression]:
+) -> tuple[value_types.Type, nodes.Expression]:
     """The type of a declared variable, and its first value."""
     if name.name == ("auto",):
         return _deduced(scope, declarator)
     kind = resolve(name, scope.messages)
-    if kind == kinds.VOID:
+    if kind == value_types.VOID:
         raise SpecificationError.at(name.position, "a variable cannot be void")
     if declarator.is_array:
         return _array(scope, kind, declarator)
     if declarator.arguments is not None:
-        value = calls.construct(scope, declarator.position, kind, declarator.arguments)
+        value = call_expressions.construct(scope, declarator.position, kind, declarator.arguments)
         return kind, convert(scope, value, kind)
     if declarator.value is None:
         return kind, nodes.Zero(kind)
     return kind, converted(scope, declarator.value, kind)
 
 
-def _deduced(scope: Scope, declarator: tree.Declarator) -> tuple[kinds.Type, nodes.Expression]:
+def _deduced(scope: Scope, declarator: tree.Declarator) -> tuple[value_types.Type, nodes.Expression]:
     if declarator.value is None or isinstance(declarator.value, tree.Elements) or declarator.is_array:
         raise SpecificationError.at(declarator.position, "`auto` needs a value: `auto x = …;`")
     value = scope.value_of(declarator.value)
-    if isinstance(value.type, kinds.Void | kinds.Index):
+    if isinstance(value.type, value_types.Void | value_types.Index):
         raise SpecificationError.at(
             declarator.position, f"a variable cannot hold {value.type}; use the expression itself"
         )
-    kind = kinds.STRING if isinstance(value.type, kinds.Characters) else value.type
+    kind = value_types.STRING if isinstance(value.type, value_types.Characters) else value.type
     return kind, convert(scope, value, kind)
 
 
 def _array(
-    scope: Scope, kind: kinds.Type, declarator: tree.Declarator
-) -> tuple[kinds.Type, nodes.Expression]:
+    scope: Scope, kind: value_types.Type, declarator: tree.Declarator
+) -> tuple[value_types.Type, nodes.Expression]:
     size = _array_size(scope, declarator)
-    if kind == kinds.CHAR and not isinstance(declarator.value, tree.Elements):
-        site, nothing = scope.lines.site, nodes.Literal(kinds.CHAR, 0)
-        zeros = nodes.Call(kinds.CHARACTERS, "e_repeat", (nodes.Literal(kinds.ULONG, size), nothing), site)
+    if kind == value_types.CHAR and not isinstance(declarator.value, tree.Elements):
+        site, nothing = scope.lines.site, nodes.Literal(value_types.CHAR, 0)
+        zeros = nodes.Call(
+            value_types.CHARACTERS, "e_repeat", (nodes.Literal(value_types.ULONG, size), nothing), site
+        )
         if declarator.value is None:
-            return kinds.CHARACTERS, zeros
-        text = converted(scope, declarator.value, kinds.STRING)
+            return value_types.CHARACTERS, zeros
+        text = converted(scope, declarator.value, value_types.STRING)
         if size is None:
-            return kinds.CHARACTERS, nodes.Call(kinds.CHARACTERS, "t_zeroed", (text,))
+            return value_types.CHARACTERS, nodes.Call(value_types.CHARACTERS, "t_zeroed", (text,))
         if isinstance(declarator.value, tree.Text) and len(declarator.value.value) >= size:
             length = len(declarator.value.value)
             raise SpecificationError.at(
                 declarator.value.position,
                 f"a text of {length} characters and its zero need `{declarator.name}[{length + 1}]`",
             )
-        return kinds.CHARACTERS, nodes.Call(kinds.CHARACTERS, "e_filled", (zeros, text), site)
+        return value_types.CHARACTERS, nodes.Call(value_types.CHARACTERS, "e_filled", (zeros, text), site)
     if size is None:
         assert isinstance(declarator.value, tree.Elements)  # _array_size has looked
         size = len(declarator.value.items)
-    array = kinds.Vector(kind, size)
+    array = value_types.Vector(kind, size)
     if declarator.value is None:
         return array, nodes.Zero(array)
     if not isinstance(declarator.value, tree.Elements):
@@ -176,9 +180,9 @@ def _array_size(scope: Scope, declarator: tree.Declarator) -> int | None:
 
 def _evaluate(scope: Scope, node: tree.Evaluate) -> None:
     expression = node.expression
-    level = calls.stream_of(expression)
+    level = call_expressions.stream_of(expression)
     if level is not None:
-        scope.evaluate(calls.streamed(scope, node, level, expression, headed=True).form)
+        scope.evaluate(call_expressions.streamed(scope, node, level, expression, headed=True).form)
     elif isinstance(expression, tree.Assign):
         first, target, assigned = assignment(scope, expression)
         for each in first:
@@ -228,13 +232,13 @@ def _return(scope: Scope, node: tree.Return) -> None:
 
 
 def _return_value(scope: Scope, node: tree.Return) -> None:
-    void = isinstance(scope.result, kinds.Void)
+    void = isinstance(scope.result, value_types.Void)
     if void != (node.value is None):
         hint = (
             "this function has no value; write `return;`" if void else f"this function returns {scope.result}"
         )
         raise SpecificationError.at(node.position, hint)
-    nothing = nodes.Literal(kinds.VOID, None)
+    nothing = nodes.Literal(value_types.VOID, None)
     value = nothing if node.value is None else converted(scope, node.value, scope.result)
     scope.add(nodes.Return(scope.lines.site, value, tuple(variable.code for variable in scope.references)))
 
@@ -256,7 +260,7 @@ def _reset(scope: Scope, node: tree.Statement) -> None:
 
 def _delete(scope: Scope, node: tree.Delete) -> None:
     value = scope.value_of(node.target)
-    if not isinstance(value.type, kinds.Characters):
+    if not isinstance(value.type, value_types.Characters):
         raise SpecificationError.at(node.position, f"`delete` is for `char` buffers; {value.type} needs none")
 
 

@@ -3,14 +3,14 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from rosmop.check.assignables import Value
 from rosmop.check.conversion import convert
 from rosmop.check.invocation import Invocation, Method, empty, length
-from rosmop.check.places import Value
 from rosmop.form import nodes
 from rosmop.runtime import strings
-from rosmop.types import kinds
+from rosmop.types import value_types
 
-_BEGIN = nodes.Literal(kinds.ULONG, 0)
+_BEGIN = nodes.Literal(value_types.ULONG, 0)
 
 
 def _same(call: Invocation) -> Value:
@@ -20,80 +20,86 @@ def _same(call: Invocation) -> Value:
 
 def _text_at(call: Invocation) -> Value:
     call.count(1)
-    return call.value(kinds.CHAR, "t_member", call.index(0))
+    return call.value(value_types.CHAR, "t_member", call.index(0))
 
 
 def _text_front(call: Invocation) -> Value:
     call.count(0)
-    return call.value(kinds.CHAR, "t_member", _BEGIN)
+    return call.value(value_types.CHAR, "t_member", _BEGIN)
 
 
 def _text_back(call: Invocation) -> Value:
     call.count(0)
-    last = call.called(kinds.STRING, "t_last")
-    return Value(nodes.Call(kinds.CHAR, "t_member", (last, _BEGIN), call.site), call.position)
+    last = call.called(value_types.STRING, "t_last")
+    return Value(nodes.Call(value_types.CHAR, "t_member", (last, _BEGIN), call.site), call.position)
 
 
 def _substring(call: Invocation) -> Value:
     call.count(0, 2)
-    return call.value(kinds.STRING, "t_substring", call.index(0, 0), call.index(1, strings.NOT_FOUND))
+    return call.value(value_types.STRING, "t_substring", call.index(0, 0), call.index(1, strings.NOT_FOUND))
 
 
 def _finder(function: str, start: int) -> Method:
     def method(call: Invocation) -> Value:
         call.count(1, 2)
-        return call.value(kinds.ULONG, function, call.text(0), call.index(1, start))
+        return call.value(value_types.ULONG, function, call.text(0), call.index(1, start))
 
     return method
 
 
 def _compare(call: Invocation) -> Value:
     call.count(1)
-    compared = nodes.Call(kinds.INT, "t_compare", (call.called(kinds.STRING, "o_charged"), call.text(0)))
+    compared = nodes.Call(
+        value_types.INT, "t_compare", (call.called(value_types.STRING, "o_charged"), call.text(0))
+    )
     return Value(compared, call.position)
 
 
 def _text_append(call: Invocation) -> Value:
     call.count(1)
-    return call.changes(call.called(kinds.STRING, "t_extend", call.text(0)))
+    return call.changes(call.called(value_types.STRING, "t_extend", call.text(0)))
 
 
 def _text_push(call: Invocation) -> Value:
     call.count(1)
-    added = nodes.Call(kinds.STRING, "t_byte", (convert(call.scope, call.arguments[0], kinds.CHAR),))
-    return call.changes(call.called(kinds.STRING, "t_extend", added))
+    added = nodes.Call(
+        value_types.STRING, "t_byte", (convert(call.scope, call.arguments[0], value_types.CHAR),)
+    )
+    return call.changes(call.called(value_types.STRING, "t_extend", added))
 
 
 def _text_clear(call: Invocation) -> Value:
     call.count(0)
-    return call.changes(nodes.Zero(kinds.STRING))
+    return call.changes(nodes.Zero(value_types.STRING))
 
 
 def _text_pop(call: Invocation) -> Value:
     call.count(0)
-    return call.changes(call.called(kinds.STRING, "t_shorten"))
+    return call.changes(call.called(value_types.STRING, "t_shorten"))
 
 
 def _text_resize(call: Invocation) -> Value:
     call.count(1, 2)
-    return call.changes(call.called(kinds.STRING, "t_resize", call.index(0), call.index(1, 0)))
+    return call.changes(call.called(value_types.STRING, "t_resize", call.index(0), call.index(1, 0)))
 
 
 def _text_erase(call: Invocation) -> Value:
     call.count(0, 2)
     return call.changes(
-        call.called(kinds.STRING, "t_erase", call.index(0, 0), call.index(1, strings.NOT_FOUND))
+        call.called(value_types.STRING, "t_erase", call.index(0, 0), call.index(1, strings.NOT_FOUND))
     )
 
 
 def _text_insert(call: Invocation) -> Value:
     call.count(2)
-    return call.changes(call.called(kinds.STRING, "t_insert", call.index(0), call.text(1)))
+    return call.changes(call.called(value_types.STRING, "t_insert", call.index(0), call.text(1)))
 
 
 def _text_replace(call: Invocation) -> Value:
     call.count(3)
-    return call.changes(call.called(kinds.STRING, "t_replace", call.index(0), call.index(1), call.text(2)))
+    return call.changes(
+        call.called(value_types.STRING, "t_replace", call.index(0), call.index(1), call.text(2))
+    )
 
 
 TEXT_METHODS: Mapping[str, Method] = MappingProxyType(

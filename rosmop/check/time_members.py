@@ -3,42 +3,44 @@
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from rosmop.check.assignables import Value
 from rosmop.check.conversion import check_convertible, convert
 from rosmop.check.invocation import Invocation, Method
-from rosmop.check.places import Value
 from rosmop.form import nodes
-from rosmop.types import kinds
+from rosmop.types import value_types
 
 
 def _seconds(call: Invocation) -> Value:
     call.count(0)
-    return call.value(kinds.DOUBLE, "m_seconds")
+    return call.value(value_types.DOUBLE, "m_seconds")
 
 
 def _nanoseconds(call: Invocation) -> Value:
     call.count(0)
-    return call.value(kinds.ULONG if call.base.type == kinds.TIME else kinds.LONG, "m_whole")
+    return call.value(
+        value_types.ULONG if call.base.type == value_types.TIME else value_types.LONG, "m_whole"
+    )
 
 
 def _is_zero(call: Invocation) -> Value:
     call.count(0)
-    return call.value(kinds.BOOL, "m_is_zero")
+    return call.value(value_types.BOOL, "m_is_zero")
 
 
 def _set_seconds(call: Invocation) -> Value:
     call.count(1)
-    check_convertible(call.arguments[0], kinds.DOUBLE)
-    seconds = nodes.Call(kinds.LONG, "m_nanoseconds", (call.arguments[0].form,), call.site)
+    check_convertible(call.arguments[0], value_types.DOUBLE)
+    seconds = nodes.Call(value_types.LONG, "m_nanoseconds", (call.arguments[0].form,), call.site)
     return _set(call, seconds)
 
 
 def _set_nanoseconds(call: Invocation) -> Value:
     call.count(1)
-    return _set(call, convert(call.scope, call.arguments[0], kinds.LONG))
+    return _set(call, convert(call.scope, call.arguments[0], value_types.LONG))
 
 
 def _set(call: Invocation, nanoseconds: nodes.Expression) -> Value:
-    limit = "m_time" if isinstance(call.base.type, kinds.Time) else "m_duration"
+    limit = "m_time" if isinstance(call.base.type, value_types.Time) else "m_duration"
     return call.changes(nodes.Call(call.base.type, limit, (nanoseconds,), call.site))
 
 

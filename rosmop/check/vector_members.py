@@ -4,22 +4,22 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from rosmop.check import cursors
+from rosmop.check.assignables import ElementPlace, Value
 from rosmop.check.conversion import constant_value, convert, number
 from rosmop.check.invocation import Invocation, Method, empty, length
-from rosmop.check.places import ElementPlace, Value
 from rosmop.form import nodes
 from rosmop.form.positions import Position
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
+from rosmop.types import value_types
 
 
 def element_value(base: Value, index: Value, position: Position, site: int) -> Value:
     """`base[index]` of a vector."""
-    assert isinstance(base.type, kinds.Vector)  # the caller has looked
+    assert isinstance(base.type, value_types.Vector)  # the caller has looked
     kind = base.type
-    if not kinds.is_number(index.type):
+    if not value_types.is_number(index.type):
         raise SpecificationError.at(index.position, f"an index is a number; this is {index.type}")
-    at = number(index.form, kinds.LONG)
+    at = number(index.form, value_types.LONG)
     known = index.constant
     if kind.length is not None and isinstance(known, int) and not 0 <= known < kind.length:
         raise SpecificationError.at(
@@ -30,8 +30,8 @@ def element_value(base: Value, index: Value, position: Position, site: int) -> V
     return Value(element, position, place, owned=base.owned)
 
 
-def _vector(call: Invocation) -> kinds.Vector:
-    assert isinstance(call.base.type, kinds.Vector)  # methods_of has looked
+def _vector(call: Invocation) -> value_types.Vector:
+    assert isinstance(call.base.type, value_types.Vector)  # methods_of has looked
     return call.base.type
 
 
@@ -42,21 +42,21 @@ def _vector_at(call: Invocation) -> Value:
 
 def _vector_front(call: Invocation) -> Value:
     call.count(0)
-    first = constant_value(call.position, kinds.LONG, 0)
+    first = constant_value(call.position, value_types.LONG, 0)
     return element_value(call.base, first, call.position, call.site)
 
 
 def _vector_back(call: Invocation) -> Value:
     call.count(0)
-    return element_value(call.base, call.value(kinds.LONG, "l_last"), call.position, call.site)
+    return element_value(call.base, call.value(value_types.LONG, "l_last"), call.position, call.site)
 
 
 def _push_back(call: Invocation) -> Value:
     call.count(1)
     kind = _vector(call)
     value = convert(call.scope, call.arguments[0], kind.element, call.site)
-    width = nodes.Literal(kinds.ULONG, call.scope.values.width(kind.element))
-    function = "l_append_text" if isinstance(kind.element, kinds.String) else "l_append"
+    width = nodes.Literal(value_types.ULONG, call.scope.values.width(kind.element))
+    function = "l_append_text" if isinstance(kind.element, value_types.String) else "l_append"
     return call.changes_in_place(function, value, width)
 
 
@@ -73,7 +73,7 @@ def _vector_clear(call: Invocation) -> Value:
 def _vector_resize(call: Invocation) -> Value:
     call.count(1)
     element = _vector(call).element
-    width = nodes.Literal(kinds.ULONG, call.scope.values.width(element))
+    width = nodes.Literal(value_types.ULONG, call.scope.values.width(element))
     return call.changes_in_place("l_resized", call.index(0), nodes.OfType("zero", element), width)
 
 
@@ -101,7 +101,7 @@ def _refuse_fixed(call: Invocation) -> None:
 
 def _nothing(call: Invocation) -> Value:
     call.count(1)
-    return Value(nodes.Literal(kinds.VOID, None), call.position)
+    return Value(nodes.Literal(value_types.VOID, None), call.position)
 
 
 VECTOR_METHODS: Mapping[str, Method] = MappingProxyType(

@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rosmop.fast.deferred_output import Line
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 POSITION, UNDO, SAID, NOW, SURE, REST, FIRST = 0, 8, 12, 16, 24, 32, 40
 """Where it stands which frame is looked at, where the log and the lines end, the time, where the lines end of the
@@ -62,7 +62,7 @@ class Cells:
     @property
     def kept(self) -> Sequence[int]:
         """Where the addresses and lengths of strings are noted."""
-        return [at for at, kind in self.variables.values() if isinstance(kind, kinds.String)]
+        return [at for at, kind in self.variables.values() if isinstance(kind, value_types.String)]
 
 
 @dataclass(frozen=True)

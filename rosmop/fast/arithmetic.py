@@ -4,7 +4,7 @@ from math import inf
 
 from rosmop.fast.abi import NOW
 from rosmop.fast.function_parts import Parts
-from rosmop.fast.layout import NotScalarError, is_signed, machine_type
+from rosmop.fast.memory_layout import NotScalarError, is_signed, machine_type
 from rosmop.fast.wasm import (
     ABS,
     CALCULATE,
@@ -23,8 +23,8 @@ from rosmop.fast.wasm import (
 from rosmop.form import nodes
 from rosmop.runtime import times
 from rosmop.runtime.times import BILLION
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 
 class Arithmetic(Parts):
@@ -46,12 +46,12 @@ class Arithmetic(Parts):
     def _convert(self, node: nodes.Convert) -> bytes:
         code, source, target = self._value(node.value), node.value.type, node.type
         one, other = machine_type(source), machine_type(target)
-        if isinstance(target, kinds.Bool):
+        if isinstance(target, value_types.Bool):
             return code + constant(one, 0) + bytes((COMPARE[one]["!="],))
-        if isinstance(target, kinds.Floating):
+        if isinstance(target, value_types.Floating):
             return code + to_floating(one, other, signed=is_signed(source))
-        assert isinstance(target, kinds.Integer)  # noqa: S101  numbers are one of the three
-        if isinstance(source, kinds.Floating):
+        assert isinstance(target, value_types.Integer)  # noqa: S101  numbers are one of the three
+        if isinstance(source, value_types.Floating):
             return self._truncated(code + (b"\xbb" if one == F32 else b""), target)
         if one == other:
             return code + _narrowed(target)
@@ -59,7 +59,7 @@ class Arithmetic(Parts):
             return code + (b"\xac" if is_signed(source) else b"\xad")
         return code + b"\xa7" + _narrowed(target)
 
-    def _truncated(self, code: bytes, target: kinds.Integer) -> bytes:
+    def _truncated(self, code: bytes, target: value_types.Integer) -> bytes:
         """A double toward zero, at most the limits."""
         if target.bits >= 32:
             wide = 4 if target.bits == 64 else 0
@@ -192,7 +192,9 @@ class Arithmetic(Parts):
 
     def _limited(self, kind: Type, code: bytes) -> bytes:
         """A time or duration, elsewhere if it is none."""
-        least, most = (0, times.MAX_TIME) if kind == kinds.TIME else (times.MIN_DURATION, times.MAX_DURATION)
+        least, most = (
+            (0, times.MAX_TIME) if kind == value_types.TIME else (times.MIN_DURATION, times.MAX_DURATION)
+        )
         name = f"moment {len(self._locals)}"
         code += self._set(name, I64)
         for limit, opcode in ((least, b"\x53"), (most, b"\x55")):
@@ -266,7 +268,7 @@ def to_floating(source: int, target: int, *, signed: bool) -> bytes:
     return bytes((first + 2 * (source == I64) + (not signed),))
 
 
-def _narrowed(target: kinds.Integer) -> bytes:
+def _narrowed(target: value_types.Integer) -> bytes:
     """Wrap what stands in 32 bits into fewer."""
     if target.bits >= 32:
         return b""

@@ -37,10 +37,9 @@ from rosmop.fast.abi import (
     Feed,
     FeedModule,
 )
-from rosmop.fast.assembly import PAGE, assembled
 from rosmop.fast.codegen import CHANGED, DROPPED, HAPPENED, RESET, Writer, Written
 from rosmop.fast.function_parts import ELSEWHERE
-from rosmop.fast.layout import NotScalarError
+from rosmop.fast.memory_layout import NotScalarError
 from rosmop.fast.wasm import (
     ELSE,
     END,
@@ -56,10 +55,11 @@ from rosmop.fast.wasm import (
     store,
     unsigned,
 )
+from rosmop.fast.wasm_assembler import PAGE, assembled
 from rosmop.form import nodes
 from rosmop.run.causes import NO_NUMBER, SEQ
 from rosmop.run.explain import CLOCKED_ROOM, ENTRY, KEPT, RING, RUNS
-from rosmop.runtime.context import BUDGET
+from rosmop.runtime.action_context import BUDGET
 from rosmop.runtime.values import Values
 
 EFFECT = 4

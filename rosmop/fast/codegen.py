@@ -29,7 +29,7 @@ from rosmop.fast.abi import NOW, POSITION, SAID, UNDO, Cells
 from rosmop.fast.arithmetic import to_floating
 from rosmop.fast.codegen_access import loaded, root_of
 from rosmop.fast.deferred_output import BYTES, HEAD, Line, is_text
-from rosmop.fast.layout import LINES, Layout, NotScalarError, is_signed, machine_type
+from rosmop.fast.memory_layout import LINES, Layout, NotScalarError, is_signed, machine_type
 from rosmop.fast.strings_codegen import Texts, settling
 from rosmop.fast.wasm import (
     COMPARE,
@@ -49,8 +49,8 @@ from rosmop.fast.wasm import (
 from rosmop.form import nodes
 from rosmop.runtime.values import Values, struct_code, struct_size
 from rosmop.runtime.wire import FEW
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 _LOADS = {I32: 0x28, I64: 0x29, F32: 0x2A, F64: 0x2B}
 _STORES = {I32: 0x36, I64: 0x37, F32: 0x38, F64: 0x39}
@@ -221,7 +221,7 @@ class _Body(Texts):
             return b""
         if isinstance(value, nodes.Sequence):
             return b"".join(self._evaluate(nodes.Evaluate(node.site, item)) for item in value.items)
-        if isinstance(value, nodes.Conditional) and value.type == kinds.VOID:
+        if isinstance(value, nodes.Conditional) and value.type == value_types.VOID:
             yes, no = ((nodes.Evaluate(node.site, branch),) for branch in (value.yes, value.no))
             return self._if(nodes.If(node.site, value.test, yes, no))
         return self._value(value) + DROP
@@ -241,11 +241,11 @@ class _Body(Texts):
         first, place, count = self._elements(node.values)
         self._brief = False
         at, left = (f"{what} {len(self._locals)}" for what in ("element", "left"))
-        if isinstance(kind, kinds.String):
+        if isinstance(kind, value_types.String):
             each, begin, length = self._text_at(self._get(at))
             each += begin + self._set(f"place of {node.name}") + length
             each += self._set(f"count of {node.name}", I64)
-        elif isinstance(kind, kinds.Record):
+        elif isinstance(kind, value_types.Record):
             each = self._get(at) + self._set(f"place of {node.name}")
         else:
             each = loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
@@ -395,11 +395,11 @@ class _Body(Texts):
         return self._cell(_LOADS[machine], self._writer.variable(node.name, node.type))
 
     def _assigned_to(self, node: nodes.Assign) -> bytes:
-        if isinstance(node.type, kinds.String):
+        if isinstance(node.type, value_types.String):
             return self._assigned_text(node)
-        if isinstance(node.type, kinds.Vector | kinds.Record):
+        if isinstance(node.type, value_types.Vector | value_types.Record):
             return self._named_in_place(node)
-        if node.type == kinds.VOID:
+        if node.type == value_types.VOID:
             return self._handed(node.name, node.value)
         machine, value = machine_type(node.type), self._value(node.value)
         cells = self._writer.shared.get(node.name)
@@ -414,7 +414,7 @@ class _Body(Texts):
         if not source or source in shared or node.name in shared:
             raise NotScalarError(str(node.type))
         self._assigned.add(node.name)
-        if isinstance(node.type, kinds.Record):
+        if isinstance(node.type, value_types.Record):
             return b"".join(self._place(node.value)) + self._set(f"place of {node.name}")
         code, place, count = self._elements(node.value)
         code += place + self._set(f"place of {node.name}")
@@ -511,7 +511,7 @@ class _Body(Texts):
         if node.function in _QUESTIONS:
             return self._question(argument, _QUESTIONS[node.function])
         if (
-            isinstance(node.type, kinds.Index)
+            isinstance(node.type, value_types.Index)
             and isinstance(argument, nodes.Call)
             and argument.function != "l_len"
         ):
@@ -550,7 +550,13 @@ class _Body(Texts):
         """
         if node.depth is not None:
             raise NotScalarError("recursion")
-        result = I32 if node.type == kinds.VOID else I64 if _has_place(node.type) else machine_type(node.type)
+        result = (
+            I32
+            if node.type == value_types.VOID
+            else I64
+            if _has_place(node.type)
+            else machine_type(node.type)
+        )
         function = self._writer.functions[node.function]
         parameters: dict[str, int] = {}
         code = b""
@@ -559,7 +565,7 @@ class _Body(Texts):
                 if _has_place(argument.type):
                     parameters |= {f"place of {name}": I32, f"count of {name}": I64}
                     code += b"".join(self._elements(argument))
-                elif isinstance(argument.type, kinds.Record):
+                elif isinstance(argument.type, value_types.Record):
                     parameters[f"place of {name}"] = I32
                     code += b"".join(self._place(argument))
                 else:
@@ -576,7 +582,7 @@ class _Body(Texts):
         if _has_place(kind):
             code, place, count = self._noted(b"".join(self._elements(node.value)))
             answer = place + b"\xad" + count + constant(I64, 32) + b"\x86\x84"
-        elif kind != kinds.VOID:
+        elif kind != value_types.VOID:
             name = f"answer {machine_type(kind)}"
             code, answer = (
                 self._value(node.value) + self._set(name, machine_type(kind)),
@@ -604,7 +610,7 @@ class _Body(Texts):
         if _has_place(node.type):
             code += self._put_span(f"{name} 0")
         else:
-            code += DROP if node.type == kinds.VOID else self._set(f"{name} 0", machine_type(node.type))
+            code += DROP if node.type == value_types.VOID else self._set(f"{name} 0", machine_type(node.type))
         kinds_of = dict(zip(self._writer.functions[node.function].parameters, node.arguments, strict=True))
         for number, (reference, at) in enumerate(references, 1):
             kind = kinds_of[reference].type
@@ -628,7 +634,7 @@ class _Body(Texts):
         return code, self._get(f"place of {name}"), self._get(f"count of {name}", I64)
 
     def _elements(self, node: nodes.Expression) -> tuple[bytes, bytes, bytes]:
-        if isinstance(node, nodes.Item) and node.base.type == kinds.VOID:
+        if isinstance(node, nodes.Item) and node.base.type == value_types.VOID:
             return super()._elements(_part_of(node))
         if _has_place(node.type) and isinstance(node, nodes.Invoke):
             return self._handed_back(node)
@@ -637,14 +643,14 @@ class _Body(Texts):
         return super()._elements(node)
 
     def _item(self, node: nodes.Item) -> bytes:
-        if node.base.type != kinds.VOID:
+        if node.base.type != value_types.VOID:
             return super()._item(node)
-        return constant(I32, 0) if node.type == kinds.VOID else self._value(_part_of(node))
+        return constant(I32, 0) if node.type == value_types.VOID else self._value(_part_of(node))
 
 
 def _has_place(kind: Type) -> bool:
     """Whether a value is where it is and how long it is."""
-    return isinstance(kind, kinds.String | kinds.Vector)
+    return isinstance(kind, value_types.String | value_types.Vector)
 
 
 def _part_of(node: nodes.Item) -> nodes.Read:

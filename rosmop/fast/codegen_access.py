@@ -9,14 +9,14 @@ from contextlib import contextmanager
 
 from rosmop.fast.abi import REST
 from rosmop.fast.arithmetic import Arithmetic
-from rosmop.fast.layout import NotScalarError, machine_type
+from rosmop.fast.memory_layout import NotScalarError, machine_type
 from rosmop.fast.wasm import I32, I64, LOAD, constant, unsigned
 from rosmop.form import nodes
 from rosmop.runtime.times import BILLION
 from rosmop.runtime.values import struct_code, struct_size
 from rosmop.runtime.wire import MAX_EMPTY
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 MOST_TEXTS = 256
 """Strings of an array that is read; one of more is left."""
@@ -75,14 +75,14 @@ class Places(Arithmetic):
 
     def _read_value(self, node: nodes.ReadValue) -> bytes:
         place, count, start = f"place of {node.name}", f"count of {node.name}", node.at
-        if isinstance(node.type, kinds.Record):
+        if isinstance(node.type, value_types.Record):
             size = self._layout.size(node.type)
             code = self._within(start, size) + self._get("at") + self._position(start) + b"\xa7\x6a"
             return code + self._set(place) + self._position(start.plus(size)) + self._set(node.end, I64)
         element, size = self._layout.element(node.type)
-        if isinstance(element, kinds.String):
+        if isinstance(element, value_types.String):
             return self._read_texts(node)
-        if isinstance(node.type, kinds.Vector) and node.type.length is not None:
+        if isinstance(node.type, value_types.Vector) and node.type.length is not None:
             code = self._within(start, node.type.length * size)
             code += constant(I64, node.type.length) + self._set(count, I64)
         else:
@@ -92,7 +92,7 @@ class Places(Arithmetic):
 
     def _read_texts(self, node: nodes.ReadValue) -> bytes:
         """Note where each string of an array begins."""
-        if isinstance(node.type, kinds.Vector) and node.type.length is not None:
+        if isinstance(node.type, value_types.Vector) and node.type.length is not None:
             raise NotScalarError(str(node.type))
         count, left, entry = (
             f"count of {node.name}",
@@ -125,14 +125,14 @@ class Places(Arithmetic):
             machine_type(element)
             return first + self._allocated(count + constant(I64, size) + b"\x7e"), place, count
         if (
-            isinstance(node.type, kinds.String)
+            isinstance(node.type, value_types.String)
             and isinstance(node, nodes.Call)
             and node.function == "l_element"
         ):
             return self._text_at(self._address_of(node))
         if (
             isinstance(node, nodes.Item)
-            and isinstance(node.type, kinds.Vector)
+            and isinstance(node.type, value_types.Vector)
             and node.type.length is not None
         ):
             first, place = self._place(node)
@@ -159,7 +159,11 @@ class Places(Arithmetic):
     @contextmanager
     def _apart(self, *looked_at: nodes.Expression) -> Iterator[None]:
         """What is written here does not change what is looked at; raises `NotScalarError` if it does."""
-        names = {root_of(node) for node in looked_at if isinstance(node.type, kinds.Vector | kinds.Record)}
+        names = {
+            root_of(node)
+            for node in looked_at
+            if isinstance(node.type, value_types.Vector | value_types.Record)
+        }
         before, self._assigned = self._assigned, set()
         try:
             yield
@@ -211,4 +215,4 @@ def root_of(node: nodes.Expression) -> str:
             node = node.arguments[0]
         else:
             return ""
-    return node.name if node.type != kinds.VOID else ""  # that holds what a function has handed back
+    return node.name if node.type != value_types.VOID else ""  # that holds what a function has handed back

@@ -12,10 +12,10 @@ from typing import Any
 import msgspec
 
 from rosmop.form import nodes
-from rosmop.runtime.context import BYTES_PER_INSTRUCTION, OUTPUT_COST, LogLine, line_of
+from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, OUTPUT_COST, LogLine, line_of
+from rosmop.runtime.builtin_functions import FAULTING, FUNCTIONS
 from rosmop.runtime.formatting import MAX_PRECISION
-from rosmop.runtime.functions import FAULTING, FUNCTIONS
-from rosmop.types import kinds
+from rosmop.types import value_types
 
 HEAD = struct.Struct("<II")
 """The number of a line and where its frame is."""
@@ -85,7 +85,7 @@ class Line(msgspec.Struct, tag=True, array_like=True, dict=True):
 
 def is_text(node: nodes.Expression) -> bool:
     """Whether a value is a string."""
-    return isinstance(node.type, kinds.String)
+    return isinstance(node.type, value_types.String)
 
 
 def _goes_on(node: nodes.Call) -> bool:
@@ -101,6 +101,8 @@ def _goes_on(node: nodes.Call) -> bool:
 
 
 def _code(node: nodes.Expression) -> str:
-    if isinstance(node.type, kinds.Floating):
+    if isinstance(node.type, value_types.Floating):
         return "d"
-    return "Q" if is_text(node) or (isinstance(node.type, kinds.Integer) and not node.type.signed) else "q"
+    return (
+        "Q" if is_text(node) or (isinstance(node.type, value_types.Integer) and not node.type.signed) else "q"
+    )

@@ -4,10 +4,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from rosmop.fast.layout import Layout, NotScalarError
+from rosmop.fast.memory_layout import Layout, NotScalarError
 from rosmop.fast.wasm import ELSE, END, I32, I64, IF, NOTHING, RETURN, UNREACHABLE, constant, unsigned
 from rosmop.form import nodes
-from rosmop.runtime.context import BYTES_PER_INSTRUCTION, UNMEASURED
+from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, UNMEASURED
 
 ELSEWHERE = 8
 """The answer of an event or handler whose message is left."""

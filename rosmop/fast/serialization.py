@@ -14,7 +14,7 @@ from rosmop.form.compiled import Compiled, Part
 from rosmop.logics.bounded import BoundedProperty
 from rosmop.logics.cfg import GrammarProperty
 from rosmop.logics.interface import CompiledProperty, FiniteProperty
-from rosmop.logics.past import ClockedPast, PastProperty
+from rosmop.logics.past_monitors import ClockedPast, PastProperty
 from rosmop.logics.pattern import TimedPattern
 from rosmop.logics.ptcaret import CaretProperty
 from rosmop.logics.srs import RewritingProperty

@@ -11,7 +11,7 @@ only that is known (`BEYOND`); the message that looks at it is left.
 
 from rosmop.fast.abi import MOST_KEPT, Cells
 from rosmop.fast.codegen_access import Places
-from rosmop.fast.layout import Layout, NotScalarError
+from rosmop.fast.memory_layout import Layout, NotScalarError
 from rosmop.fast.wasm import (
     COMPARE,
     ELSE,
@@ -28,15 +28,15 @@ from rosmop.fast.wasm import (
     unsigned,
 )
 from rosmop.form import nodes
-from rosmop.runtime.context import BYTES_PER_INSTRUCTION
-from rosmop.types import kinds
+from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION
+from rosmop.types import value_types
 
 
 class Texts(Places):
     """Writes what looks at strings."""
 
     def _elements(self, node: nodes.Expression) -> tuple[bytes, bytes, bytes]:
-        if not isinstance(node.type, kinds.String):
+        if not isinstance(node.type, value_types.String):
             return super()._elements(node)
         if isinstance(node, nodes.Literal | nodes.Zero):
             raw = node.value if isinstance(node, nodes.Literal) else b""

@@ -8,7 +8,7 @@ from rosmop.fast.abi import FeedModule
 from rosmop.fast.batch_codegen import WrittenModule, written
 from rosmop.fast.wasm_instance import translated
 from rosmop.form.compiled import Compiled, Part
-from rosmop.form.components import groups
+from rosmop.form.specification_groups import groups
 from rosmop.runtime.values import Values
 
 

@@ -35,16 +35,16 @@ from rosmop.fast.abi import (
 from rosmop.fast.deferred_output import HEAD
 from rosmop.fast.wasm_instance import Machine, MachineTrap
 from rosmop.form.compiled import Compiled
-from rosmop.form.components import groups
+from rosmop.form.specification_groups import groups
 from rosmop.run.explain import ClockedSteps, Exits
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import CellNames, Monitor, RunningProperty
 from rosmop.run.outcomes import Outcome, Verdict
-from rosmop.runtime.context import FUEL_PER_SECOND, Context, LogLine
+from rosmop.runtime.action_context import FUEL_PER_SECOND, Context, LogLine
 from rosmop.runtime.values import struct_code
 from rosmop.runtime.wire import Buffer
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 FUEL = FUEL_PER_SECOND // 1000
 """Instructions of one call at most: about a millisecond. What a call leaves is for the next ones: setting it costs a
@@ -142,7 +142,7 @@ class Home:
         self._strings = [
             (place, cells.texts[address])
             for place, (address, kind) in enumerate(variables.values())
-            if isinstance(kind, kinds.String)
+            if isinstance(kind, value_types.String)
         ]
         codes = "".join(_cell(kind) for _, kind in variables.values())
         self.names = CellNames([*properties], [*map(known.get, variables)], codes, [*cells.clocks])
@@ -245,11 +245,11 @@ def _left(memory: memoryview, word: int, before: bytes) -> bytes:
 
 def _cell(kind: Type) -> str:
     """The `struct` code of a variable in the module's memory, 8 bytes."""
-    if isinstance(kind, kinds.String):
+    if isinstance(kind, value_types.String):
         return "Q"
-    if isinstance(kind, kinds.Bool):
+    if isinstance(kind, value_types.Bool):
         return "?7x"
-    if isinstance(kind, kinds.Integer) and kind.bits <= 32:
+    if isinstance(kind, value_types.Integer) and kind.bits <= 32:
         return "i4x" if kind.signed else "I4x"
     code = struct_code(kind) or ""
     return "q" if len(code) == 2 else "f4x" if code == "f" else code

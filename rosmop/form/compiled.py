@@ -10,9 +10,9 @@ from rosmop.form.positions import Finding, Position
 from rosmop.form.sites import Site, Symbols
 from rosmop.logics.interface import CompiledProperty
 from rosmop.run.interpreter import Interpreter
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
 from rosmop.types.messages import Messages
+from rosmop.types.value_types import Type
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Slicing:
     `enforces`: the specification drops or changes messages, or publishes some.
     """
 
-    parameters: tuple[tuple[str, str, kinds.Type], ...]
+    parameters: tuple[tuple[str, str, value_types.Type], ...]
     own: tuple[str, ...]
     enforces: bool
 

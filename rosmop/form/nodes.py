@@ -1,9 +1,9 @@
 """The form: typed expressions, statements and functions, without names to look up or types to infer.
 
-Everything is an immutable value. Types are those of `types/kinds.py`; every expression has one, and its operands have
-the types that the operation takes (conversions are written out). Values are as in C++ on a 64-bit machine: integers
-of their width that wrap, floats of 32 or 64 bits, strings of bytes. Times and durations are nanoseconds. Vectors and
-messages are references: assigning one shares it, so copies are written out, too (`Copy`).
+Everything is an immutable value. Types are those of `types/value_types.py`; every expression has one, and its operands
+have the types that the operation takes (conversions are written out). Values are as in C++ on a 64-bit machine:
+integers of their width that wrap, floats of 32 or 64 bits, strings of bytes. Times and durations are nanoseconds.
+Vectors and messages are references: assigning one shares it, so copies are written out, too (`Copy`).
 
 Names are of the set of specifications: `g…` variables that specifications share, all others belong to one call of one
 function. A *site* is the number of a place in the text, to tell faults by; -1 is that of the statement.
@@ -24,8 +24,8 @@ from typing import Any, get_args
 
 import msgspec
 
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 CHARGED = 1024
 """A message longer than this is charged when an array or all of it is decoded."""
@@ -119,7 +119,7 @@ class Compare(Node, frozen=True):
     left: "Expression"
     right: "Expression"
     site: int
-    type: Type = kinds.BOOL
+    type: Type = value_types.BOOL
 
 
 class CompareTexts(Node, frozen=True):
@@ -132,7 +132,7 @@ class CompareTexts(Node, frozen=True):
     right: "Expression"
     short: bool
     site: int
-    type: Type = kinds.BOOL
+    type: Type = value_types.BOOL
 
 
 class Logical(Node, frozen=True):
@@ -141,14 +141,14 @@ class Logical(Node, frozen=True):
     operator: str
     left: "Expression"
     right: "Expression"
-    type: Type = kinds.BOOL
+    type: Type = value_types.BOOL
 
 
 class Not(Node, frozen=True):
     """The opposite."""
 
     value: "Expression"
-    type: Type = kinds.BOOL
+    type: Type = value_types.BOOL
 
 
 class Conditional(Node, frozen=True):
@@ -172,7 +172,7 @@ class Discard(Node, frozen=True):
     """An expression for its effect alone."""
 
     value: "Expression"
-    type: Type = kinds.VOID
+    type: Type = value_types.VOID
 
 
 class Item(Node, frozen=True):
@@ -186,7 +186,7 @@ class Item(Node, frozen=True):
 class Vector(Node, frozen=True):
     """A vector of these elements, and so many zeros behind them."""
 
-    type: kinds.Vector
+    type: value_types.Vector
     items: "tuple[Expression, ...]"
     zeros: int = 0
 
@@ -208,7 +208,7 @@ class Copy(Node, frozen=True):
 class Recast(Node, frozen=True):
     """A vector of bytes (or of vectors of them) as one of bytes of another kind."""
 
-    type: kinds.Vector
+    type: value_types.Vector
     value: "Expression"
     site: int
 
@@ -221,7 +221,7 @@ class OfType(Node, frozen=True):
     what: str
     of: Type
     site: int = -1
-    type: Type = kinds.VOID
+    type: Type = value_types.VOID
 
 
 class Call(Node, frozen=True):
@@ -268,7 +268,7 @@ class Format(Node, frozen=True):
     arguments: "tuple[Expression, ...]"
     size: int | None
     site: int
-    type: Type = kinds.STRING
+    type: Type = value_types.STRING
 
 
 class Join(Node, frozen=True):
@@ -276,7 +276,7 @@ class Join(Node, frozen=True):
 
     pieces: "tuple[Expression, ...]"
     site: int
-    type: Type = kinds.STRING
+    type: Type = value_types.STRING
 
 
 class Log(Node, frozen=True):
@@ -285,7 +285,7 @@ class Log(Node, frozen=True):
     level: str
     text: "Expression"
     site: int
-    type: Type = kinds.VOID
+    type: Type = value_types.VOID
 
 
 class Throttle(Node, frozen=True):
@@ -293,19 +293,19 @@ class Throttle(Node, frozen=True):
 
     seconds: "Expression"
     site: int
-    type: Type = kinds.BOOL
+    type: Type = value_types.BOOL
 
 
 class Now(Node, frozen=True):
     """The time at which the message was received."""
 
-    type: Type = kinds.TIME
+    type: Type = value_types.TIME
 
 
 class Whole(Node, frozen=True):
     """`MESSAGE`: all of it, with the fields that this action has assigned so far, which `Pending` has named."""
 
-    type: kinds.Record
+    type: value_types.Record
     pending: str
     site: int
 
@@ -428,7 +428,7 @@ class Publish(Node, frozen=True):
 
     site: int
     topic: str
-    kind: kinds.Record
+    kind: value_types.Record
     value: Expression
     name: str
 
@@ -674,7 +674,9 @@ def acts(root: Expression) -> bool:
     """Whether to evaluate it changes anything, or is seen from outside."""
     return any(
         isinstance(node, Assign | Invoke | Log | Throttle)
-        or (isinstance(node, Call) and (node.type == kinds.VOID or node.function in ("a_put", "a_slot")))
+        or (
+            isinstance(node, Call) and (node.type == value_types.VOID or node.function in ("a_put", "a_slot"))
+        )
         for node in walk(root)
     )
 

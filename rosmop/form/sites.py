@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rosmop.form.positions import Position
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,16 +66,16 @@ class Symbols:
 
 def showing(kind: Type) -> Callable[[Any], object]:
     """How a value of a type is shown where a fault is told: something JSON has."""
-    if isinstance(kind, kinds.String | kinds.Characters):
+    if isinstance(kind, value_types.String | value_types.Characters):
         return lambda value: _short(value[:200].split(b"\0")[0].decode("utf-8", "replace"))
-    if isinstance(kind, kinds.Time | kinds.Duration):
+    if isinstance(kind, value_types.Time | value_types.Duration):
         return lambda value: value / 1e9
-    if isinstance(kind, kinds.Vector):
+    if isinstance(kind, value_types.Vector):
         inner = showing(kind.element)
         return lambda values: [inner(value) for value in values[:8]] + ["…"] * (len(values) > 8)
-    if isinstance(kind, kinds.Floating):
+    if isinstance(kind, value_types.Floating):
         return lambda value: value if value - value == 0 else str(value)
-    if isinstance(kind, kinds.Record):
+    if isinstance(kind, value_types.Record):
         return lambda value: _short(str(value)[:200])
     return lambda value: value
 

@@ -11,10 +11,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from rosmop.learn import extremes
-from rosmop.learn.orders import Orders, Pair
 from rosmop.learn.recordings import Windows
+from rosmop.learn.rv_text import identifier, literal, number, rounded_down, rounded_up, short_names
 from rosmop.learn.series import Highs, Series, Values
-from rosmop.learn.text import identifier, literal, number, rounded_down, rounded_up, short_names
+from rosmop.learn.topic_orders import Orders, Pair
 from rosmop.learn.topics import Content, Rhythm
 
 QUIET_HOURS = 10.0

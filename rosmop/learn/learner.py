@@ -13,11 +13,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rosmop.learn.candidates import Candidate, Knowledge
-from rosmop.learn.fields import Fields, MessageError
-from rosmop.learn.orders import Orders
+from rosmop.learn.field_values import Fields, MessageError
 from rosmop.learn.recordings import Part, Received, Recording, Windows, split
+from rosmop.learn.rv_writer import on, specifications
+from rosmop.learn.topic_orders import Orders
 from rosmop.learn.topics import Content, Rhythm
-from rosmop.learn.writer import on, specifications
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from roswire.definitions import Definitions

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from rosmop.learn.fields import MOST_ELEMENTS, Fields
+from rosmop.learn.field_values import MOST_ELEMENTS, Fields
 from rosmop.learn.series import Highs, Series, Values
 
 MOST_SINGLE = 6

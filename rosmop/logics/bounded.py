@@ -31,7 +31,7 @@ from typing import Any, ClassVar
 
 from rosmop.logics.formula import Formula
 from rosmop.logics.interface import Categories, CompiledProperty, Run, RunFaultError, Source
-from rosmop.logics.past import FOREVER, VERDICTS, Instruction, Program, Window, fold
+from rosmop.logics.past_monitors import FOREVER, VERDICTS, Instruction, Program, Window, fold
 
 MOST_OPEN = 10_000
 

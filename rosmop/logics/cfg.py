@@ -9,8 +9,8 @@ table.
 """
 
 from rosmop.logics.automaton import Automaton, TooManyStatesError, explore
+from rosmop.logics.cfg_grammar import Grammar, prepare, read_grammar
 from rosmop.logics.ere import with_fail
-from rosmop.logics.grammar import Grammar, prepare, read_grammar
 from rosmop.logics.interface import (
     Categories,
     CompiledProperty,

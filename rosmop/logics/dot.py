@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from rosmop.logics.interface import CompiledProperty, FiniteProperty
-from rosmop.logics.lint import Graph, graph_of
 from rosmop.logics.pattern import MODES, TimedPattern
+from rosmop.logics.property_lint import Graph, graph_of
 from rosmop.logics.tfsm import TimedMachine
 
 

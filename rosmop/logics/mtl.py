@@ -10,7 +10,7 @@ only, at the times at which they were received. The category is ``validation`` w
 from rosmop.logics.bounded import BoundedProperty
 from rosmop.logics.formula import NOT, Level, Syntax, boolean_levels, nodes, read_formula
 from rosmop.logics.interface import CompiledProperty, Source
-from rosmop.logics.past import compile_past
+from rosmop.logics.past_monitors import compile_past
 
 _PAST = ("previously", "once", "historically", "since")
 FUTURE = ("next", "eventually", "always", "until")

@@ -23,7 +23,7 @@ ends; a frame is viable if it has an item, because every symbol of the grammar c
 
 from collections.abc import Sequence
 
-from rosmop.logics.grammar import Grammar, nullable_symbols
+from rosmop.logics.cfg_grammar import Grammar, nullable_symbols
 from rosmop.logics.interface import RunFaultError
 
 MAX_WIDTH = 4_000

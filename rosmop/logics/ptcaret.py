@@ -26,7 +26,7 @@ from rosmop.logics.interface import (
     UntimedRun,
     twin,
 )
-from rosmop.logics.past import TOLD, VERDICTS, Folded, Program, fold
+from rosmop.logics.past_monitors import TOLD, VERDICTS, Folded, Program, fold
 from rosmop.logics.ptltl import SYNTAX as PTLTL
 
 MAX_DEPTH = 10_000

@@ -7,7 +7,7 @@ no previous one: ``(*) a`` is false there, ``[*] a`` is ``a``.
 
 from rosmop.logics.formula import NOT, Level, Syntax, boolean_levels, read_formula
 from rosmop.logics.interface import CompiledProperty, Source
-from rosmop.logics.past import compile_past
+from rosmop.logics.past_monitors import compile_past
 
 _FUTURE = "is about the future; write `ltl:` as the logic, or a past operator: (*) <*> [*] S"
 

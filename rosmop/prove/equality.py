@@ -22,7 +22,7 @@ from rosmop.fast.abi import AREA
 from rosmop.fast.batch_codegen import WrittenModule, written
 from rosmop.form import nodes
 from rosmop.form.compiled import Compiled
-from rosmop.form.components import groups
+from rosmop.form.specification_groups import groups
 from rosmop.prove.decoding import functions_of
 from rosmop.prove.form_terms import Meaning, wrapped
 from rosmop.prove.module_terms import Done, Execution
@@ -43,11 +43,11 @@ from rosmop.prove.terms import (
     number_at,
     opposite,
 )
-from rosmop.runtime.context import BUDGET
+from rosmop.runtime.action_context import BUDGET
 from rosmop.runtime.times import MAX_TIME
 from rosmop.runtime.values import Values
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 EQUAL = "equal"
 IN_PYTHON = "no module: messages of this topic are judged in Python"
@@ -204,10 +204,10 @@ class Validation:
         variables: dict[str, Any] = {}
         for component in self._module.cells:
             for name, (address, kind) in component.variables.items():
-                if isinstance(kind, kinds.String):
+                if isinstance(kind, value_types.String):
                     continue
                 variables[name] = cells[address] = _variable(name, kind)
-                if isinstance(kind, kinds.Time | kinds.Duration):
+                if isinstance(kind, value_types.Time | value_types.Duration):
                     most = MAX_TIME + (1 << 32)
                     known += [variables[name] >= -most, variables[name] <= most]
         budgets = {context: z3.BitVec(f"budget of {context}", 64) for context in self._module.budgets}
@@ -273,10 +273,10 @@ def _bit(bits: Term, which: int) -> Term:
 
 def _variable(name: str, kind: Type) -> Term:
     """A variable of the set, with any value of its type."""
-    if isinstance(kind, kinds.Bool):
+    if isinstance(kind, value_types.Bool):
         return z3.Bool(name)
-    if isinstance(kind, kinds.Floating):
+    if isinstance(kind, value_types.Floating):
         return z3.FP(name, DOUBLE if kind.bits == 64 else SINGLE)
-    if isinstance(kind, kinds.Integer) and kind.bits <= 32:
+    if isinstance(kind, value_types.Integer) and kind.bits <= 32:
         return wrapped(z3.BitVec(name, 32), kind)
     return z3.BitVec(name, 64)

@@ -41,11 +41,11 @@ from rosmop.prove.terms import (
     with_number,
 )
 from rosmop.runtime import times
-from rosmop.runtime.context import BYTES_PER_INSTRUCTION, UNMEASURED
+from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, UNMEASURED
 from rosmop.runtime.values import Values, struct_code, struct_size
 from rosmop.runtime.wire import MAX_EMPTY
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 _MESSAGE, _DROPPED, _CHANGED, _BUDGET, _SAID = "message", "dropped", "changed", "budget", "said"
 
@@ -65,15 +65,15 @@ class UnknownError(Exception):
 
 def is_signed(kind: Type) -> bool:
     """Whether numbers of the type may be negative."""
-    return not isinstance(kind, kinds.Integer) or kind.signed
+    return not isinstance(kind, value_types.Integer) or kind.signed
 
 
 def width(kind: Type) -> int:
     """The bits of the vector that holds a number of this type."""
-    return 32 if isinstance(kind, kinds.Integer) and kind.bits <= 32 else 64
+    return 32 if isinstance(kind, value_types.Integer) and kind.bits <= 32 else 64
 
 
-def wrapped(value: Term, kind: kinds.Integer) -> Term:
+def wrapped(value: Term, kind: value_types.Integer) -> Term:
     """Only the bits of this type, as the vector holds them."""
     if kind.bits >= 32:
         return value
@@ -87,7 +87,7 @@ def _text(view: _View) -> Term:
 
 def _word(value: Term, kind: Type) -> Term:
     """A number as it stands in a line."""
-    if isinstance(kind, kinds.Floating):
+    if isinstance(kind, value_types.Floating):
         return z3.fpToIEEEBV(value if kind.bits == 64 else z3.fpFPToFP(NEAREST, value, DOUBLE))
     bits = as_bits(value) if z3.is_bool(value) else value
     return bits if bits.size() == 64 else (z3.SignExt if is_signed(kind) else z3.ZeroExt)(32, bits)
@@ -196,7 +196,7 @@ class Meaning:
     def _return(self, node: nodes.Return, state: State) -> None:
         if node.references or self._returned is None:
             raise UnknownError("references")
-        value = None if node.value.type == kinds.VOID else self._value(node.value, state)
+        value = None if node.value.type == value_types.VOID else self._value(node.value, state)
         self._returned.append((state.where(z3.BoolVal(True)), value))
         state.alive = z3.BoolVal(False)
 
@@ -317,15 +317,15 @@ class Meaning:
 
     def _decoded(self, bits: Term, kind: Type) -> Term:
         """The number that these bytes are."""
-        if isinstance(kind, kinds.Time | kinds.Duration):
-            extend = z3.ZeroExt if kind == kinds.TIME else z3.SignExt
+        if isinstance(kind, value_types.Time | value_types.Duration):
+            extend = z3.ZeroExt if kind == value_types.TIME else z3.SignExt
             seconds, rest = (extend(32, z3.Extract(more + 31, more, bits)) for more in (0, 32))
             return seconds * integer(times.BILLION, 64) + rest
-        if isinstance(kind, kinds.Bool):
+        if isinstance(kind, value_types.Bool):
             return bits != 0
-        if isinstance(kind, kinds.Floating):
+        if isinstance(kind, value_types.Floating):
             return z3.fpBVToFP(bits, DOUBLE if kind.bits == 64 else SINGLE)
-        if not isinstance(kind, kinds.Integer):
+        if not isinstance(kind, value_types.Integer):
             raise UnknownError(f"a value of type {kind}")
         missing = width(kind) - bits.size()
         return bits if not missing else (z3.SignExt if kind.signed else z3.ZeroExt)(missing, bits)
@@ -335,27 +335,27 @@ class Meaning:
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
-        if isinstance(kind, kinds.Record):
+        if isinstance(kind, value_types.Record):
             return sum(map(self._size, self._values.fields(kind)))
-        if isinstance(kind, kinds.Vector) and kind.length is not None:
+        if isinstance(kind, value_types.Vector) and kind.length is not None:
             return kind.length * self._size(kind.element)
         raise UnknownError(f"a value of type {kind} in a vector or message")
 
     def _read_value(self, node: nodes.ReadValue, state: State) -> None:
         kind, start = node.type, self._position(node.at, state)
         count, size = integer(1, 64), 1
-        if isinstance(kind, kinds.String):
+        if isinstance(kind, value_types.String):
             count = self._length(node.at, state)
             start = self._position(node.at.plus(4), state)
             self._leave_to_python(state, z3.UGT(start + count, z3.ZeroExt(32, self._beginning.size)))
-        elif isinstance(kind, kinds.Vector) and kind.length is None:
+        elif isinstance(kind, value_types.Vector) and kind.length is None:
             size = self._size(kind.element)
             count = self._counted(node.at, size, state)
             start = self._position(node.at.plus(4), state)
         else:
             size = self._size(kind)
             self._within(node.at, size, state)
-            if isinstance(kind, kinds.Vector):
+            if isinstance(kind, value_types.Vector):
                 count, size = integer(kind.length or 0, 64), self._size(kind.element)
         state.slots[self._frame, node.name] = _View(state.slots[_MESSAGE], start, count)
         state.slots[self._frame, node.end] = start + count * size
@@ -383,15 +383,15 @@ class Meaning:
 
     def _packed(self, value: Term, kind: Type, state: State) -> Term:
         """The bytes of a number. Which bits a NaN has is for Python to say."""
-        if isinstance(kind, kinds.Floating):
+        if isinstance(kind, value_types.Floating):
             self._leave_to_python(state, z3.fpIsNaN(value))
             return z3.fpToIEEEBV(value)
-        if isinstance(kind, kinds.Bool):
+        if isinstance(kind, value_types.Bool):
             return as_bits(value, 8)
-        if isinstance(kind, kinds.Integer):
+        if isinstance(kind, value_types.Integer):
             return z3.Extract(kind.bits - 1, 0, value)
         seconds, rest = self._parts(value)
-        least, most = (0, 1 << 32) if kind == kinds.TIME else (-(1 << 31), 1 << 31)
+        least, most = (0, 1 << 32) if kind == value_types.TIME else (-(1 << 31), 1 << 31)
         self._leave_to_python(state, either(seconds < least, seconds >= most))
         return z3.Concat(z3.Extract(31, 0, rest), z3.Extract(31, 0, seconds))
 
@@ -415,17 +415,19 @@ class Meaning:
             return None
         if isinstance(node.value, bytes | str):
             raise UnknownError("a constant string")
-        if isinstance(node.type, kinds.Floating):
+        if isinstance(node.type, value_types.Floating):
             return floating(node.value, node.type.bits)
         return self._whole_number(int(node.value), node.type)
 
     def _whole_number(self, value: int, kind: Type) -> Term:
-        return z3.BoolVal(bool(value)) if isinstance(kind, kinds.Bool) else integer(value, width(kind))
+        return z3.BoolVal(bool(value)) if isinstance(kind, value_types.Bool) else integer(value, width(kind))
 
     def _zero(self, node: nodes.Zero, state: State) -> Any:
-        if isinstance(node.type, kinds.Floating):
+        if isinstance(node.type, value_types.Floating):
             return self._literal(nodes.Literal(node.type, 0.0), state)
-        if not isinstance(node.type, kinds.Bool | kinds.Integer | kinds.Time | kinds.Duration):
+        if not isinstance(
+            node.type, value_types.Bool | value_types.Integer | value_types.Time | value_types.Duration
+        ):
             raise UnknownError(f"a zero of type {node.type}")
         return self._whole_number(0, node.type)
 
@@ -448,28 +450,28 @@ class Meaning:
         return self._converted(self._value(node.value, state), node.value.type, node.type)
 
     def _converted(self, value: Term, source: Type, target: Type) -> Term:
-        if isinstance(target, kinds.Bool):
-            if isinstance(source, kinds.Floating):
+        if isinstance(target, value_types.Bool):
+            if isinstance(source, value_types.Floating):
                 return opposite(z3.fpIsZero(value))
-            return value if isinstance(source, kinds.Bool) else value != 0
-        if isinstance(source, kinds.Bool):
-            source, value = kinds.INT, as_bits(value)
-        if isinstance(target, kinds.Floating):
+            return value if isinstance(source, value_types.Bool) else value != 0
+        if isinstance(source, value_types.Bool):
+            source, value = value_types.INT, as_bits(value)
+        if isinstance(target, value_types.Floating):
             sort = DOUBLE if target.bits == 64 else SINGLE
-            if isinstance(source, kinds.Floating):
+            if isinstance(source, value_types.Floating):
                 return value if source.bits == target.bits else z3.fpFPToFP(NEAREST, value, sort)
             return (z3.fpSignedToFP if is_signed(source) else z3.fpUnsignedToFP)(NEAREST, value, sort)
-        if not isinstance(target, kinds.Integer):
+        if not isinstance(target, value_types.Integer):
             raise UnknownError(f"a conversion to {target}")
-        if isinstance(source, kinds.Floating):
-            return self._truncated(self._converted(value, source, kinds.Floating(64)), target)
+        if isinstance(source, value_types.Floating):
+            return self._truncated(self._converted(value, source, value_types.Floating(64)), target)
         if width(target) > value.size():
             value = (z3.SignExt if is_signed(source) else z3.ZeroExt)(32, value)
         return wrapped(value if width(target) == value.size() else z3.Extract(31, 0, value), target)
 
-    def _truncated(self, value: Term, target: kinds.Integer) -> Term:
+    def _truncated(self, value: Term, target: value_types.Integer) -> Term:
         """Toward zero, at most the limits; of what is narrower than 32 bits within those of `int` first."""
-        whole = target if target.bits >= 32 else kinds.INT
+        whole = target if target.bits >= 32 else value_types.INT
         bits = whole.bits
         least, most = floating(whole.least, 64), floating(whole.most, 64)
         cut = (z3.fpToSBV if whole.signed else z3.fpToUBV)(z3.RTZ(), value, z3.BitVecSort(bits))
@@ -484,9 +486,9 @@ class Meaning:
     def _arithmetic(self, node: nodes.Arithmetic, state: State) -> Any:
         left, right = self._value(node.left, state), self._value(node.right, state)
         kind, operator = node.type, node.operator
-        if isinstance(kind, kinds.Floating):
+        if isinstance(kind, value_types.Floating):
             return _OF_FLOATS[operator](NEAREST, left, right)
-        assert isinstance(kind, kinds.Integer)  # noqa: S101  numbers that are calculated with are one of the two
+        assert isinstance(kind, value_types.Integer)  # noqa: S101  numbers that are calculated with are one of the two
         if operator in "/%":
             self._leave_to_python(state, right == 0)
             if operator == "/":
@@ -510,7 +512,7 @@ class Meaning:
 
     def _unary(self, node: nodes.Unary, state: State) -> Any:
         value = self._value(node.value, state)
-        if isinstance(node.type, kinds.Floating):
+        if isinstance(node.type, value_types.Floating):
             return z3.fpAbs(value) if node.operator == "abs" else z3.fpNeg(value)
         if node.operator == "~":
             result = ~value
@@ -518,7 +520,7 @@ class Meaning:
             result = -value
         else:
             result = z3.If(value < 0, -value, value) if is_signed(node.type) else value
-        return wrapped(result, node.type) if isinstance(node.type, kinds.Integer) else result
+        return wrapped(result, node.type) if isinstance(node.type, value_types.Integer) else result
 
     def _moment(self, node: nodes.Moment, state: State) -> Any:
         left, right = self._value(node.left, state), self._value(node.right, state)
@@ -542,13 +544,13 @@ class Meaning:
         return z3.Extract(63, 0, limited)
 
     def _limited(self, kind: Type, moment: Term, state: State) -> Term:
-        limits = (0, times.MAX_TIME) if kind == kinds.TIME else (times.MIN_DURATION, times.MAX_DURATION)
+        limits = (0, times.MAX_TIME) if kind == value_types.TIME else (times.MIN_DURATION, times.MAX_DURATION)
         self._leave_to_python(state, either(moment < limits[0], moment > limits[1]))
         return moment
 
     def _compare(self, node: nodes.Compare, state: State) -> Any:
         kind = node.left.type
-        if isinstance(kind, kinds.Vector | kinds.Record):
+        if isinstance(kind, value_types.Vector | value_types.Record):
             raise UnknownError(f"a comparison of values of type {kind}")
         left, right = self._value(node.left, state), self._value(node.right, state)
         return _compared(node.operator, left, right, kind)
@@ -600,7 +602,9 @@ class Meaning:
         last = self._beginning.throttles.get((self._function.context, node.site))
         if last is None:
             raise UnknownError("output at most so often")
-        seconds = self._converted(self._value(node.seconds, state), node.seconds.type, kinds.Floating(64))
+        seconds = self._converted(
+            self._value(node.seconds, state), node.seconds.type, value_types.Floating(64)
+        )
         more = z3.fpMul(NEAREST, seconds, floating(1e9, 64))
         until = z3.fpAdd(NEAREST, z3.fpSignedToFP(NEAREST, last, DOUBLE), more)
         # A whole number is below another if it is below the next whole one.
@@ -613,7 +617,7 @@ class Meaning:
 
     def _item(self, node: nodes.Item, state: State) -> Any:
         view = self._value(node.base, state)
-        if not isinstance(view, _View) or not isinstance(node.base.type, kinds.Record):
+        if not isinstance(view, _View) or not isinstance(node.base.type, value_types.Record):
             raise UnknownError("a part of a value")
         before = self._values.fields(node.base.type)[: node.number]
         return self._part(view, sum(map(self._size, before)), node.type)
@@ -621,17 +625,17 @@ class Meaning:
     def _part(self, view: _View, offset: Term | int, kind: Type) -> Any:
         """What stands so many bytes behind the beginning of a value."""
         start = view.start + offset
-        if isinstance(kind, kinds.Record):
+        if isinstance(kind, value_types.Record):
             return _View(view.message, start, integer(1, 64))
-        if isinstance(kind, kinds.Vector) and kind.length is not None:
+        if isinstance(kind, value_types.Vector) and kind.length is not None:
             return _View(view.message, start, integer(kind.length, 64))
         return self._number(view.message, z3.Extract(31, 0, start), kind)
 
     def _copy(self, node: nodes.Copy, state: State) -> Any:
         view, kind = self._value(node.value, state), node.type
-        if isinstance(kind, kinds.Vector) and struct_code(kind.element) is not None:
+        if isinstance(kind, value_types.Vector) and struct_code(kind.element) is not None:
             self._make(view.count * self._values.width(kind.element), state)
-        elif not isinstance(kind, kinds.Record) or any(
+        elif not isinstance(kind, value_types.Record) or any(
             not struct_code(field) for field in self._values.fields(kind)
         ):
             raise UnknownError(f"a copy of type {kind}")
@@ -642,32 +646,32 @@ class Meaning:
         if name in ("a_part",):
             return self._with_part(node, state)
         values = [self._value(argument, state) for argument in arguments]
-        kind = arguments[0].type if arguments else kinds.VOID
+        kind = arguments[0].type if arguments else value_types.VOID
         if name in _OF_VIEWS and isinstance(values[0], _View):
             return _OF_VIEWS[name](values[0].count)
-        if name == "l_element" and isinstance(values[0], _View) and isinstance(kind, kinds.Vector):
+        if name == "l_element" and isinstance(values[0], _View) and isinstance(kind, value_types.Vector):
             index = values[1]
             self._leave_to_python(state, z3.UGE(index, values[0].count))
             return self._part(values[0], index * self._size(kind.element), node.type)
-        rounded = name.removesuffix("f") if kind == kinds.Floating(32) else name
+        rounded = name.removesuffix("f") if kind == value_types.Floating(32) else name
         if (
-            isinstance(kind, kinds.Floating)
+            isinstance(kind, value_types.Floating)
             and rounded in _ROUNDED
             and (rounded != name) == (kind.bits == 32)
         ):
             return _ROUNDED[rounded](values[0])
-        if isinstance(kind, kinds.Floating) and name in _QUESTIONS:
+        if isinstance(kind, value_types.Floating) and name in _QUESTIONS:
             return _QUESTIONS[name](values[0])
         if name in ("h_min", "h_max"):
             return self._chosen(
                 _compared("<" if name == "h_min" else ">", values[1], values[0], kind), values
             )
-        if name in ("h_fmin", "h_fmax") and kind == kinds.Floating(64):
+        if name in ("h_fmin", "h_fmax") and kind == value_types.Floating(64):
             less = (z3.fpLT if name == "h_fmin" else z3.fpGT)(values[1], values[0])
             return self._chosen(either(z3.fpIsNaN(values[0]), less), values)
         if name in _OF_MOMENTS:
             value = _OF_MOMENTS[name](self, values[0])
-            if isinstance(node.type, kinds.Integer) and width(node.type) == 32:
+            if isinstance(node.type, value_types.Integer) and width(node.type) == 32:
                 return z3.Extract(31, 0, value)
             return value
         if name in ("k_after", "k_before"):
@@ -681,7 +685,7 @@ class Meaning:
         moment, part, new = node.arguments
         assert isinstance(part, nodes.Literal)  # noqa: S101  the name of a part
         old = self._value(moment, state)
-        value = self._converted(self._value(new, state), new.type, kinds.Integer(64, True, "long"))
+        value = self._converted(self._value(new, state), new.type, value_types.Integer(64, True, "long"))
         seconds, rest = self._parts(old)
         one, other = (value, rest) if part.value == b"sec" else (seconds, value)
         return self._of_parts(node.type, one, other, state)
@@ -718,9 +722,9 @@ class Meaning:
 
 def _compared(operator: str, left: Term, right: Term, kind: Type) -> Term:
     """A comparison of numbers, truths or times."""
-    if isinstance(kind, kinds.Bool) and operator not in ("==", "!="):
+    if isinstance(kind, value_types.Bool) and operator not in ("==", "!="):
         left, right = map(as_bits, (left, right))
-    if isinstance(kind, kinds.Floating):
+    if isinstance(kind, value_types.Floating):
         result: Term = _COMPARED_FLOATS[operator](left, right)
         return opposite(result) if operator == "!=" else result
     return (_COMPARED if is_signed(kind) else _COMPARED_UNSIGNED)[operator](left, right)

@@ -28,9 +28,9 @@ from typing import Any, NamedTuple
 from rosmop.fast.abi import FeedModule
 from rosmop.fast.wasm_runner import MESSAGE_FUEL, Prepared, Walker, Walks, walks_of
 from rosmop.form.compiled import Compiled, EventCode
-from rosmop.form.components import groups
 from rosmop.form.connected_groups import way_of
 from rosmop.form.positions import Finding, Position
+from rosmop.form.specification_groups import groups
 from rosmop.run.causes import NOBODY, Sender
 from rosmop.run.execution import Asked, Execution, OnFault
 from rosmop.run.monitor import Group, Monitor, Step, monitors_of
@@ -51,7 +51,7 @@ from rosmop.run.state import (
 from rosmop.run.state_of_runs import StateTooLargeError
 from rosmop.run.state_of_slices import SliceParts
 from rosmop.run.timers import Agenda, Patience
-from rosmop.runtime.context import TRIAL_BUDGET, Context
+from rosmop.runtime.action_context import TRIAL_BUDGET, Context
 from rosmop.runtime.wire import Buffer, Message
 from roswire.definitions import Definitions
 

@@ -26,7 +26,7 @@ from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import Handler, Monitor, RunningProperty, Step
 from rosmop.run.outcomes import DROPPED, Fault, Outcome, Verdict
 from rosmop.run.slices import Key, Slice, Slices
-from rosmop.runtime.context import FOLDED_NS, LogLine
+from rosmop.runtime.action_context import FOLDED_NS, LogLine
 from rosmop.runtime.wire import Buffer, Message
 
 OnFault = Literal["drop", "pass"]

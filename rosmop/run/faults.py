@@ -6,7 +6,7 @@ from rosmop.form.positions import Position
 from rosmop.form.sites import Site, showing
 from rosmop.run.interpreter import Failed, Interpreter
 from rosmop.run.outcomes import Fault
-from rosmop.runtime.context import FaultError, MalformedError
+from rosmop.runtime.action_context import FaultError, MalformedError
 
 
 def explain(error: Exception, interpreter: Interpreter, monitor: str, otherwise: Position) -> Fault:

@@ -26,12 +26,12 @@ from typing import Any
 from rosmop.form import nodes
 from rosmop.form.sites import Site
 from rosmop.runtime import formatting, numbers, strings, times, vectors, wire
-from rosmop.runtime.context import MAX_CALLS, Context, FaultError, Turn
-from rosmop.runtime.functions import CHARGING, FAULTING, FUNCTIONS
+from rosmop.runtime.action_context import MAX_CALLS, Context, FaultError, Turn
+from rosmop.runtime.builtin_functions import CHARGING, FAULTING, FUNCTIONS
 from rosmop.runtime.values import BILLION, Values, struct_code, struct_size
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
 from rosmop.types.messages import Messages
+from rosmop.types.value_types import Type
 from roswire.definitions import Definitions
 
 _FRAMES = 40_000  # of Python's: those of `MAX_CALLS` calls, each deep in expressions
@@ -630,10 +630,10 @@ class _Maker:
 
     def _arithmetic(self, node: nodes.Arithmetic) -> _Value:
         kind, sign, site = node.type, node.operator, node.site
-        if isinstance(kind, kinds.Floating):
+        if isinstance(kind, value_types.Floating):
             result = self._both(numbers.ratio if sign == "/" else _CALCULATED[sign], node.left, node.right)
             return self._then(result, numbers.f32 if kind.bits == 32 else None)
-        assert isinstance(kind, kinds.Integer)  # noqa: S101  the common type of two numbers
+        assert isinstance(kind, value_types.Integer)  # noqa: S101  the common type of two numbers
         last = kind.bits - 1
         calculate = {
             "/": lambda left, right: numbers.divide(left, right, site),
@@ -646,7 +646,7 @@ class _Maker:
 
     def _unary(self, node: nodes.Unary) -> _Value:
         result = self._then(self.value(node.value), _CALCULATED_OF_ONE[node.operator])
-        return self._then(result, wrapping(node.type) if isinstance(node.type, kinds.Integer) else None)
+        return self._then(result, wrapping(node.type) if isinstance(node.type, value_types.Integer) else None)
 
     def _moment(self, node: nodes.Moment) -> _Value:
         result = self._both(_CALCULATED[node.operator], node.left, node.right)
@@ -660,7 +660,7 @@ class _Maker:
 
     def _compare(self, node: nodes.Compare) -> _Value:
         kind, compare = node.left.type, _CALCULATED[node.operator]
-        if not isinstance(kind, kinds.Vector | kinds.Record):
+        if not isinstance(kind, value_types.Vector | value_types.Record):
             return self._both(compare, node.left, node.right)
         left, right, measure = self.value(node.left), self.value(node.right), self._values.measure(kind)
         context, site = self._context, node.site
@@ -705,7 +705,7 @@ class _Maker:
 
     def _vector(self, node: nodes.Vector) -> _Value:
         items = [self.value(item) for item in node.items]
-        zeros: Callable[[], list[Any]] = self._values.maker(kinds.Vector(node.type.element, node.zeros))
+        zeros: Callable[[], list[Any]] = self._values.maker(value_types.Vector(node.type.element, node.zeros))
         return lambda v: [item(v) for item in items] + zeros()
 
     def _zero(self, node: nodes.Zero) -> _Value:
@@ -714,7 +714,11 @@ class _Maker:
 
     def _copy(self, node: nodes.Copy) -> _Value:
         value = self.value(node.value)
-        return value if kinds.is_scalar(node.type) else self._then(value, self._copier(node.type, node.site))
+        return (
+            value
+            if value_types.is_scalar(node.type)
+            else self._then(value, self._copier(node.type, node.site))
+        )
 
     def _copier(self, kind: Type, site: int) -> Callable[[Any], Any]:
         context, copy = self._context, self._values.copier(kind)
@@ -747,10 +751,10 @@ class _Maker:
         return lambda v: function(*[argument(v) for argument in arguments], *after)
 
     def _accumulate(self, node: nodes.Accumulate) -> _Value:
-        assert isinstance(node.vector.type, kinds.Vector)  # noqa: S101  of which there are sums
+        assert isinstance(node.vector.type, value_types.Vector)  # noqa: S101  of which there are sums
         context, site, wide = self._context, node.site, node.wide
         widened, added = _converting(node.type, wide), _converting(node.vector.type.element, wide)
-        wrapped = wrapping(wide) if isinstance(wide, kinds.Integer) else float
+        wrapped = wrapping(wide) if isinstance(wide, value_types.Integer) else float
         narrowed = _converting(wide, node.type)
         parts = [self.value(part) for part in (node.vector, node.first, node.last, node.start)]
 
@@ -829,19 +833,19 @@ def conversion(  # noqa: PLR0911  one for each kind
     """Makes a number of one type one of another; None where it is that."""
     if source == target:
         return None
-    if isinstance(target, kinds.Bool):
+    if isinstance(target, value_types.Bool):
         return bool
-    if isinstance(target, kinds.Floating):
+    if isinstance(target, value_types.Floating):
         if target.bits == 64:
             return float
-        return numbers.f32_of_integer if isinstance(source, kinds.Integer) else numbers.f32
-    assert isinstance(target, kinds.Integer)  # noqa: S101  numbers are one of the three
-    if isinstance(source, kinds.Floating):
+        return numbers.f32_of_integer if isinstance(source, value_types.Integer) else numbers.f32
+    assert isinstance(target, value_types.Integer)  # noqa: S101  numbers are one of the three
+    if isinstance(source, value_types.Floating):
         least, most = target.least, target.most
         return lambda value: numbers.truncate(value, least, most)
-    if isinstance(source, kinds.Bool):
+    if isinstance(source, value_types.Bool):
         return int
-    assert isinstance(source, kinds.Integer)  # noqa: S101  as above
+    assert isinstance(source, value_types.Integer)  # noqa: S101  as above
     return None if target.holds(source) else wrapping(target)
 
 
@@ -849,25 +853,25 @@ def _converting(source: Type, target: Type) -> Callable[[Any], Any]:
     return conversion(source, target) or (lambda value: value)
 
 
-def wrapping(kind: kinds.Integer) -> Callable[[int], int]:
+def wrapping(kind: value_types.Integer) -> Callable[[int], int]:
     """Wraps an integer that may have overflowed into its type."""
     mask, half = (1 << kind.bits) - 1, 1 << (kind.bits - 1) if kind.signed else 0
     return lambda value: (value + half & mask) - half
 
 
 def _limited(kind: Type, site: int) -> Callable[[int], int]:
-    limit = times.time if kind == kinds.TIME else times.duration
+    limit = times.time if kind == value_types.TIME else times.duration
     return lambda nanoseconds: limit(nanoseconds, site)
 
 
 def _recast(context: Context, values: list[Any], element: Type, site: int) -> list[Any]:
-    if isinstance(element, kinds.Vector):
+    if isinstance(element, value_types.Vector):
         inner = partial(_recast, context, element=element.element, site=site)
         return vectors.recast_each(context, values, inner, site)
-    signed = isinstance(element, kinds.Integer) and element.signed
+    signed = isinstance(element, value_types.Integer) and element.signed
     to_bytes = vectors.signed if signed else vectors.unsigned
     return vectors.recast(
-        context, values, vectors.truths if isinstance(element, kinds.Bool) else to_bytes, site
+        context, values, vectors.truths if isinstance(element, value_types.Bool) else to_bytes, site
     )
 
 

@@ -14,7 +14,7 @@ from rosmop.run.explain import TRAIL, Bound, Exits, Steps, history_of
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.slice_quota import HolderOf
 from rosmop.run.slices import Slice, Slices
-from rosmop.runtime.context import Context
+from rosmop.runtime.action_context import Context
 from rosmop.runtime.wire import Message
 
 FAILING_AFTER = 10

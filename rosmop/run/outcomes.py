@@ -9,7 +9,7 @@ from rosmop.form.positions import Position
 from rosmop.form.sites import Site, showing
 from rosmop.logics.interface import Source
 from rosmop.run.causes import Explanation
-from rosmop.runtime.context import LogLine, Published
+from rosmop.runtime.action_context import LogLine, Published
 from rosmop.runtime.wire import Buffer
 
 Result = Literal["passed", "changed", "dropped"]

@@ -48,8 +48,8 @@ from rosmop.logics.interface import (
     Run,
 )
 from rosmop.run.slice_quota import Holder, HolderOf, Quota
-from rosmop.runtime.context import FOLDED_NS
-from rosmop.types import kinds
+from rosmop.runtime.action_context import FOLDED_NS
+from rosmop.types import value_types
 
 LIMIT = 100_000
 """Slices of one specification, unless it is set otherwise."""
@@ -151,7 +151,7 @@ class Slices:
         self._own = code.slicing.own
         self._forgets = not code.slicing.enforces
         self._timed = any(one.timed for one in properties)
-        self._floating = any(isinstance(kind, kinds.Floating) for _, _, kind in self._parameters)
+        self._floating = any(isinstance(kind, value_types.Floating) for _, _, kind in self._parameters)
         self._first: Slice
         self._holder: Holder = None
         self._now = 0

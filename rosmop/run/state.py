@@ -25,8 +25,8 @@ from rosmop.run.monitor import CellNames, Monitor
 from rosmop.run.state_of_runs import StateTooLargeError, kept, run_of
 from rosmop.run.state_of_slices import KeptPart, KeptSlice, restore_slices
 from rosmop.runtime.values import Values
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 
 MOST_BYTES = 64 << 10
 """Bytes of a group's state, without slices. It is written with each batch that changes it."""
@@ -208,26 +208,26 @@ def restore(
 
 _HELD: Mapping[type, type | tuple[type, ...]] = MappingProxyType(
     {
-        kinds.Bool: bool,
-        kinds.Integer: int,
-        kinds.Time: int,
-        kinds.Duration: int,
-        kinds.Floating: (float, int),
-        kinds.String: bytes,
-        kinds.Characters: bytes,
+        value_types.Bool: bool,
+        value_types.Integer: int,
+        value_types.Time: int,
+        value_types.Duration: int,
+        value_types.Floating: (float, int),
+        value_types.String: bytes,
+        value_types.Characters: bytes,
     }
 )
 
 
 def _fits(known: Values, kind: Type, value: Any) -> bool:
     """Whether a value is one of a type, as variables hold it."""
-    if isinstance(kind, kinds.Vector):
+    if isinstance(kind, value_types.Vector):
         return (
             isinstance(value, list)
             and kind.length in (None, len(value))
             and all(_fits(known, kind.element, one) for one in value)
         )
-    if isinstance(kind, kinds.Record):
+    if isinstance(kind, value_types.Record):
         parts = known.fields(kind)
         return (
             isinstance(value, list)
@@ -266,7 +266,8 @@ def guards(compiled: Compiled) -> frozenset[str]:
             ):
                 acting.add(function.context)
             elif isinstance(node, nodes.Assign) or (
-                isinstance(node, nodes.Read) and isinstance(node.type, kinds.Vector | kinds.Record)
+                isinstance(node, nodes.Read)
+                and isinstance(node.type, value_types.Vector | value_types.Record)
             ):  # what a vector or message holds may change in place
                 used.add(node.name)
     return frozenset(

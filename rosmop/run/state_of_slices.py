@@ -12,7 +12,7 @@ import msgspec
 from rosmop.form.compiled import SpecificationCode
 from rosmop.run.slices import Binding, Slice, Slices, of_nan
 from rosmop.run.state_of_runs import StateTooLargeError, kept, run_of
-from rosmop.types.kinds import Type
+from rosmop.types.value_types import Type
 
 BUCKETS = 128
 

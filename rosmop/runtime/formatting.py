@@ -1,6 +1,6 @@
 """Values as text, as C++ prints them."""
 
-from rosmop.runtime.context import Context, FaultError
+from rosmop.runtime.action_context import Context, FaultError
 
 MAX_PRECISION = 100
 _LONG = 1024  # bytes; a shorter text is not charged before it is made

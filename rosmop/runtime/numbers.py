@@ -6,7 +6,7 @@ import struct
 from collections.abc import Callable
 from fractions import Fraction
 
-from rosmop.runtime.context import FaultError
+from rosmop.runtime.action_context import FaultError
 
 _F32 = struct.Struct("<f")
 _EXACT = 1 << 53

@@ -3,7 +3,7 @@
 import math
 import re
 
-from rosmop.runtime.context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
+from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
 from rosmop.runtime.numbers import f32
 
 NOT_FOUND = (1 << 64) - 1

@@ -2,7 +2,7 @@
 
 import math
 
-from rosmop.runtime.context import FaultError
+from rosmop.runtime.action_context import FaultError
 
 BILLION = 1_000_000_000
 MAX_TIME = (1 << 32) * BILLION - 1

@@ -10,10 +10,10 @@ from itertools import groupby
 from typing import Any
 
 from rosmop.runtime import vectors, wire
-from rosmop.runtime.context import Context
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.runtime.action_context import Context
+from rosmop.types import value_types
 from rosmop.types.messages import Messages
+from rosmop.types.value_types import Type
 
 _CODES = {
     (True, 8): "b",
@@ -25,17 +25,17 @@ _CODES = {
     (True, 64): "q",
     (False, 64): "Q",
 }
-_MOMENTS: dict[Type, str] = {kinds.TIME: "II", kinds.DURATION: "ii"}
+_MOMENTS: dict[Type, str] = {value_types.TIME: "II", value_types.DURATION: "ii"}
 BILLION = 1_000_000_000
 
 
 def struct_code(kind: Type) -> str | None:
     """The `struct` code of a type of fixed size (of times two: seconds and nanoseconds), None for others."""
-    if isinstance(kind, kinds.Bool):
+    if isinstance(kind, value_types.Bool):
         return "?"
-    if isinstance(kind, kinds.Integer):
+    if isinstance(kind, value_types.Integer):
         return _CODES[kind.signed, kind.bits]
-    if isinstance(kind, kinds.Floating):
+    if isinstance(kind, value_types.Floating):
         return "f" if kind.bits == 32 else "d"
     return _MOMENTS.get(kind)
 
@@ -59,7 +59,7 @@ class Values:
             self._made[make, kind] = make(self, kind)
         return self._made[make, kind]
 
-    def fields(self, kind: kinds.Record) -> list[Type]:
+    def fields(self, kind: value_types.Record) -> list[Type]:
         """The types of a message's fields, in order."""
         return [slot.type for slot in self._messages.slots(kind.name).values()]
 
@@ -67,22 +67,28 @@ class Values:
 
     def width(self, kind: Type) -> int:
         """The bytes that C++ takes for a value (without what a string or vector in it points to)."""
-        if isinstance(kind, kinds.Integer | kinds.Floating):
+        if isinstance(kind, value_types.Integer | value_types.Floating):
             return kind.bits // 8
-        if isinstance(kind, kinds.Record):
+        if isinstance(kind, value_types.Record):
             return sum(map(self.width, self.fields(kind))) or 1
-        if isinstance(kind, kinds.Vector) and kind.length is not None:
+        if isinstance(kind, value_types.Vector) and kind.length is not None:
             return kind.length * self.width(kind.element)
-        return 1 if isinstance(kind, kinds.Bool) else 8 if kind in (kinds.TIME, kinds.DURATION) else 32
+        return (
+            1
+            if isinstance(kind, value_types.Bool)
+            else 8
+            if kind in (value_types.TIME, value_types.DURATION)
+            else 32
+        )
 
     def least(self, kind: Type) -> int:
         """The bytes of the shortest value in a message."""
         code = struct_code(kind)
         if code is not None:
             return struct_size(code)
-        if isinstance(kind, kinds.Record):
+        if isinstance(kind, value_types.Record):
             return self._messages.definitions.layout(kind.name).minimum
-        if isinstance(kind, kinds.Vector) and kind.length is not None:
+        if isinstance(kind, value_types.Vector) and kind.length is not None:
             return kind.length * self.least(kind.element)
         return 4
 
@@ -91,14 +97,14 @@ class Values:
         return self._once(Values._measure, kind)
 
     def _measure(self, kind: Type) -> Callable[[Any], int]:
-        if isinstance(kind, kinds.String | kinds.Characters):
+        if isinstance(kind, value_types.String | value_types.Characters):
             return len
-        if isinstance(kind, kinds.Vector):
+        if isinstance(kind, value_types.Vector):
             width, inner = self.width(kind.element), self.measure(kind.element)
             if struct_code(kind.element):
                 return lambda values: len(values) * width
             return lambda values: len(values) * width + sum(map(inner, values))
-        if isinstance(kind, kinds.Record):
+        if isinstance(kind, value_types.Record):
             large = [
                 (index, self.measure(field))
                 for index, field in enumerate(self.fields(kind))
@@ -115,10 +121,10 @@ class Values:
         return self._once(Values._maker, kind)
 
     def _maker(self, kind: Type) -> Callable[[], Any]:
-        if isinstance(kind, kinds.Vector):
+        if isinstance(kind, value_types.Vector):
             make, length, element = self.maker(kind.element), kind.length or 0, zero_of(kind.element)
             return lambda: [make() for _ in range(length)] if element is None else [element] * length
-        if isinstance(kind, kinds.Record):
+        if isinstance(kind, value_types.Record):
             makers = [self.maker(field) for field in self.fields(kind)]
             return lambda: [make() for make in makers]
         zero = zero_of(kind)
@@ -129,16 +135,18 @@ class Values:
         return self._once(Values._copier, kind)
 
     def _copier(self, kind: Type) -> Callable[[Context, Any, int], Any]:
-        if isinstance(kind, kinds.Record):
-            copies = [None if kinds.is_scalar(field) else self.copier(field) for field in self.fields(kind)]
+        if isinstance(kind, value_types.Record):
+            copies = [
+                None if value_types.is_scalar(field) else self.copier(field) for field in self.fields(kind)
+            ]
             return lambda context, record, site: [
                 part if copy is None else copy(context, part, site)
                 for copy, part in zip(copies, record, strict=True)
             ]
-        if not isinstance(kind, kinds.Vector):
+        if not isinstance(kind, value_types.Vector):
             return lambda _context, value, _site: value
         width, element = self.width(kind.element), self.copier(kind.element)
-        if kinds.is_scalar(kind.element):
+        if value_types.is_scalar(kind.element):
             return lambda context, values, site: vectors.copied(context, values, width, site)
         return lambda context, values, site: vectors.copied_deep(context, values, width, element, site)
 
@@ -146,12 +154,12 @@ class Values:
 
     def decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
         """A function that finds the value at a position, and where it ends."""
-        return wire.text if isinstance(kind, kinds.String) else self._once(Values._decoder, kind)
+        return wire.text if isinstance(kind, value_types.String) else self._once(Values._decoder, kind)
 
     def _decoder(self, kind: Type) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
-        if isinstance(kind, kinds.Vector):
+        if isinstance(kind, value_types.Vector):
             return self._decoder_of_vectors(kind)
-        if not isinstance(kind, kinds.Record):
+        if not isinstance(kind, value_types.Record):
             numbers = unpacker([struct_code(kind) or ""])
 
             def number(buffer: wire.Buffer, start: int) -> tuple[Any, int]:
@@ -178,7 +186,7 @@ class Values:
 
         return record
 
-    def _decoder_of_vectors(self, kind: kinds.Vector) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
+    def _decoder_of_vectors(self, kind: value_types.Vector) -> Callable[[wire.Buffer, int], tuple[Any, int]]:
         code, least, element = struct_code(kind.element), self.least(kind.element), kind.element
         decode: Callable[[wire.Buffer, int, int], tuple[Any, int]]
         if code is None:
@@ -194,12 +202,12 @@ class Values:
 
     def encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
         """A function that appends the bytes of a value."""
-        return wire.put_text if isinstance(kind, kinds.String) else self._once(Values._encoder, kind)
+        return wire.put_text if isinstance(kind, value_types.String) else self._once(Values._encoder, kind)
 
     def _encoder(self, kind: Type) -> Callable[[Any, bytearray], None]:
-        if isinstance(kind, kinds.Vector):
+        if isinstance(kind, value_types.Vector):
             return self._encoder_of_vectors(kind)
-        if not isinstance(kind, kinds.Record):
+        if not isinstance(kind, value_types.Record):
             pack_one = packer([struct_code(kind) or ""])
             return lambda value, out: out.extend(pack_one((value,)))
         parts: list[tuple[int, int, Any, Any]] = []
@@ -218,7 +226,7 @@ class Values:
 
         return record
 
-    def _encoder_of_vectors(self, kind: kinds.Vector) -> Callable[[Any, bytearray], None]:
+    def _encoder_of_vectors(self, kind: value_types.Vector) -> Callable[[Any, bytearray], None]:
         code, length = struct_code(kind.element) or "", kind.length
         encode = None if code else self.encoder(kind.element)
 
@@ -237,7 +245,7 @@ class Values:
 
         return vector
 
-    def _runs(self, kind: kinds.Record) -> Iterator[tuple[bool, list[Type]]]:
+    def _runs(self, kind: value_types.Record) -> Iterator[tuple[bool, list[Type]]]:
         """The fields in groups: numbers that follow each other, or one field of another kind."""
         for fixed, run in groupby(self.fields(kind), lambda field: struct_code(field) is not None):
             if fixed:
@@ -248,13 +256,13 @@ class Values:
 
 def zero_of(kind: Type) -> bool | float | bytes | None:
     """The zero of a type whose values do not change; None of void."""
-    if isinstance(kind, kinds.Bool):
+    if isinstance(kind, value_types.Bool):
         return False
-    if isinstance(kind, kinds.Floating):
+    if isinstance(kind, value_types.Floating):
         return 0.0
-    if isinstance(kind, kinds.Integer | kinds.Time | kinds.Duration):
+    if isinstance(kind, value_types.Integer | value_types.Time | value_types.Duration):
         return 0
-    return b"" if isinstance(kind, kinds.String | kinds.Characters) else None
+    return b"" if isinstance(kind, value_types.String | value_types.Characters) else None
 
 
 def unpacker(codes: Sequence[str]) -> Callable[[wire.Buffer, int], tuple[Sequence[Any], int]]:

@@ -6,7 +6,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from rosmop.runtime.context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
+from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, PART, Context, FaultError
 
 Values = list[Any]
 

@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rosmop.runtime.context import PART, Context, MalformedError
+from rosmop.runtime.action_context import PART, Context, MalformedError
 from rosmop.runtime.times import with_part
 
 Buffer = bytes | bytearray | memoryview

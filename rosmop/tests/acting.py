@@ -12,7 +12,7 @@ from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
 from rosmop.run.outcomes import Outcome
 from rosmop.run.timers import Patience
-from rosmop.runtime.context import BUDGET
+from rosmop.runtime.action_context import BUDGET
 from rosmop.text.errors import SpecificationError
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions

@@ -10,7 +10,7 @@ from rosmop.check.standard_functions import LIBRARY
 from rosmop.check.string_members import TEXT_METHODS
 from rosmop.check.time_members import MOMENT_METHODS
 from rosmop.check.vector_members import VECTOR_METHODS
-from rosmop.runtime.context import BUDGET, MAX_BYTES, MAX_CALLS
+from rosmop.runtime.action_context import BUDGET, MAX_BYTES, MAX_CALLS
 from rosmop.runtime.numbers import MATH
 from rosmop.tests.acting import load
 from rosmop.text.parser import MAX_CHARACTERS, MAX_DEPTH

@@ -6,7 +6,7 @@ import tracemalloc
 import pytest
 
 from rosmop.run.engine import MonitorSet
-from rosmop.runtime.context import BUDGET as BUDGET_SIZE
+from rosmop.runtime.action_context import BUDGET as BUDGET_SIZE
 from rosmop.tests.acting import act, definitions, load, message, refused, refused_action
 from rosmop.text.errors import SpecificationError
 

@@ -17,7 +17,7 @@ from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
+from rosmop.types import value_types
 from rosmop.types.messages import Messages as MessageTypes
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
@@ -89,22 +89,22 @@ def shipped() -> MonitorSet:
     return MonitorSet.load(sources, standard_definitions().extended(own))
 
 
-def a_value(values: Values, kind: kinds.Type) -> st.SearchStrategy[Any]:
+def a_value(values: Values, kind: value_types.Type) -> st.SearchStrategy[Any]:
     """Any value of a type."""
-    if isinstance(kind, kinds.Record):
+    if isinstance(kind, value_types.Record):
         return st.tuples(*(a_value(values, field) for field in values.fields(kind))).map(list)
-    if isinstance(kind, kinds.Vector):
+    if isinstance(kind, value_types.Vector):
         most = 4 if kind.length is None else kind.length
         return st.lists(a_value(values, kind.element), min_size=kind.length or 0, max_size=most)
-    if isinstance(kind, kinds.Integer):
+    if isinstance(kind, value_types.Integer):
         return st.integers(kind.least, kind.most)
-    known: dict[kinds.Type, st.SearchStrategy[Any]] = {
-        kinds.BOOL: st.booleans(),
-        kinds.STRING: st.sampled_from([b"turret_tilt", b"turret_pan", b"", b"x"]),
-        kinds.FLOAT: st.floats(width=32),
-        kinds.DOUBLE: st.floats() | st.floats(-2, 2),
-        kinds.TIME: st.integers(0, 1 << 40),
-        kinds.DURATION: st.integers(-(1 << 40), 1 << 40),
+    known: dict[value_types.Type, st.SearchStrategy[Any]] = {
+        value_types.BOOL: st.booleans(),
+        value_types.STRING: st.sampled_from([b"turret_tilt", b"turret_pan", b"", b"x"]),
+        value_types.FLOAT: st.floats(width=32),
+        value_types.DOUBLE: st.floats() | st.floats(-2, 2),
+        value_types.TIME: st.integers(0, 1 << 40),
+        value_types.DURATION: st.integers(-(1 << 40), 1 << 40),
     }
     return known[kind]
 
@@ -117,7 +117,7 @@ def test_shipped_specifications(data: st.DataObject) -> None:
     values = Values(MessageTypes(monitors.definitions))
     traffic = []
     for topic in data.draw(st.lists(st.sampled_from(sorted(monitors.topics)), min_size=1, max_size=12)):
-        kind = kinds.Record(monitors.topics[topic])
+        kind = value_types.Record(monitors.topics[topic])
         body = bytearray()
         values.encoder(kind)(data.draw(a_value(values, kind)), body)
         end = data.draw(st.just(len(body)) | st.integers(0, len(body)))

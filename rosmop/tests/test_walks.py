@@ -13,14 +13,14 @@ from rosmop.fast import wasm_runner
 from rosmop.fast.abi import AREA
 from rosmop.fast.batch_codegen import MAX_EFFECTS
 from rosmop.fast.codegen_access import MOST_TEXTS
-from rosmop.fast.layout import LINES
+from rosmop.fast.memory_layout import LINES
 from rosmop.fast.wasm_runner import BEGINNING, Walker
 from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.causes import Sender
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
 from rosmop.run.outcomes import Outcome, Verdict, named
-from rosmop.runtime.context import LogLine, Published
+from rosmop.runtime.action_context import LogLine, Published
 from rosmop.runtime.wire import Buffer
 from rosmop.tests.acting import message
 from rosmop.tests.examples import examples

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from itertools import islice
 from types import MappingProxyType
 
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
+from rosmop.types.value_types import Type
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_text import Constant, Field, MessageDefinition
@@ -19,22 +19,22 @@ _COMPARED = 600  # names that a wrong one is compared with
 
 PRIMITIVES: Mapping[str, Type] = MappingProxyType(
     {
-        "bool": kinds.BOOL,
-        "int8": kinds.INT8,
-        "byte": kinds.INT8,
-        "uint8": kinds.UINT8,
-        "char": kinds.UINT8,
-        "int16": kinds.INT16,
-        "uint16": kinds.UINT16,
-        "int32": kinds.INT,
-        "uint32": kinds.UINT,
-        "int64": kinds.LONG,
-        "uint64": kinds.ULONG,
-        "float32": kinds.FLOAT,
-        "float64": kinds.DOUBLE,
-        "string": kinds.STRING,
-        "time": kinds.TIME,
-        "duration": kinds.DURATION,
+        "bool": value_types.BOOL,
+        "int8": value_types.INT8,
+        "byte": value_types.INT8,
+        "uint8": value_types.UINT8,
+        "char": value_types.UINT8,
+        "int16": value_types.INT16,
+        "uint16": value_types.UINT16,
+        "int32": value_types.INT,
+        "uint32": value_types.UINT,
+        "int64": value_types.LONG,
+        "uint64": value_types.ULONG,
+        "float32": value_types.FLOAT,
+        "float64": value_types.DOUBLE,
+        "string": value_types.STRING,
+        "time": value_types.TIME,
+        "duration": value_types.DURATION,
     }
 )
 
@@ -110,7 +110,7 @@ class Messages:
                 for slot in self.slots(record).values():
                     if slot.name == field and prefix:
                         found.append(f"{prefix}{slot.name}")
-                    if isinstance(slot.type, kinds.Record):
+                    if isinstance(slot.type, value_types.Record):
                         below.append((f"{prefix}{slot.name}.", slot.type.name))
             if found:
                 return found
@@ -120,8 +120,8 @@ class Messages:
 
 def field_type(field: Field) -> Type:
     """The type of a field's value."""
-    element = PRIMITIVES.get(field.type) or kinds.Record(field.type)
-    return kinds.Vector(element, field.length) if field.is_array else element
+    element = PRIMITIVES.get(field.type) or value_types.Record(field.type)
+    return value_types.Vector(element, field.length) if field.is_array else element
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

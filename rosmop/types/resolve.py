@@ -4,25 +4,35 @@ from rosmop.form.positions import Position
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
 from rosmop.text.foreign import instead
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
 from rosmop.types.messages import Messages, UnknownNameError, nearest
+from rosmop.types.value_types import Type
 
-_SIGNED = {"char": kinds.CHAR, "short": kinds.INT16, "int": kinds.INT, "long": kinds.LONG}
-_UNSIGNED = {"char": kinds.UINT8, "short": kinds.UINT16, "int": kinds.UINT, "long": kinds.ULONG}
+_SIGNED = {
+    "char": value_types.CHAR,
+    "short": value_types.INT16,
+    "int": value_types.INT,
+    "long": value_types.LONG,
+}
+_UNSIGNED = {
+    "char": value_types.UINT8,
+    "short": value_types.UINT16,
+    "int": value_types.UINT,
+    "long": value_types.ULONG,
+}
 _NAMED: dict[tuple[str, ...], Type] = {
-    ("string",): kinds.STRING,
-    ("ros", "Time"): kinds.TIME,
-    ("ros", "Duration"): kinds.DURATION,
-    ("size_t",): kinds.ULONG,
-    ("int8_t",): kinds.INT8,
-    ("uint8_t",): kinds.UINT8,
-    ("int16_t",): kinds.INT16,
-    ("uint16_t",): kinds.UINT16,
-    ("int32_t",): kinds.INT,
-    ("uint32_t",): kinds.UINT,
-    ("int64_t",): kinds.LONG,
-    ("uint64_t",): kinds.ULONG,
+    ("string",): value_types.STRING,
+    ("ros", "Time"): value_types.TIME,
+    ("ros", "Duration"): value_types.DURATION,
+    ("size_t",): value_types.ULONG,
+    ("int8_t",): value_types.INT8,
+    ("uint8_t",): value_types.UINT8,
+    ("int16_t",): value_types.INT16,
+    ("uint16_t",): value_types.UINT16,
+    ("int32_t",): value_types.INT,
+    ("uint32_t",): value_types.UINT,
+    ("int64_t",): value_types.LONG,
+    ("uint64_t",): value_types.ULONG,
 }
 _CPP_NAMES = {  # of the types of fields, as .msg files name them
     **{f"{sign}int{bits}": f"{sign}int{bits}_t" for sign in ("", "u") for bits in (8, 16, 32, 64)},
@@ -44,27 +54,27 @@ def resolve(name: tree.TypeName, messages: Messages) -> Type:
     """The type that a name of the text stands for (`auto` is not one); raises `SpecificationError`."""
     if name.element is not None:
         element = resolve(name.element, messages)
-        if element in (kinds.VOID, kinds.CHARACTERS):
+        if element in (value_types.VOID, value_types.CHARACTERS):
             raise SpecificationError.at(name.position, f"there are no vectors of {element}")
-        return kinds.Vector(element)
+        return value_types.Vector(element)
     built_in = _built_in(name)
     if name.pointer:
-        if built_in != kinds.CHAR:
+        if built_in != value_types.CHAR:
             raise SpecificationError.at(
                 name.position, f"there are no pointers but `char *`; write `{' '.join(name.name)}`"
             )
-        return kinds.CHARACTERS
+        return value_types.CHARACTERS
     return built_in or named_type(name.name) or _message(name, messages)
 
 
 def _built_in(name: tree.TypeName) -> Type | None:
     words = list(name.name)
     if words == ["void"]:
-        return kinds.VOID
+        return value_types.VOID
     if words == ["bool"]:
-        return kinds.BOOL
+        return value_types.BOOL
     if words in (["float"], ["double"], ["long", "double"]):
-        return kinds.FLOAT if words == ["float"] else kinds.DOUBLE
+        return value_types.FLOAT if words == ["float"] else value_types.DOUBLE
     if not set(words) <= {"char", "short", "int", "long", "signed", "unsigned"}:
         if len(words) > 1 and words[0] in ("unsigned", "signed", "long", "short"):
             raise SpecificationError.at(name.position, f"`{' '.join(words)}` is no type")
@@ -76,7 +86,7 @@ def _built_in(name: tree.TypeName) -> Type | None:
     if sizes not in known or too_many:
         raise SpecificationError.at(name.position, f"`{' '.join(words)}` is no type")
     if words == ["signed", "char"]:
-        return kinds.INT8
+        return value_types.INT8
     table = _UNSIGNED if signs == ["unsigned"] else _SIGNED
     return table[sizes[0] if sizes else "int"]
 
@@ -107,7 +117,7 @@ def _meant(parts: tuple[str, ...], messages: Messages) -> str:
     return hint if "did you mean" in hint else "; write a C++ type or a message type `package::Type`"
 
 
-def record(position: Position, name: str, messages: Messages) -> kinds.Record:
+def record(position: Position, name: str, messages: Messages) -> value_types.Record:
     """The message type of this name; raises `SpecificationError`."""
     try:
         messages.definition(name)
@@ -115,4 +125,4 @@ def record(position: Position, name: str, messages: Messages) -> kinds.Record:
         told = instead(name.split("/")) if name not in messages.definitions.message_types else None
         text = f"there is no `{name.replace('/', '::')}`; {told}" if told else str(error)
         raise SpecificationError.at(position, text) from None
-    return kinds.Record(name)
+    return value_types.Record(name)

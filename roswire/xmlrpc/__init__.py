@@ -7,10 +7,10 @@ decided on, and written afresh (`writer`).
 from dataclasses import dataclass
 
 from roswire.errors import LimitExceededError, PeerError, ProtocolError
-from roswire.xmlrpc.reader import Document
-from roswire.xmlrpc.usual import usual_answer, usual_call
-from roswire.xmlrpc.values import DEFAULT_LIMITS, Limits, Value
-from roswire.xmlrpc.writer import build_call, build_fault, build_response
+from roswire.xmlrpc.fast_path import usual_answer, usual_call
+from roswire.xmlrpc.xmlrpc_reader import Document
+from roswire.xmlrpc.xmlrpc_values import DEFAULT_LIMITS, Limits, Value
+from roswire.xmlrpc.xmlrpc_writer import build_call, build_fault, build_response
 
 __all__ = [
     "DEFAULT_LIMITS",

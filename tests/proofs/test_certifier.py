@@ -8,7 +8,7 @@ from random import Random
 
 import pytest
 
-from rosmop.certify import text
+from rosmop.certify import formula_reader
 from rosmop.certify.check import Tables, Verdicts, certify
 from rosmop.certify.machines import Machine
 from rosmop.tests.certify.test_certify import broken, properties, tables_of
@@ -58,7 +58,7 @@ def _automaton(events: list[str], tables: Tables, verdict: Callable[[Verdicts], 
     return _numbers(len(events), tables.initial, len(tables.table), *rows, *verdicts)
 
 
-def _written(node: text.Node, events: list[str]) -> str:
+def _written(node: formula_reader.Node, events: list[str]) -> str:
     """Operator first; a power as often as it says."""
     kind = str(node[0])
     if kind == "event":
@@ -70,13 +70,13 @@ def _written(node: text.Node, events: list[str]) -> str:
 
 
 def _past(formula: str, events: list[str], tables: Tables) -> str:
-    read = text.formula(formula, events, text.PTLTL)
+    read = formula_reader.formula(formula, events, formula_reader.PTLTL)
     return f"{_automaton(events, tables, (('violation',), ('validation',)).index)} {_written(read, events)}"
 
 
 def _expression(formula: str, events: list[str], tables: Tables) -> str:
     automaton = _automaton(events, tables, ((), ("match",), ("fail",)).index)
-    return f"{automaton} ere {_written(text.expression(formula, events), events)}"
+    return f"{automaton} ere {_written(formula_reader.expression(formula, events), events)}"
 
 
 def _machine(formula: str, events: list[str], tables: Tables) -> str:

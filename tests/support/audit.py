@@ -6,7 +6,7 @@ from typing import Any
 
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Record, RuleReference
-from appliance.audit_trail import AuditTrail
+from appliance.telemetry.audit_trail import AuditTrail
 
 
 class HeardTrail(AuditTrail):

@@ -11,30 +11,30 @@ import itertools
 from collections.abc import Iterable
 from typing import Any, Self, cast
 
-from appliance import config
+from appliance.configuration import settings
 from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.endpoints.endpoint_addresses import Places
+from appliance.master.endpoints.node_api import NodeApi
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.endpoints.traffic import Carried
 from appliance.master.graph.effects import Effect, NodeCall
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry, new_key
 from appliance.master.graph.revocation import Revocation, revoked
-from appliance.master.reach.node_api import NodeApi
-from appliance.master.reach.places import Places
-from appliance.master.reach.relays import RelayControl
-from appliance.master.reach.traffic import Carried
+from appliance.master.reconcile.enactor import Enactor
+from appliance.master.reconcile.entries import Entries
+from appliance.master.reconcile.liveness import Liveness, Watchlist
+from appliance.master.reconcile.reconciler import Reconciler
 from appliance.master.rosmaster import RosMaster
-from appliance.master.upkeep.enactor import Enactor
-from appliance.master.upkeep.entries import Entries
-from appliance.master.upkeep.liveness import Liveness, Watchlist
-from appliance.master.upkeep.reconcile import Reconciler
-from appliance.metrics import Meter
-from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Address, Decision
-from appliance.rpc.client import CallFailedError, RefusedError
+from appliance.policy.policy_compiler import compile_policy
+from appliance.quotas.pool import Standing
 from appliance.rpc.server import HttpRequest, Peer
-from appliance.shares.pool import Standing
-from appliance.store.state import StateStore
+from appliance.rpc.xmlrpc_client import CallFailedError, RefusedError
+from appliance.store.state_file import StateStore
+from appliance.telemetry.metrics import Meter
 from roswire.uris import node_uri, parse_node_uri
 from roswire.xmlrpc import Limits, Value, build_call, parse_response
 from tests.support.idle import idle, idle_class
@@ -352,7 +352,7 @@ class ControlParts:
             self.enactor,
             self.watchlist,
             nodes=self.nodes,
-            settings=config.Liveness(silent=silent),
+            settings=settings.Liveness(silent=silent),
             standing=lambda _host: Standing.REGISTERED,
         )
         self._serving = functools.partial(

@@ -20,6 +20,9 @@ import shlex
 from typing import Any, cast
 
 from appliance.channel import messages
+from appliance.master.endpoints.node_api import NodeApi
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.endpoints.traffic import Carried
 from appliance.master.graph.effects import (
     CloseNode,
     DropCalls,
@@ -36,9 +39,6 @@ from appliance.master.graph.effects import (
     WithdrawNode,
 )
 from appliance.master.graph.registry import Incarnation
-from appliance.master.reach.node_api import NodeApi
-from appliance.master.reach.relays import RelayControl
-from appliance.master.reach.traffic import Carried
 from appliance.specifications.allocation import Allocation
 from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts

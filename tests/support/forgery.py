@@ -9,8 +9,8 @@ import msgspec
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.chain import genesis, record_hash
-from appliance.audit.database import COLUMNS
-from appliance.sealed_texts import NO_CHECKPOINT, checkpoint_hash, parse_checkpoint
+from appliance.audit.log_database import COLUMNS
+from appliance.signing.signed_statements import NO_CHECKPOINT, checkpoint_hash, parse_checkpoint
 
 # ruff: noqa: S608  the attacker's statements are put together from names of columns
 

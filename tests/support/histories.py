@@ -33,25 +33,25 @@ import structlog
 
 from appliance.channel import messages
 from appliance.master.caller import Answer
+from appliance.master.endpoints.delivery import Delivery
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.endpoints.traffic import Carried
 from appliance.master.graph import graph as graph_module
 from appliance.master.graph.effects import Effect, Place, PlaceGrant, PlaceNode, RevokeGrant, SaveGrant
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Registry, SaveRegistration
 from appliance.master.graph.revocation import Revocation
-from appliance.master.reach.delivery import Delivery
-from appliance.master.reach.relays import RelayControl
-from appliance.master.reach.traffic import Carried
-from appliance.master.upkeep import arrivals as arrivals_module
-from appliance.master.upkeep import liveness as liveness_module
-from appliance.master.upkeep.arrivals import Arrivals
-from appliance.master.upkeep.enactor import Enactor, restore
-from appliance.master.upkeep.reminders import Reminders
-from appliance.policy.compiler import compile_policy
+from appliance.master.reconcile import arrivals as arrivals_module
+from appliance.master.reconcile import liveness as liveness_module
+from appliance.master.reconcile.arrivals import Arrivals
+from appliance.master.reconcile.enactor import Enactor, restore
+from appliance.master.reconcile.reminders import Reminders
 from appliance.policy.policy import Policy
-from appliance.rpc.client import BrokenOffError, RefusedError, UnansweredError
-from appliance.shares.pool import Standing
+from appliance.policy.policy_compiler import compile_policy
+from appliance.quotas.pool import Standing
+from appliance.rpc.xmlrpc_client import BrokenOffError, RefusedError, UnansweredError
 from appliance.specifications.allocation import Allocation
-from appliance.store.state import IncarnationRow, PermissionRow, RegistrationRow, StateStore
+from appliance.store.state_file import IncarnationRow, PermissionRow, RegistrationRow, StateStore
 from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, POLICY, ControlParts, HiddenMaster, Inner
 from tests.support.idle import idle, idle_class

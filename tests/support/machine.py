@@ -24,7 +24,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
-from appliance.network.progress import Progress
+from appliance.network.patience import Progress
 from tests.support.machine_disk import ROOT, Kernel, checkout_archive, machine_disk, newest_kernel
 from tests.support.requirements import need_program, need_root
 

@@ -6,7 +6,7 @@ from typing import Any
 from appliance.master.parameter_charges import ParameterCharges, measure
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.model import Address
-from appliance.shares.pool import Bounds, Pool, Standing
+from appliance.quotas.pool import Bounds, Pool, Standing
 from roswire.parameter_tree import Tree
 from roswire.xmlrpc import Value
 

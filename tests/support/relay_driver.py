@@ -154,7 +154,7 @@ class RelayProcess:
     def __init__(self, limits: str = "None") -> None:
         ours, theirs = socket.socketpair()
         code = (
-            "import sys; from appliance.relay.process import main; from appliance.relay.limits import Limits;"
+            "import sys; from appliance.relay.process import main; from appliance.relay.bounds import Limits;"
             f" main(int(sys.argv[1]), 0, {limits})"
         )
         self.process = subprocess.Popen(

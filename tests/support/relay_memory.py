@@ -1,7 +1,7 @@
 """The memory of a relay for tests of its parts."""
 
+from appliance.quotas.pool import Bounds, Standing
 from appliance.relay.connections.memory import HostShare, HostShares
-from appliance.shares.pool import Bounds, Standing
 
 
 def share(limit: int = 1 << 30) -> HostShare:

@@ -7,7 +7,7 @@ machine itself.
 import contextlib
 from collections.abc import Iterator
 
-from appliance.network import links
+from appliance.network import interfaces
 from appliance.network.namespaces import Namespace
 from examples.landshark.lab import INTERFACE, Host, Lab
 
@@ -19,10 +19,10 @@ def root_host(lab: Lab, address: str) -> Iterator[Host]:
     """The machine, connected to the lab under an address such as `10.77.0.2/24`, until the block ends."""
     own = Namespace.own()
     switch = lab.switch
-    links.create_veth(own, INTERFACE, switch, _PORT)
+    interfaces.create_veth(own, INTERFACE, switch, _PORT)
     try:
-        links.attach(switch, _PORT, "br0")
-        links.add_address(own, INTERFACE, address)
+        interfaces.attach(switch, _PORT, "br0")
+        interfaces.add_address(own, INTERFACE, address)
         yield Host("machine", own, _PORT, (address,))
     finally:
-        links.delete_link(own, INTERFACE)
+        interfaces.delete_link(own, INTERFACE)

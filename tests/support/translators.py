@@ -7,7 +7,7 @@ its program gives to iptables-restore or nft.
 import subprocess
 from dataclasses import dataclass
 
-from appliance.network import links
+from appliance.network import interfaces
 from appliance.network.namespaces import Namespace
 from examples.landshark.lab import Host
 
@@ -223,12 +223,12 @@ def load(machine: Namespace, form: str, rules: str) -> None:
 
 def guest_behind(machine: Namespace, guest: Namespace, translator: Translator) -> Host:
     """A guest of `translator`: a bridge on the machine, the guest's end on it, then the program's rules."""
-    links.create_bridge(machine, translator.interface)
-    links.add_address(machine, translator.interface, f"{translator.network}.1/24")
-    links.add_address(machine, translator.interface, "fd88::1/64")
+    interfaces.create_bridge(machine, translator.interface)
+    interfaces.add_address(machine, translator.interface, f"{translator.network}.1/24")
+    interfaces.add_address(machine, translator.interface, "fd88::1/64")
     found = plugged(machine, guest, translator.interface, translator.network)
-    links.add_address(guest, "eth0", "fd88::2/64")
-    links.add_route(guest, "default", "fd88::1")
+    interfaces.add_address(guest, "eth0", "fd88::2/64")
+    interfaces.add_route(guest, "default", "fd88::1")
     for family in ("ipv4", "ipv6"):
         machine.sysctl(f"net/{family}/conf/all/forwarding", "1")
     load(machine, translator.form, translator.rules)
@@ -237,9 +237,9 @@ def guest_behind(machine: Namespace, guest: Namespace, translator: Translator) -
 
 def plugged(machine: Namespace, guest: Namespace, bridge: str, network: str) -> Host:
     """A guest at .2 of `network`, with a cable to a bridge that the machine has, whose address is .1."""
-    links.create_veth(guest, "eth0", machine, "vguest")
-    links.attach(machine, "vguest", bridge)
-    links.set_link(guest, "lo", up=True)
-    links.add_address(guest, "eth0", f"{network}.2/24")
-    links.add_route(guest, "default", f"{network}.1")
+    interfaces.create_veth(guest, "eth0", machine, "vguest")
+    interfaces.attach(machine, "vguest", bridge)
+    interfaces.set_link(guest, "lo", up=True)
+    interfaces.add_address(guest, "eth0", f"{network}.2/24")
+    interfaces.add_route(guest, "default", f"{network}.1")
     return Host("guest", guest, "", (f"{network}.2/24",))

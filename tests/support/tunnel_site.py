@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
-from appliance.network import links
+from appliance.network import interfaces
 from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.appliance import Appliance
 from tests.support.command import ROSRV
@@ -191,8 +191,10 @@ def left_behind(host: Host) -> dict[str, str]:
         "nftables": told("nft", "list", "ruleset"),
         "iptables": "ROSRV" if "ROSRV" in iptables else "",
         "routes": told("ip", "route", "show", "table", "220"),
-        "interfaces": " ".join(one for one in links.links(host.namespace) if one not in ("lo", INTERFACE)),
-        "addresses": OWN if OWN in " ".join(links.addresses(host.namespace)) else "",
+        "interfaces": " ".join(
+            one for one in interfaces.links(host.namespace) if one not in ("lo", INTERFACE)
+        ),
+        "addresses": OWN if OWN in " ".join(interfaces.addresses(host.namespace)) else "",
     }
     return {name: text for name, text in found.items() if text}
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.ages import AgeClock
+from appliance.base.age_clock import AgeClock
 
 HOUR = 3600 * 1_000_000_000
 DAY = 24 * HOUR

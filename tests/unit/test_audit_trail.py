@@ -9,11 +9,11 @@ import pytest
 from appliance.audit.budget import Budget
 from appliance.audit.ids import IdSource
 from appliance.audit.record import Severity
-from appliance.audit_trail import NOT_RECORDED, AuditTrail, Recordings
-from appliance.config import RecorderRules
-from appliance.recorder.plan import RecordingPlan
-from appliance.shares.pool import Standing
-from appliance.shares.table import AUDIT_BYTES
+from appliance.configuration.settings import RecorderRules
+from appliance.quotas.pool import Standing
+from appliance.quotas.table import AUDIT_BYTES
+from appliance.recorder.recording_plan import RecordingPlan
+from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail, Recordings
 
 GUEST, STRANGER = "10.0.0.66", "10.9.9.9"
 

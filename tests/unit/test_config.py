@@ -1,4 +1,4 @@
-"""Tests of `appliance.config`."""
+"""Tests of `appliance.configuration.settings`."""
 
 import json
 from collections.abc import Iterator
@@ -9,8 +9,8 @@ from typing import Any, get_type_hints
 import pytest
 from pydantic import ValidationError
 
-from appliance.config import Settings, load_resolved, split_address
-from appliance.config_sources import plain, read
+from appliance.configuration.settings import Settings, load_resolved, split_address
+from appliance.configuration.sources import plain, read
 
 
 def test_every_key_has_a_default() -> None:

@@ -1,4 +1,4 @@
-"""Tests of `appliance.config_sources`."""
+"""Tests of `appliance.configuration.sources`."""
 
 import re
 from contextlib import suppress
@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from appliance.config import Settings
-from appliance.config_sources import ConfigError, resolve
+from appliance.configuration.settings import Settings
+from appliance.configuration.sources import ConfigError, resolve
 
 
 @pytest.fixture

@@ -1,8 +1,8 @@
-"""Tests of `appliance.fingerprints`: texts are known again by their hash, and no others have it."""
+"""Tests of `appliance.signing.fingerprints`: texts are known again by their hash, and no others have it."""
 
 import itertools
 
-from appliance.fingerprints import file_name, fingerprint, fingerprint_of_all
+from appliance.signing.fingerprints import file_name, fingerprint, fingerprint_of_all
 
 NAMES = [
     "a.rv", "b.rv", "msg/p/T.msg", "..", "../a.rv", ".", "a/./b", "a//b", "/a", "a\nb", "a%0Ab", "%", "", "é.rv",

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 import structlog
 
+from appliance.base.input_files import lines_given, read_given, read_given_text
 from appliance.cli import main
 from appliance.cli.rest.session import _context
-from appliance.given_files import lines_given, read_given, read_given_text
 
 POLICY = "[Nodes]\ndefault = *\n"
 SPECIFICATION = "m() { event e() /t std_msgs/Int32 '{}' {} fsm: s0 [ e -> s0 ] @s0 {} }\n"

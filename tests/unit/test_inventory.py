@@ -1,4 +1,4 @@
-"""Tests of `appliance.inventory`."""
+"""Tests of `appliance.configuration.inventory`."""
 
 import hashlib
 import json
@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance import __version__, inventory
+from appliance import __version__
+from appliance.configuration import inventory
 
 STATUS = """\
 Package: nftables

@@ -1,4 +1,4 @@
-"""Tests of `appliance.order_proof`: the vectors of `docs/rest.md`, and that no proof fits another request."""
+"""Tests of `appliance.signing.request_signing`: the vectors of `docs/rest.md`; a proof fits one request."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.order_proof import (
+from appliance.signing.request_signing import (
     BadProofError,
     is_signed,
     keys_of,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.site_keys import UnsignedError, checked_key, name_of, read_signature, signer
+from appliance.signing.site_keys import UnsignedError, checked_key, name_of, read_signature, signer
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
 
 TEXT = "a policy ä\n"

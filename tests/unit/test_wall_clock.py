@@ -7,27 +7,30 @@ from tests.support.sources import ROOT, product_files
 
 READERS = {
     "a moment that people are shown, or that stands in a file": [
-        "api/history.py", "audit/ids.py", "audit/log.py", "audit_trail.py", "backup/create.py", "control/policies.py",
-        "control/looks.py",
-        "control/recording_orders.py", "evidence/bundle.py", "forwarding/forwarder.py",
-        "hosts/checked_ports.py", "hosts/table.py",
-        "recorder/recorder.py", "recorder/ring.py", "relay/looks.py", "relay/monitors/middle.py",
+        "api/history.py", "audit/ids.py", "audit/log.py", "telemetry/audit_trail.py", "backup/create.py", "control/policies.py",
+        "control/queries.py",
+        "control/recording_orders.py", "evidence/bundle.py", "forwarding/log_forwarder.py",
+        "hosts/checked_ports.py", "hosts/host_table.py",
+        "recorder/recorder.py", "recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
         "relay/recorder_ring.py",
-        "specifications/monitors.py", "supervisor/life.py", "supervisor/monitor_memory.py",
+        "specifications/specifications.py", "supervisor/process_handle.py", "supervisor/monitor_memory.py",
         "supervisor/rings.py", "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
-        "api/access.py", "api/metrics.py", "api/process.py", "cli/selftest/files.py", "cli/token.py",
-        "control/tokens.py", "hosts/certification.py", "hosts/enrolment_tokens.py", "hosts/revocation_list.py",
-        "hosts/revoked_certificates.py", "hosts/tunnels.py", "hosts/view.py", "ipsec/authority.py",
+        "api/access.py", "api/metrics.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
+        "control/token_orders.py", "hosts/certification.py", "hosts/enrolment_tokens.py", "hosts/revocation_list.py",
+        "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",
     ],
     "a span that goes on over restarts of the machine, which has no other clock": [
         "control/switched_off.py", "hosts/self_service.py", "specifications/returns.py", "store/revisions.py",
     ],
-    "whether the wall clock can be believed": ["ages.py", "control/clock.py", "shipped.py"],
+    "whether the wall clock can be believed": [
+        "base/age_clock.py", "base/shipped.py", "control/clock_check.py",
+    ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
-        "api/moments.py", "cli/audit/filter.py", "cli/evidence.py", "cli/monitor/offline.py", "cli/monitor/recorder.py",
-        "cli/policy/learning.py", "cli/protect.py", "cli/record.py", "cli/status.py", "cli/status_view.py",
+        "api/moments.py", "cli/audit/filter.py", "cli/evidence_verbs.py", "cli/monitor/offline.py",
+        "cli/monitor/recorder.py", "cli/policy/learn_verb.py", "cli/protect_verb.py", "cli/record_verbs.py",
+        "cli/status_verb.py", "cli/status_view.py",
     ],
 }  # fmt: skip
 """The files that read the wall clock, by what for. A new one is added here by whoever can say the same of it."""

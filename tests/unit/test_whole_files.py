@@ -1,4 +1,4 @@
-"""Tests of `appliance.whole_files`."""
+"""Tests of `appliance.base.atomic_files`."""
 
 import errno
 import os
@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 import appliance
-from appliance.cli.output import write_told
-from appliance.whole_files import (
+from appliance.base.atomic_files import (
     NotLastingError,
     name_to_make,
     remove_unfinished,
     write_where_told,
     write_whole,
 )
+from appliance.cli.output import write_told
 from tests.support.requirements import need_root
 
 
@@ -173,7 +173,7 @@ def test_what_goes_to_our_own_output_stands_behind_what_was_said(tmp_path: Path)
     file = tmp_path / "file"
     file.write_text("before\n")
     program = (
-        "from pathlib import Path; from appliance.whole_files import write_where_told as write\n"
+        "from pathlib import Path; from appliance.base.atomic_files import write_where_told as write\n"
         "print('said'); write(Path('/dev/stdout'), b'written\\n'); print('done')"
     )
     with file.open("a") as output:

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from appliance.withdrawal import WithdrawnError, awaited, require_awaited, take_effect
+from appliance.base.withdrawal import WithdrawnError, awaited, require_awaited, take_effect
 
 
 def test_an_order_whose_client_gave_up_does_not_take_effect() -> None:

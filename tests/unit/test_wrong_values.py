@@ -13,9 +13,9 @@ from fastapi import FastAPI, Request
 from fastapi.routing import iter_route_contexts
 
 from appliance.api.problems import ProblemError
-from appliance.config import Settings
-from appliance.config_sources import ConfigError, resolve
-from appliance.wrong_values import refusal
+from appliance.base.validation_messages import refusal
+from appliance.configuration.settings import Settings
+from appliance.configuration.sources import ConfigError, resolve
 from tests.support.command import commands, rosrv
 from tests.unit.api.conftest import app  # noqa: F401  the fixture
 

@@ -1,4 +1,4 @@
-"""What is measured, in numbers; `appliance.metrics` says what each is called."""
+"""What is measured, in numbers; `appliance.telemetry.metrics` says what each is called."""
 
 import msgspec
 

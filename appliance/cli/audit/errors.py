@@ -7,12 +7,12 @@ from typing import NoReturn
 import typer
 
 from appliance.audit.copies import CopiesUnreadableError
-from appliance.audit.database import LogUnreadableError
 from appliance.audit.export_proof import ExportUnreadableError
-from appliance.audit.moment import MomentError
-from appliance.audit.output import printable
+from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import FilterError
+from appliance.audit.record_format import printable
 from appliance.audit.signatures import KeyUnreadableError
+from appliance.audit.timestamps import MomentError
 from appliance.cli.admin_socket import NotRunningError
 
 CANNOT_READ = 2

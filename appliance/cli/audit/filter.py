@@ -9,12 +9,12 @@ from typing import Annotated, Concatenate, ParamSpec
 import typer
 
 from appliance.api.unrecorded import unrecorded
-from appliance.audit.moment import MomentError, parse_moment
-from appliance.audit.output import printable
 from appliance.audit.query import Filter
 from appliance.audit.record import Severity
+from appliance.audit.record_format import printable
+from appliance.audit.timestamps import MomentError, parse_moment
 from appliance.cli.audit.errors import Errors, tell
-from appliance.cli.spans import Since, Until
+from appliance.cli.durations import Since, Until
 from appliance.cli.target import Appliance
 
 _P = ParamSpec("_P")

@@ -5,14 +5,14 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from appliance.audit.chain_findings import Verification
+from appliance.audit.chain_proofs import evidence, evidence_line
 from appliance.audit.copies import SignedCheckpoint, signed_checkpoints
-from appliance.audit.database import LogUnreadableError
-from appliance.audit.evidence import evidence, evidence_line
-from appliance.audit.findings import Verification
-from appliance.audit.output import Entry
+from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter
+from appliance.audit.record_format import Entry
 from appliance.audit.search import Follower, Page, Shown, export, last_sequence, search, show
-from appliance.audit.verify import verify
+from appliance.audit.verification import verify
 
 _POLL_SECONDS = 0.2
 Progress = Callable[[int], None]

@@ -19,7 +19,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import Header, IndexData, RecordType, decompressors, read_bytes, read_uint32
 
-from appliance.given_files import open_given
+from appliance.base.input_files import open_given
 
 LARGEST_CHUNK = 256 << 20
 PER_BYTE = 256

@@ -19,7 +19,7 @@ from appliance.cli.monitor.input import (
 )
 from appliance.cli.output import Json, refused, say, say_json
 from appliance.cli.tables import table_of
-from rosmop.learn.coverage import Item, covered
+from rosmop.learn.exercised import Item, covered
 from rosmop.run.engine import MonitorSet
 from rosmop.text.errors import SpecificationError
 

@@ -14,11 +14,11 @@ from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.monitors import MonitorState, Replaced, Switched
 from appliance.cli import completion
+from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within
+from appliance.cli.durations import span_given
 from appliance.cli.output import counted, moment, printable, say, say_json, usage_error
-from appliance.cli.spans import span_given
 from appliance.cli.tables import say_table, table_of
 from appliance.cli.target import Appliance, speaks
-from appliance.cli.trials import ConfirmWithin, say_deadline, seconds_within
 
 _Names = Annotated[
     list[str], typer.Argument(metavar="MONITOR…", show_default=False, autocompletion=completion.monitors)

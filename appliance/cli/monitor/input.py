@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.input_files import read_given, read_given_text
 from appliance.cli import output
-from appliance.given_files import read_given, read_given_text
-from appliance.specifications.files import Sources, signatures_of
+from appliance.specifications.specification_files import Sources, signatures_of
 from rosmop.form.positions import Position
 from rosmop.text.errors import SpecificationError
 from roswire.definitions import Definitions

@@ -8,11 +8,11 @@ from typing import Annotated
 
 import typer
 
+from appliance.base.input_files import read_given_text
 from appliance.cli.monitor.bag import Recorded
 from appliance.cli.monitor.input import BESIDE, Bags, usage_error
 from appliance.cli.output import Json, counted, say, say_json, write_told
-from appliance.cli.progress import progress
-from appliance.given_files import read_given_text
+from appliance.cli.progress_bar import progress
 from rosmop.learn.learner import LearningError, Learnt, learn
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError

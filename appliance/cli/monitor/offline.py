@@ -9,10 +9,10 @@ import typer
 
 from appliance.cli.output import Json, refused, say, say_json, usage_error
 from appliance.cli.target import DEFAULT_STATE
-from appliance.specifications.revisions import forget_revision
-from appliance.store.database import StoreError
-from appliance.store.state import StateStore
-from appliance.supervisor.state import StateDirectory
+from appliance.specifications.specification_revisions import forget_revision
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
+from appliance.supervisor.state_directory import StateDirectory
 
 _STATE, _VERB = "state.db", "rosrv monitor"
 

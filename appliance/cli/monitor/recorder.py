@@ -8,14 +8,14 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import NamedTuple
 
-from appliance.audit.moment import parse_moment
-from appliance.audit.output import rfc3339
+from appliance.audit.record_format import rfc3339
+from appliance.audit.timestamps import parse_moment
 from appliance.channel import admin
 from appliance.channel.answers.recordings import Recording, Recordings
 from appliance.cli.admin_socket import NotRunningError
 from appliance.cli.monitor.input import usage_error
 from appliance.cli.output import refused
-from appliance.cli.record import bag_of
+from appliance.cli.record_verbs import bag_of
 from appliance.cli.target import Appliance
 
 _SECOND = 1_000_000_000

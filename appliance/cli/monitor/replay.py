@@ -17,7 +17,7 @@ from appliance.cli.monitor.input import Folders, read_definitions, read_specific
 from appliance.cli.monitor.output import BILLION, because
 from appliance.cli.monitor.recorder import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
 from appliance.cli.output import counted, refused, say, say_json
-from appliance.cli.progress import progress
+from appliance.cli.progress_bar import progress
 from appliance.cli.tables import say_table, table_of
 from appliance.cli.target import Appliance, speaks
 from rosmop.form.connected_groups import sharing

@@ -7,10 +7,10 @@ import typer
 
 from appliance.channel.admin import MonitorConfirm, MonitorRevisions, MonitorRevisionWanted, MonitorRollback
 from appliance.channel.answers.monitors import RevisionTexts
+from appliance.cli.commit_confirm import verbs_of
 from appliance.cli.monitor.in_force import say_replaced
 from appliance.cli.output import say, say_json, usage_error
 from appliance.cli.target import Appliance, speaks
-from appliance.cli.trials import verbs_of
 
 _Revision = Annotated[int | None, typer.Argument(help="A kept revision; without it, the one in force")]
 

@@ -15,7 +15,7 @@ from appliance.cli.monitor.bounded_bag import BoundedReader
 from appliance.cli.monitor.input import Files, Folders, read_definitions, read_specifications, usage_error
 from appliance.cli.monitor.output import explained, lines, record, say_finding
 from appliance.cli.output import Json, counted, printable, refused, say, say_json
-from appliance.cli.progress import progress
+from appliance.cli.progress_bar import progress
 from rosmop.certify.properties import certificates_of
 from rosmop.form.positions import Finding
 from rosmop.logics.interface import CompiledProperty

@@ -11,12 +11,12 @@ from typing import Any
 from msgspec.structs import asdict
 
 from appliance.channel.admin import AdminAnswer, PolicyWanted
-from appliance.cli.policy.input import known_of, live_now, read_text
+from appliance.cli.policy.policy_input import known_of, live_now, read_text
 from appliance.cli.target import Appliance
-from appliance.policy.findings import Finding, PolicyError, Severity
 from appliance.policy.judgement import Known, judge
-from appliance.policy.live import Ending, endings
-from appliance.site_keys import read_signature
+from appliance.policy.live_rights import Ending, endings
+from appliance.policy.policy_findings import Finding, PolicyError, Severity
+from appliance.signing.site_keys import read_signature
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from appliance.cli.admin_socket import NotRunningError, encoded
 from appliance.cli.rest.session import ProblemError, RestClient
 
 if TYPE_CHECKING:
-    from appliance.cli.audit.rest import RestLog
+    from appliance.cli.audit.log_over_rest import RestLog
 
 
 class RestWay:
@@ -34,7 +34,7 @@ class RestWay:
 
     def audit(self) -> "RestLog":
         """Its audit log."""
-        from appliance.cli.audit.rest import RestLog  # noqa: PLC0415  only for the verbs that read it
+        from appliance.cli.audit.log_over_rest import RestLog  # noqa: PLC0415  only for the verbs that read it
 
         return RestLog(self.client)
 

@@ -19,11 +19,11 @@ from urllib.parse import urlsplit
 
 import httpx
 
+from appliance.base.input_files import read_given_text
 from appliance.cli.admin_socket import SECONDS, UNKNOWN, NotRunningError
-from appliance.config import is_loopback
-from appliance.given_files import read_given_text
-from appliance.order_proof import HEADER, proof_of, reading_key, statement
-from appliance.store.tokens import parse_token
+from appliance.configuration.settings import is_loopback
+from appliance.signing.request_signing import HEADER, proof_of, reading_key, statement
+from appliance.store.access_tokens import parse_token
 
 _CONNECT_SECONDS = 10.0
 _LONGEST_ERROR = 1 << 20

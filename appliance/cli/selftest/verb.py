@@ -14,11 +14,11 @@ from rich.text import Text
 
 from appliance.cli.admin_socket import ADMIN_SOCKET, AdminSocket
 from appliance.cli.output import counted, printable, say_json
-from appliance.cli.selftest.findings import Found, fail
+from appliance.cli.selftest.selftest_findings import Found, fail
 from appliance.cli.tables import say_table
 from appliance.cli.target import Appliance, speaks
-from appliance.config import Settings, load_resolved
-from appliance.config_sources import ConfigError, resolve
+from appliance.configuration.settings import Settings, load_resolved
+from appliance.configuration.sources import ConfigError, resolve
 
 _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 
@@ -66,7 +66,7 @@ def selftest(
 
 
 def _all(appliance: Appliance, config: Path | None) -> Iterator[Found]:
-    from appliance.cli.selftest.live import running  # noqa: PLC0415  after what can be said without it
+    from appliance.cli.selftest.live_checks import running  # noqa: PLC0415  after what can be said without it
 
     if appliance.place is not None:
         yield from running(appliance)
@@ -77,8 +77,8 @@ def _all(appliance: Appliance, config: Path | None) -> Iterator[Found]:
 
 
 def _here(appliance: Appliance, config: Path | None) -> Iterator[Found]:
-    from appliance.cli.selftest.files import files  # noqa: PLC0415  what it imports is slow
-    from appliance.cli.selftest.machine import machine  # noqa: PLC0415  the same
+    from appliance.cli.selftest.file_checks import files  # noqa: PLC0415  what it imports is slow
+    from appliance.cli.selftest.machine_checks import machine  # noqa: PLC0415  the same
 
     try:
         settings = _settings(appliance, config)

@@ -20,22 +20,22 @@ from typing import NamedTuple
 import structlog
 
 from appliance.audit.record import Severity
-from appliance.audit_trail import NOT_RECORDED, AuditTrail
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import Attempt, Call, Table, Verb, claimed_name, denial_text, with_record
+from appliance.master.calls.call_order import Claims, WriteTurns
 from appliance.master.calls.gate import Contest, Gate, contested
-from appliance.master.calls.parameters import ParameterCalls, Write
+from appliance.master.calls.parameter_calls import ParameterCalls, Write
 from appliance.master.calls.registration import given_up
-from appliance.master.calls.turns import Claims, WriteTurns
+from appliance.master.endpoints.endpoint_addresses import NoPortError
 from appliance.master.graph.registry import Kind, Registry
 from appliance.master.parameter_charges import LimitReachedError
-from appliance.master.reach.places import NoPortError
-from appliance.master.upkeep.enactor import Enactor
-from appliance.master.upkeep.liveness import Liveness, Probe
+from appliance.master.reconcile.enactor import Enactor
+from appliance.master.reconcile.liveness import Liveness, Probe
 from appliance.policy.model import Address, Category, Decision
 from appliance.policy.policy import Policy
 from appliance.rpc.bulk import Bulk, LargeWrites, weigh
-from appliance.rpc.client import CallFailedError
+from appliance.rpc.xmlrpc_client import CallFailedError
+from appliance.telemetry.audit_trail import NOT_RECORDED, AuditTrail
 from roswire.errors import EncodingError, PeerError, ProtocolError
 from roswire.xmlrpc import Value
 

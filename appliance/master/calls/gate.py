@@ -14,12 +14,12 @@ from appliance.master.caller import ApiUri, Caller
 from appliance.master.calls.call import Attempt, Identity, Verb
 from appliance.master.graph.own_node import OWN, ROSOUT
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
-from appliance.master.upkeep.liveness import Presence, Probe
+from appliance.master.reconcile.liveness import Presence, Probe
 from appliance.policy.model import Address, Category, Decision
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide, rights_of_call
 from appliance.policy.settings import AT_ONCE
-from appliance.shares.table import NAMES
+from appliance.quotas.table import NAMES
 from roswire.parameter_tree import Tree
 
 _TIMES_THE_REST = 3

@@ -5,12 +5,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.master.caller import Answer, Caller
+from appliance.master.endpoints.endpoint_addresses import Addresses
+from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Kind, Registry
-from appliance.master.reach.places import Addresses
-from appliance.master.reach.relays import RelayControl
-from appliance.master.upkeep.enactor import Enactor
+from appliance.master.reconcile.enactor import Enactor
 from roswire.uris import node_uri, service_uri
 from roswire.xmlrpc import Value
 

@@ -5,10 +5,10 @@ from typing import cast
 
 from appliance.channel.admin import MonitorSwitch
 from appliance.master.caller import Answer, Caller
+from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.registry import Kind, Registry
-from appliance.master.reach.relays import RelayControl
-from appliance.specifications.files import SpecificationsRefusedError
-from appliance.specifications.monitors import Monitors, UnknownMonitorError
+from appliance.specifications.specification_files import SpecificationsRefusedError
+from appliance.specifications.specifications import Monitors, UnknownMonitorError
 from roswire.xmlrpc import Value
 
 _WORDS = {"enable": True, "disable": False}

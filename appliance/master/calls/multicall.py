@@ -13,13 +13,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from appliance.audit_trail import AuditTrail
 from appliance.master.calls.call import Attempt, Verb, with_record
+from appliance.master.calls.call_order import touch
 from appliance.master.calls.execution import Execution, Visit
-from appliance.master.calls.parameters import ParameterCalls
-from appliance.master.calls.turns import touch
+from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.policy.model import Category
 from appliance.rpc.bulk import weigh
+from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import Value
 
 MULTICALL = "system.multicall"

@@ -14,17 +14,17 @@ from dataclasses import dataclass
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import MESSAGE, PROTOCOLS, TOPIC, Call, Identity, Verb, method
 from appliance.master.calls.gate import Gate
+from appliance.master.endpoints.endpoint_addresses import Addresses
+from appliance.master.endpoints.node_api import NodeApi
+from appliance.master.endpoints.relay_control import RelayControl, tcpros_port
+from appliance.master.endpoints.traffic import Traffic
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reach.node_api import NodeApi
-from appliance.master.reach.places import Addresses
-from appliance.master.reach.relays import RelayControl, tcpros_port
-from appliance.master.reach.traffic import Traffic
-from appliance.master.upkeep.enactor import Enactor
-from appliance.master.upkeep.liveness import Liveness
-from appliance.rpc.client import CallFailedError
+from appliance.master.reconcile.enactor import Enactor
+from appliance.master.reconcile.liveness import Liveness
 from appliance.rpc.server import NoAnswerError
+from appliance.rpc.xmlrpc_client import CallFailedError
 from appliance.specifications.allocation import TOPIC as TOPIC_CONNECTION
 from roswire.uris import node_uri
 from roswire.xmlrpc import Value

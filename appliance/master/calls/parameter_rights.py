@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from appliance.audit_trail import AuditTrail
 from appliance.master.caller import Answer, Caller
 from appliance.master.calls.call import denial_text
 from appliance.master.graph.registry import Incarnation
@@ -12,6 +11,7 @@ from appliance.policy.model import Address, Category, Decision, Request
 from appliance.policy.policy import Policy
 from appliance.policy.rights import decide_right, right_to_find, right_to_read
 from appliance.rpc.server import Peer
+from appliance.telemetry.audit_trail import AuditTrail
 from roswire.xmlrpc import Value
 
 

@@ -8,20 +8,20 @@ from dataclasses import dataclass
 
 import structlog
 
-from appliance.audit_trail import AuditTrail
 from appliance.master.caller import Caller
 from appliance.master.calls.call import Attempt, Table
 from appliance.master.calls.execution import Execution, Visit
 from appliance.master.calls.multicall import LIMIT_FAULT, MULTICALL, PARSE_FAULT, Multicall
 from appliance.master.calls.repetition import Repetitions
+from appliance.master.endpoints.endpoint_addresses import Addresses
 from appliance.master.graph.registry import Incarnation
-from appliance.master.reach.places import Addresses
 from appliance.policy.model import Category
 from appliance.rpc.bulk import Bulk, weigh
+from appliance.rpc.fair_queue import Turns
 from appliance.rpc.method_name import method_named
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import Handler, HttpRequest
-from appliance.rpc.turns import Turns
+from appliance.telemetry.audit_trail import AuditTrail
 from roswire.errors import EncodingError, LimitExceededError, PeerError
 from roswire.xmlrpc import Limits, MethodCall, Value, build_fault, build_response, parse_call
 

@@ -10,15 +10,15 @@ from appliance.master.caller import Answer, ApiUri, Caller
 from appliance.master.calls.call import Attempt
 from appliance.master.calls.gate import Gate
 from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.endpoints.proxy_endpoints import Faces
+from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
-from appliance.master.reach.faces import Faces
-from appliance.master.reach.relays import RelayControl
+from appliance.master.reconcile.arrivals import Arrivals, MakingRoomForNobody
+from appliance.master.reconcile.enactor import Enactor
+from appliance.master.reconcile.entries import NO_SERVICE, stand_in
 from appliance.master.rosmaster import RosMaster
-from appliance.master.upkeep.arrivals import Arrivals, MakingRoomForNobody
-from appliance.master.upkeep.enactor import Enactor
-from appliance.master.upkeep.entries import NO_SERVICE, stand_in
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,18 +19,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from appliance.audit.record import Repeated
-from appliance.audit_trail import AuditTrail
 from appliance.master.caller import Caller
 from appliance.master.calls.call import Attempt, Table
 from appliance.master.calls.gate import Gate
 from appliance.master.calls.multicall import MULTICALL
+from appliance.master.endpoints.endpoint_addresses import Addresses
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
-from appliance.master.reach.places import Addresses
 from appliance.master.rosmaster import RosMaster
 from appliance.policy.model import Decision
 from appliance.policy.policy import Policy
 from appliance.rpc.server import HttpRequest, Peer
+from appliance.telemetry.audit_trail import AuditTrail
 from roswire.errors import PeerError
 from roswire.parameter_tree import standing_at
 from roswire.xmlrpc import MethodCall, Value

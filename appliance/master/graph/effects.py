@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from appliance.audit.record import Severity
 from appliance.master.graph.registry import Durable, Incarnation, Kind, Registration
 from appliance.policy.model import Rule
-from appliance.store.state import PermissionRow
+from appliance.store.state_file import PermissionRow
 from roswire.xmlrpc import Value
 
 _CALL_BYTES = 200  # a call with nothing in it, and a text with nothing in it, as Python keeps them

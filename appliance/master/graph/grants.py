@@ -7,9 +7,9 @@ its oldest ones that nobody is connected by.
 from collections.abc import Callable, Collection, Iterable
 
 from appliance.master.graph.effects import Effects, EraseGrant, PlaceGrant, RevokeGrant, SaveGrant
-from appliance.shares.pool import Bounds
-from appliance.shares.table import GRANTS
-from appliance.store.state import PermissionRow
+from appliance.quotas.pool import Bounds
+from appliance.quotas.table import GRANTS
+from appliance.store.state_file import PermissionRow
 
 _CLEARED_AT_ONCE = 1000
 

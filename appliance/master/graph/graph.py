@@ -30,12 +30,12 @@ from appliance.master.graph.grants import Grants
 from appliance.master.graph.mediation import Mediation
 from appliance.master.graph.parameter_updates import settled, updates_of
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
-from appliance.policy.limits import Part
 from appliance.policy.model import Address, Decision, address_of
 from appliance.policy.policy import Policy
+from appliance.policy.rate_limits import Part
 from appliance.rpc.bulk import weigh
 from appliance.specifications.allocation import SERVICE, TOPIC
-from appliance.store.state import PermissionRow
+from appliance.store.state_file import PermissionRow
 from roswire.xmlrpc import Value
 
 _CARRIED = (Kind.PUBLICATION, Kind.SERVICE)

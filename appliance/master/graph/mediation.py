@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from appliance.policy.policy import Policy
-from appliance.specifications.files import Checked
+from appliance.specifications.specification_files import Checked
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,11 +12,11 @@ from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph, revocation
 from appliance.master.graph.own_node import OWN, ROSOUT
 from appliance.master.graph.registry import Incarnation, Kind, Life, Registration, Registry
-from appliance.policy.live import Live, live_by, may_keep
+from appliance.policy.live_rights import Live, live_by, may_keep
 from appliance.policy.model import Address, Decision, address_of
 from appliance.policy.policy import Policy
 from appliance.specifications.allocation import TOPIC
-from appliance.store.state import PermissionRow
+from appliance.store.state_file import PermissionRow
 from roswire.parameter_tree import Tree
 
 CALLS = {

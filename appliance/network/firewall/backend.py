@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-from appliance.network.firewall.rules import Family, Rule
+from appliance.network.firewall.firewall_rules import Family, Rule
 from appliance.network.namespaces import NetworkError
 
 

@@ -10,10 +10,10 @@ from typing import Literal
 
 from appliance.channel.answers.status import FirewallRule
 from appliance.network.firewall.backend import Backend, FirewallError, RuleCounter
+from appliance.network.firewall.backend_check import prove
+from appliance.network.firewall.firewall_rules import Family, FirewallSettings, Rule, appliance_rules
 from appliance.network.firewall.iptables import IptablesBackend
 from appliance.network.firewall.nft import NftBackend
-from appliance.network.firewall.proof import prove
-from appliance.network.firewall.rules import Family, FirewallSettings, Rule, appliance_rules
 from appliance.network.namespaces import Namespace, require_network_admin
 
 BackendChoice = Literal["auto", "nft", "iptables"]

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from appliance.network.firewall.backend import BackendMissingError, FirewallError, RuleCounter
-from appliance.network.firewall.rules import (
+from appliance.network.firewall.firewall_rules import (
     COUNTED_MARK,
     HOOKS,
     SOURCE_TRANSLATIONS,

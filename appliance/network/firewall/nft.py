@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 from appliance.network.firewall.backend import BackendMissingError, FirewallError, RuleCounter
-from appliance.network.firewall.rules import (
+from appliance.network.firewall.firewall_rules import (
     COUNTED_MARK,
     HOOKS,
     SOURCE_TRANSLATIONS,
@@ -29,7 +29,7 @@ from appliance.network.firewall.rules import (
     Verdict,
 )
 from appliance.network.namespaces import Namespace
-from appliance.network.progress import run
+from appliance.network.patience import run
 
 TABLE = "rosrv"
 _FAMILY = "inet"

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 from appliance.channel.messages.relay import NO_GRANT
 from appliance.relay.connections.headers import switched_on, too_long
-from appliance.relay.grants import StatedTable
+from appliance.relay.granted import StatedTable
 from roswire.errors import InvalidNameError
 from roswire.names import check_tool_id
 

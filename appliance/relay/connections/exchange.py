@@ -14,7 +14,7 @@ Invariants:
 from collections import deque
 from collections.abc import Callable
 
-from appliance.relay.monitors.middle import Judged
+from appliance.relay.monitors.interceptor import Judged
 from roswire.errors import ProtocolError
 from roswire.tcpros import (
     FrameParser,

@@ -16,9 +16,9 @@ Invariants, besides those of `Pool`:
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 
-from appliance.relay.limits import Limits
-from appliance.shares.pool import Pool, Standing
-from appliance.shares.table import RELAY_FRAMES, RELAY_HEADERS, RELAY_LATCHED, RELAY_QUEUES, Share
+from appliance.quotas.pool import Pool, Standing
+from appliance.quotas.table import RELAY_FRAMES, RELAY_HEADERS, RELAY_LATCHED, RELAY_QUEUES, Share
+from appliance.relay.bounds import Limits
 
 
 class HostShare:

@@ -9,11 +9,11 @@ Invariants:
 import socket
 from collections.abc import Callable, Mapping
 
-from appliance.relay.connections.flow import FlowShare
 from appliance.relay.connections.frames import LARGE, Batch
 from appliance.relay.connections.memory import Stall
-from appliance.relay.connections.outbox import Outbox
-from appliance.relay.connections.topic import RelayedTopic
+from appliance.relay.connections.rate_limit import FlowShare
+from appliance.relay.connections.relayed_topic import RelayedTopic
+from appliance.relay.connections.send_queue import Outbox
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import READ, WRITE
 from roswire.tcpros import encode_header

@@ -16,9 +16,9 @@ from appliance.channel.messages.relay import Violation
 from appliance.relay.connections.frames import SMALL, Batch, FrameReceiver
 from appliance.relay.connections.headers import size_of
 from appliance.relay.connections.memory import Stall, Weight
-from appliance.relay.connections.presence import Presences, looks_for_names
+from appliance.relay.connections.named_subscribers import Presences, looks_for_names
+from appliance.relay.connections.relayed_topic import RelayedTopic
 from appliance.relay.connections.sockets import Stream, begin_connect
-from appliance.relay.connections.topic import RelayedTopic
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import READ, Timer
 from roswire.errors import LimitExceededError, PeerError

@@ -11,7 +11,7 @@ Invariants:
 import socket
 from collections.abc import Callable, Mapping
 
-from appliance.relay.connections.anteroom import Anteroom
+from appliance.relay.connections.pending_connections import Anteroom
 from appliance.relay.connections.sockets import Stream
 from appliance.relay.context import RelayContext
 from appliance.relay.loop import Loop

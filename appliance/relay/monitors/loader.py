@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Union
 
-from appliance import late
+from appliance.base import lazy_imports
 from appliance.channel.messages import SpecificationsStated
 from appliance.relay.loop import READ, Loop
 
@@ -89,7 +89,7 @@ class Loader:
     def load(message: SpecificationsStated, holder_of: "HolderOf") -> Result:
         """The set that these specifications make, or what is wrong with them."""
         try:  # it is loaded late, for that takes half a second of a small machine
-            sets = late.load("appliance.relay.monitors.monitor_sets", "prepare")
+            sets = lazy_imports.load("appliance.relay.monitors.monitor_sets", "prepare")
             result: Result = sets.monitor_set(message, holder_of)
         except Exception as error:  # noqa: BLE001  a defect is a reason to refuse, no more
             return [f"a defect of rosrv, please report it: {type(error).__name__}: {error}"]

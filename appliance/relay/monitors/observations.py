@@ -17,7 +17,7 @@ from typing import Any
 
 from appliance.channel.messages import MonitorEvent, MonitorRow, MonitorsCounted, MonitorsReported
 from appliance.relay.loop import Loop, Timer
-from appliance.relay.monitors.places import Place, Sighting
+from appliance.relay.monitors.observation_points import Place, Sighting
 from appliance.relay.report import Reporter
 
 SHOWN = 1024

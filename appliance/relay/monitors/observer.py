@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 from appliance.channel.messages import MonitorRow
 from appliance.relay.counts import Counts
-from appliance.relay.monitors.margins import Margins
+from appliance.relay.monitors.margin_counts import Margins
+from appliance.relay.monitors.observation_points import NOWHERE, Place, Senders, Sighting
 from appliance.relay.monitors.observations import SHOWN, Observations
-from appliance.relay.monitors.places import NOWHERE, Place, Senders, Sighting
 from rosmop.run.explanations import of_change, of_drop, of_fault, of_published, of_verdict
 from rosmop.run.outcomes import Outcome, Verdict, named
-from rosmop.runtime.context import LogLine, Published
+from rosmop.runtime.action_context import LogLine, Published
 
 if TYPE_CHECKING:
     from rosmop.run.monitor import Monitor

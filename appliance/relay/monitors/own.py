@@ -6,7 +6,7 @@ The appliance is the publisher (`/rosrv`, or as configured); its header comes fr
 from collections.abc import Callable
 
 from appliance.relay.connections.frames import Batch
-from appliance.relay.connections.topic import RelayedTopic
+from appliance.relay.connections.relayed_topic import RelayedTopic
 from roswire.tcpros import encode_frame
 
 

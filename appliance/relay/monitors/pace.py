@@ -5,7 +5,7 @@ next ones have a tenth. Messages that are cut off within that second do not prol
 name have one pace together, as many addresses could each send such a message.
 """
 
-from rosmop.runtime.context import FUEL_PER_SECOND
+from rosmop.runtime.action_context import FUEL_PER_SECOND
 
 _SECOND = 1_000_000_000
 _AGAIN = 0.1

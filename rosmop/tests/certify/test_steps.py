@@ -11,15 +11,15 @@ import pytest
 
 from appliance.channel.messages import PartNames
 from appliance.specifications.checking import parts
-from appliance.specifications.files import SpecificationsRefusedError
+from appliance.specifications.specification_files import SpecificationsRefusedError
 from rosmop.certify.steps import StepDiffersError, check_steps
 from rosmop.fast import batch_codegen, wasm_build
 from rosmop.fast.batch_codegen import WrittenModule, written
 from rosmop.fast.serialization import encoded
 from rosmop.fast.wasm_instance import MachineError
-from rosmop.form import components, nodes
+from rosmop.form import nodes, specification_groups
 from rosmop.form.compiled import Compiled
-from rosmop.form.components import groups
+from rosmop.form.specification_groups import groups
 from rosmop.run.engine import MonitorSet
 from rosmop.runtime.values import Values
 from rosmop.tests.certify.step_mutants import tables, walks
@@ -97,7 +97,7 @@ def test_mutants_of_walks_and_tables_are_rejected() -> None:
 
 
 def _changed(change: Callable[[nodes.Advance], nodes.Advance]) -> Callable[..., nodes.Event]:
-    event = components.event_of
+    event = specification_groups.event_of
 
     def changed(*arguments: Any) -> nodes.Event:
         made = event(*arguments)
@@ -114,19 +114,20 @@ def _advance(**fields: Callable[[nodes.Advance], object]) -> Callable[..., nodes
 
 # `local.get` and `local.set`: the walk goes on at the next message, and writes nothing.
 NEXT_MESSAGE = bytes((0x20, 6, 0x21, 0))
+ADVANCE = (specification_groups, "event_of")
 FAULTS: dict[str, tuple[object, str, object]] = {
-    "another column of the table": (components, "event_of", _advance(table=lambda one: one.table[1:] + one.table[:1])),
-    "another initial state": (components, "event_of", _advance(initial=lambda one: one.initial + 1)),
-    "no handler runs": (components, "event_of", _advance(handlers=lambda _: ())),
-    "a handler in another state": (components, "event_of", _advance(
+    "another column of the table": (*ADVANCE, _advance(table=lambda one: one.table[1:] + one.table[:1])),
+    "another initial state": (*ADVANCE, _advance(initial=lambda one: one.initial + 1)),
+    "no handler runs": (*ADVANCE, _advance(handlers=lambda _: ())),
+    "a handler in another state": (*ADVANCE, _advance(
         handlers=lambda one: tuple(
             msgspec.structs.replace(each, states=frozenset({0})) for each in one.handlers
         )
     )),
-    "handlers in another order": (components, "event_of", _advance(handlers=lambda one: one.handlers[::-1])),
-    "formulas keep dropped messages": (components, "event_of", _advance(suppresses=lambda _: False)),
-    "machines forget dropped messages": (components, "event_of", _advance(suppresses=lambda _: True)),
-    "properties in another order": (components, "event_of", _advance(property=lambda one: 1 - (one.property or 0))),
+    "handlers in another order": (*ADVANCE, _advance(handlers=lambda one: one.handlers[::-1])),
+    "formulas keep dropped messages": (*ADVANCE, _advance(suppresses=lambda _: False)),
+    "machines forget dropped messages": (*ADVANCE, _advance(suppresses=lambda _: True)),
+    "properties in another order": (*ADVANCE, _advance(property=lambda one: 1 - (one.property or 0))),
     "a drop has no effect": (batch_codegen.WalkWriter, "_drop", lambda *_: b""),
     "handlers are not called": (batch_codegen.WalkWriter, "_handle", lambda *_: b""),
     "properties do not step": (batch_codegen.WalkWriter, "_advance", lambda *_: b""),

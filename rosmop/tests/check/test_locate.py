@@ -8,7 +8,7 @@ from random import Random
 import pytest
 
 from rosmop.tests.acting import definitions, load, message
-from rosmop.types import kinds
+from rosmop.types import value_types
 from rosmop.types.messages import Messages
 
 KINDS = (
@@ -20,48 +20,50 @@ KINDS = (
 )  # fmt: skip
 
 
-def content(random: Random, kind: kinds.Type) -> object:
+def content(random: Random, kind: value_types.Type) -> object:
     """A random value of a type, for the other library's encoder."""
-    if isinstance(kind, kinds.Record):
+    if isinstance(kind, value_types.Record):
         slots = Messages(definitions()).slots(kind.name)
         return {name: content(random, slot.type) for name, slot in slots.items()}
-    if isinstance(kind, kinds.Vector):
+    if isinstance(kind, value_types.Vector):
         count = random.randrange(4) if kind.length is None else kind.length
         return [content(random, kind.element) for _ in range(count)]
-    if isinstance(kind, kinds.Integer):
+    if isinstance(kind, value_types.Integer):
         return random.randint(kind.least, kind.most)
-    if isinstance(kind, kinds.Time | kinds.Duration):
+    if isinstance(kind, value_types.Time | value_types.Duration):
         return {"sec": random.randrange(2**31), "nanosec": random.randrange(10**9)}
-    if isinstance(kind, kinds.Bool):
+    if isinstance(kind, value_types.Bool):
         return random.random() < 0.5
     return (
-        "x" * random.randrange(6) if isinstance(kind, kinds.String) else float(random.randrange(-99, 99)) / 4
+        "x" * random.randrange(6)
+        if isinstance(kind, value_types.String)
+        else float(random.randrange(-99, 99)) / 4
     )
 
 
-def paths(kind: kinds.Type, value: object, path: str = "") -> Iterator[tuple[str, kinds.Type]]:
+def paths(kind: value_types.Type, value: object, path: str = "") -> Iterator[tuple[str, value_types.Type]]:
     """Every path to a value in a message, and the type there."""
     if path:
         yield path, kind
-    if isinstance(kind, kinds.Record) and isinstance(value, dict):
+    if isinstance(kind, value_types.Record) and isinstance(value, dict):
         for name, slot in Messages(definitions()).slots(kind.name).items():
             yield from paths(slot.type, value[name], f"{path}.{name}" if path else name)
-    if isinstance(kind, kinds.Vector) and isinstance(value, list):
+    if isinstance(kind, value_types.Vector) and isinstance(value, list):
         for index in range(min(len(value), 3)):
             yield from paths(kind.element, value[index], f"{path}[{index}]")
 
 
-def change(kind: kinds.Type, name: str) -> str:
+def change(kind: value_types.Type, name: str) -> str:
     """A statement that gives a variable of this type another value; nothing for whole messages and fixed arrays."""
-    if isinstance(kind, kinds.String):
+    if isinstance(kind, value_types.String):
         return f'{name} += "longer";'
-    if isinstance(kind, kinds.Bool):
+    if isinstance(kind, value_types.Bool):
         return f"{name} = !{name};"
-    if isinstance(kind, kinds.Vector) and kind.length is None:
+    if isinstance(kind, value_types.Vector) and kind.length is None:
         return f"{name}.resize(5);"
-    if isinstance(kind, kinds.Time | kinds.Duration):
+    if isinstance(kind, value_types.Time | value_types.Duration):
         return f"{name}.nsec = 17;"
-    return f"{name} = 7;" if kinds.is_number(kind) else ""
+    return f"{name} = 7;" if value_types.is_number(kind) else ""
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -69,9 +71,9 @@ def change(kind: kinds.Type, name: str) -> str:
 def test_every_field_of_a_random_message(kind: str, seed: int) -> None:
     """Bound one by one, each field is read right, and changed right."""
     random = Random(f"{kind} {seed}")  # noqa: S311  draws examples, not keys
-    value = content(random, kinds.Record(kind))
+    value = content(random, value_types.Record(kind))
     data = _encoded(kind, value)
-    found = list(paths(kinds.Record(kind), value))
+    found = list(paths(value_types.Record(kind), value))
     for path, field in random.sample(found, min(len(found), 25)):
         text = f"""s() {{ {kind} v; event e(auto p) /t {kind} '{{{path}:p}}' {{
             v = MESSAGE; ROS_INFO("%d", p == v.{path});

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from rosmop.learn.coverage import covered
+from rosmop.learn.exercised import covered
 from rosmop.tests.acting import message
 from rosmop.tests.learn.test_learner import START, Recorded
 from rosmop.text.errors import SpecificationError

@@ -5,8 +5,8 @@ from itertools import accumulate, product
 import pytest
 
 from rosmop.logics.dot import to_dot
-from rosmop.logics.lint import TIME, Fact, analyse, shortest_trace_to
-from rosmop.logics.past import ClockedPast
+from rosmop.logics.past_monitors import ClockedPast
+from rosmop.logics.property_lint import TIME, Fact, analyse, shortest_trace_to
 from rosmop.tests.logics.driving import compiled, seeded, told, traces
 from rosmop.tests.logics.temporal import draw
 from rosmop.tests.logics.test_mtl import ARITY, PRINTER, TEMPORAL, bounded

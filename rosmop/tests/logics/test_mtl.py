@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 import reelay
 
-from rosmop.logics import past
+from rosmop.logics import past_monitors
 from rosmop.logics.interface import ClockedProperty, FiniteProperty, Run
-from rosmop.logics.past import PastProperty, PastRun, Window
+from rosmop.logics.past_monitors import PastProperty, PastRun, Window
 from rosmop.tests.logics.driving import ABC, compiled, refusal, seeded
 from rosmop.tests.logics.temporal import Printer, Tree, draw
 
@@ -97,13 +97,13 @@ def timed_trace(random: Random, length: int, gap: int) -> Timed:
     return trace
 
 
-@pytest.mark.parametrize("folded", [past.MAX_FOLDED, 0])
+@pytest.mark.parametrize("folded", [past_monitors.MAX_FOLDED, 0])
 def test_random_formulas_by_definition(folded: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Validation exactly where the formula holds: 1500 formulas with bounds of all kinds, two traces each.
 
     Also of formulas that are too large to find what is left of them at each event.
     """
-    monkeypatch.setattr(past, "MAX_FOLDED", folded)
+    monkeypatch.setattr(past_monitors, "MAX_FOLDED", folded)
     random = seeded(9)
     for _ in range(1500):
         tree = bounded(draw(random, 3, TEMPORAL, ARITY, ("a", "b")), random, 6)

@@ -4,9 +4,9 @@ from itertools import product
 
 import pytest
 
-from rosmop.logics import past
+from rosmop.logics import past_monitors
 from rosmop.logics.interface import FiniteProperty
-from rosmop.logics.past import PastProperty
+from rosmop.logics.past_monitors import PastProperty
 from rosmop.tests.examples import examples
 from rosmop.tests.logics.driving import ABC, compiled, refusal, seeded, told, traces
 from rosmop.tests.logics.temporal import Printer, Tree, draw
@@ -80,10 +80,10 @@ def test_random_formulas_on_all_short_traces() -> None:
             assert told(monitor, word) == expected, (text, word)
 
 
-@pytest.mark.parametrize("folded", [past.MAX_FOLDED, 0])
+@pytest.mark.parametrize("folded", [past_monitors.MAX_FOLDED, 0])
 def test_table_and_folded_program_agree(folded: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A formula too large for a table is computed, with the same verdicts."""
-    monkeypatch.setattr(past, "MAX_FOLDED", folded)
+    monkeypatch.setattr(past_monitors, "MAX_FOLDED", folded)
     random = seeded(8)
     for _ in range(examples(40)):
         tree = draw(random, 4, TEMPORAL, ARITY, ("a", "b"))

@@ -7,7 +7,7 @@ from itertools import islice
 
 from rosmop.fast.batch_codegen import written
 from rosmop.form.compiled import Compiled
-from rosmop.form.components import groups
+from rosmop.form.specification_groups import groups
 from rosmop.prove.decoding import Code, Instruction
 from rosmop.prove.equality import EQUAL, Validation
 from rosmop.run.engine import MonitorSet

@@ -6,39 +6,39 @@ from rosmop.form.positions import Position
 from rosmop.tests.acting import definitions
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
-from rosmop.types import kinds
-from rosmop.types.kinds import Type
+from rosmop.types import value_types
 from rosmop.types.messages import Messages
 from rosmop.types.resolve import resolve
+from rosmop.types.value_types import Type
 
 HERE = Position("x.rv", 1, 1)
 
 SPELLINGS = [
-    ("int", kinds.INT),
-    ("signed", kinds.INT),
-    ("unsigned", kinds.UINT),
-    ("unsigned int", kinds.UINT),
-    ("int unsigned", kinds.UINT),
-    ("long", kinds.LONG),
-    ("long long", kinds.LONG),
-    ("long long int", kinds.LONG),
-    ("unsigned long long", kinds.ULONG),
-    ("short int", kinds.INT16),
-    ("unsigned short", kinds.UINT16),
-    ("char", kinds.CHAR),
-    ("signed char", kinds.INT8),
-    ("unsigned char", kinds.UINT8),
-    ("bool", kinds.BOOL),
-    ("float", kinds.FLOAT),
-    ("double", kinds.DOUBLE),
-    ("std string", kinds.STRING),
-    ("string", kinds.STRING),
-    ("std uint8_t", kinds.UINT8),
-    ("size_t", kinds.ULONG),
-    ("int64_t", kinds.LONG),
-    ("ros Time", kinds.TIME),
-    ("ros Duration", kinds.DURATION),
-    ("geometry_msgs Twist", kinds.Record("geometry_msgs/Twist")),
+    ("int", value_types.INT),
+    ("signed", value_types.INT),
+    ("unsigned", value_types.UINT),
+    ("unsigned int", value_types.UINT),
+    ("int unsigned", value_types.UINT),
+    ("long", value_types.LONG),
+    ("long long", value_types.LONG),
+    ("long long int", value_types.LONG),
+    ("unsigned long long", value_types.ULONG),
+    ("short int", value_types.INT16),
+    ("unsigned short", value_types.UINT16),
+    ("char", value_types.CHAR),
+    ("signed char", value_types.INT8),
+    ("unsigned char", value_types.UINT8),
+    ("bool", value_types.BOOL),
+    ("float", value_types.FLOAT),
+    ("double", value_types.DOUBLE),
+    ("std string", value_types.STRING),
+    ("string", value_types.STRING),
+    ("std uint8_t", value_types.UINT8),
+    ("size_t", value_types.ULONG),
+    ("int64_t", value_types.LONG),
+    ("ros Time", value_types.TIME),
+    ("ros Duration", value_types.DURATION),
+    ("geometry_msgs Twist", value_types.Record("geometry_msgs/Twist")),
 ]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.shares.table import REST_CONNECTIONS
+from appliance.quotas.table import REST_CONNECTIONS
 from tests.support.appliance import Appliance
 from tests.support.rest import Rest
 from tests.support.waiting import eventually

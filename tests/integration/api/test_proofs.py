@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from appliance.order_proof import HEADER, proof_of, reading_key, statement
+from appliance.signing.request_signing import HEADER, proof_of, reading_key, statement
 from tests.support.appliance import Appliance
 from tests.support.command import rosrv
 from tests.support.rest import Answer, Rest

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from appliance.shares.table import AUDIT_BYTES, AUDIT_KINDS
+from appliance.quotas.table import AUDIT_BYTES, AUDIT_KINDS
 from examples.landshark.lab import Lab
 from tests.support.nodes import has_ros
 from tests.support.requirements import need_root, needs

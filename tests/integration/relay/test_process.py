@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.channel.messages import NodePlaced, NodeWithdrawn, StateEnded
-from appliance.relay.limits import Limits
+from appliance.relay.bounds import Limits
 from appliance.relay.process import fitted
 from tests.support.relay_driver import LOOPBACK, RelayProcess
 

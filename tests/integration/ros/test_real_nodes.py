@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from roswire.definitions import Definitions
-from roswire.layout import StringPart
+from roswire.message_layout import StringPart
 from roswire.standard import standard_definitions
 from roswire.tcpros import FrameParser, HeaderParser, ServiceReplyParser, encode_frame, encode_header
 from roswire.uris import parse_node_uri, parse_service_uri

@@ -32,7 +32,7 @@ from appliance.channel.messages import (
     StateBegan,
     Stop,
 )
-from appliance.config import load_resolved
+from appliance.configuration.settings import load_resolved
 
 ECHO = "echo"
 CROWD = 2_000  # two for each node of a robot with a thousand

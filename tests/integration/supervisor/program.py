@@ -14,10 +14,10 @@ from unittest import mock
 
 import setproctitle
 
-from appliance.config import Settings
+from appliance.configuration.settings import Settings
 from appliance.supervisor import run
-from appliance.supervisor.enclosure import Enclosure
 from appliance.supervisor.errors import StartError
+from appliance.supervisor.isolation_lifecycle import Enclosure
 from appliance.supervisor.logs import configure_logs
 from appliance.supervisor.roles import Role, roles_of
 from appliance.supervisor.supervisor import ControlReady

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.audit.log import AuditLog
-from appliance.supervisor.clock import clock_is_synchronised
+from appliance.supervisor.clock_sync import clock_is_synchronised
 from tests.support.appliance import Appliance
 from tests.support.audit import decision, settle
 from tests.support.rosmaster import master_at

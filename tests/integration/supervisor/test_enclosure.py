@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.enclosure` on a host of the lab: the real kernel, the real firewall."""
+"""Tests of `appliance.supervisor.isolation_lifecycle` on a host of the lab: the real kernel, the real firewall."""
 
 import os
 import socket
@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from appliance.network.firewall.firewall import FirewallReport
-from appliance.network.firewall.rules import PortRange
+from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import NetworkError
-from appliance.supervisor.enclosure import Contained, InNamespace, Ports
+from appliance.supervisor.isolation_lifecycle import Contained, InNamespace, Ports
 from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_program, need_root
 from tests.support.translators import TRANSLATORS, load
@@ -156,7 +156,7 @@ def test_an_end_does_not_wait_for_a_look_that_hangs(
     host: Host, enclosure: Contained, hidden: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The rules are taken away all the same, and the look puts nothing back when it wakes up."""
-    monkeypatch.setattr("appliance.supervisor.enclosure._PATIENCE_SECONDS", 0.1)
+    monkeypatch.setattr("appliance.supervisor.isolation_lifecycle._PATIENCE_SECONDS", 0.1)
     enclosure.build()
     firewall = enclosure.firewall
     assert firewall is not None

@@ -19,18 +19,18 @@ import pytest
 
 from appliance.channel.channel import Channel
 from appliance.channel.messages import Lifeline, Walled
-from appliance.supervisor.post import Post
+from appliance.supervisor.process_slot import Post
 from appliance.supervisor.roles import Facts, Role, roles_of
-from appliance.supervisor.state import StateDirectory
+from appliance.supervisor.sandbox import landlock
+from appliance.supervisor.state_directory import StateDirectory
 from appliance.supervisor.users import Account, account_of
-from appliance.supervisor.walls import landlock
 from tests.integration.supervisor import trying
 from tests.support.appliance import Appliance
 from tests.support.requirements import need_root, needs
 from tests.support.waiting import eventually
 
 ROOT = Path(trying.__file__).parents[3]
-CHILD = "appliance.supervisor.child"
+CHILD = "appliance.supervisor.child_entry"
 UNIX, NETWORK, ROUTES = (
     ["AF_UNIX"],
     ["AF_UNIX", "AF_INET", "AF_INET6"],

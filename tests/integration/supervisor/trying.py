@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from appliance.supervisor.walls.calls import FORBIDDEN
-from appliance.supervisor.walls.seccomp import LIBRARY
+from appliance.supervisor.sandbox.seccomp import LIBRARY
+from appliance.supervisor.sandbox.system_calls import FORBIDDEN
 
 FAMILIES = ("AF_UNIX", "AF_INET", "AF_INET6", "AF_NETLINK", "AF_PACKET", "AF_ALG", "AF_VSOCK", "AF_BLUETOOTH")
 _KINDS = {"AF_NETLINK": socket.SOCK_RAW, "AF_PACKET": socket.SOCK_RAW, "AF_ALG": socket.SOCK_SEQPACKET}

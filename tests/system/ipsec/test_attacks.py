@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from appliance.ipsec.strongswan import USER_SPACE_INTERFACE
-from appliance.network import links
+from appliance.network import interfaces
 from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.esp_packets import initiators_keys
 from tests.support.processes import LIMIT, Event
@@ -106,7 +106,7 @@ def lab_host(site: TunnelSite) -> Host:
 
 def esp_is_charons(site: TunnelSite) -> bool:
     """Whether ESP runs in user space, where charon sees what is dropped."""
-    return USER_SPACE_INTERFACE in links.links(lab_host(site).namespace)
+    return USER_SPACE_INTERFACE in interfaces.links(lab_host(site).namespace)
 
 
 @contextlib.contextmanager
@@ -240,8 +240,8 @@ def test_the_right_address_without_a_tunnel_is_nobody(site: TunnelSite, kit: Pat
     one by the firewall."""
     with site.joined(kit) as joined:
         virtual = joined.address
-    links.add_address(site.ocu.namespace, INTERFACE, f"{virtual}/32")
-    links.add_route(site.ocu.namespace, f"{OWN}/32", MIDDLE)
+    interfaces.add_address(site.ocu.namespace, INTERFACE, f"{virtual}/32")
+    interfaces.add_route(site.ocu.namespace, f"{OWN}/32", MIDDLE)
     try:
         assert _ask(site.ocu, OCU, MIDDLE) == "answered"
         mark = site.mark

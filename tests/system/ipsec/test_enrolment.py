@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 
 from appliance.ipsec.requests import make_key, signing_request
-from appliance.network import links
+from appliance.network import interfaces
 from examples.landshark.lab import Lab
 from tests.support.command import ROSRV
 from tests.support.nodes import RosSession
@@ -140,7 +140,7 @@ def forged(site: TunnelSite, laptop: ScriptHost) -> None:
     """A datagram from the wire with the appliance's tunnel address is dropped: it counts in the tunnel only."""
     before = dropped(laptop)
     stranger = site.attacker.namespace
-    links.add_address(stranger, "lo", f"{OWN}/32")
+    interfaces.add_address(stranger, "lo", f"{OWN}/32")
     try:
         with stranger.entered(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
             sock.bind((OWN, 0))
@@ -149,7 +149,7 @@ def forged(site: TunnelSite, laptop: ScriptHost) -> None:
         while dropped(laptop) == before:
             assert time.monotonic() < deadline, "the forged datagram passed the laptop's firewall"
     finally:
-        links.delete_address(stranger, "lo", f"{OWN}/32")
+        interfaces.delete_address(stranger, "lo", f"{OWN}/32")
 
 
 def dropped(laptop: ScriptHost) -> int:

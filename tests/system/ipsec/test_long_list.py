@@ -8,7 +8,7 @@ from pathlib import Path
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from appliance.ipsec.authority import Authority
+from appliance.ipsec.certificate_authority import Authority
 from examples.landshark.lab import Lab
 from tests.support.processes import LIMIT
 from tests.support.requirements import need_root

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance.ipsec.authority import Authority
+from appliance.ipsec.certificate_authority import Authority
 from appliance.ipsec.requests import make_key, signing_request
-from appliance.network import links
+from appliance.network import interfaces
 from examples.landshark.lab import INTERFACE, Lab
 from tests.support.nodes import RosSession
 from tests.support.processes import Event
@@ -81,8 +81,8 @@ def test_nodes_talk_through_the_tunnel(site: TunnelSite, joined: JoinedHost) -> 
 def test_a_forged_address_gets_nowhere(site: TunnelSite, kit: Path) -> None:
     """Packets in clear text from the trusted address are dropped before anything answers, tunnel or no tunnel."""
     forged = "10.113.11.2"
-    links.add_address(site.attacker.namespace, INTERFACE, f"{forged}/32")
-    links.add_route(site.attacker.namespace, f"{OWN}/32", MIDDLE)
+    interfaces.add_address(site.attacker.namespace, INTERFACE, f"{forged}/32")
+    interfaces.add_route(site.attacker.namespace, f"{OWN}/32", MIDDLE)
 
     def connect(source: str, target: str) -> str:
         def work() -> str:

@@ -1,12 +1,12 @@
-"""Tests of `appliance.network.endpoint`: hosts of the lab with the addresses and routes that machines have."""
+"""Tests of `appliance.network.public_address`: hosts of the lab with the addresses and routes that machines have."""
 
 from collections.abc import Iterator
 
 import pytest
 
-from appliance.network import links
-from appliance.network.endpoint import Endpoint, only_address, outward_address
+from appliance.network import interfaces
 from appliance.network.namespaces import NetworkError
+from appliance.network.public_address import Endpoint, only_address, outward_address
 from examples.landshark.lab import INTERFACE, Lab
 from tests.support.requirements import need_root
 
@@ -26,7 +26,7 @@ def lab() -> Iterator[Lab]:
 def test_the_default_route_decides_between_addresses(lab: Lab) -> None:
     """The address on its way out is taken, whatever others the machine has; IPv6 only where IPv4 leads nowhere."""
     both = lab.host("both", "10.78.0.2/24", "fd78::2/64", gateway="10.78.0.1").namespace
-    links.add_address(both, INTERFACE, "10.79.0.2/24")
+    interfaces.add_address(both, INTERFACE, "10.79.0.2/24")
     assert outward_address(both, without=LO) == Endpoint("10.78.0.2", ROUTE)
     six = lab.host("six", "fd78::3/64", gateway="fd78::1").namespace
     assert outward_address(six, without=LO) == Endpoint("fd78::3", ROUTE)
@@ -35,7 +35,7 @@ def test_the_default_route_decides_between_addresses(lab: Lab) -> None:
 def test_without_a_default_route_the_only_address_is_taken(lab: Lab) -> None:
     """Loopback does not count, nor does what is on an interface that is left out; IPv4 goes before IPv6."""
     host = lab.host("alone", "10.78.0.4/24", "fd78::4/64").namespace
-    links.add_address(host, "lo", "10.113.11.1/32")
+    interfaces.add_address(host, "lo", "10.113.11.1/32")
     assert outward_address(host, without=LO) == only_address(host, without=LO) == Endpoint("10.78.0.4", ONLY)
     with pytest.raises(NetworkError, match=r"several addresses here \(10\.78\.0\.4, 10\.113\.11\.1\)"):
         only_address(host, without=())

@@ -13,11 +13,18 @@ from typing import Any
 import pytest
 
 from appliance.network.firewall.backend import BackendMissingError, FirewallError
+from appliance.network.firewall.backend_check import prove
 from appliance.network.firewall.firewall import BackendChoice, Firewall
+from appliance.network.firewall.firewall_rules import (
+    Chain,
+    FirewallSettings,
+    PortRange,
+    RateLimit,
+    Rule,
+    Verdict,
+)
 from appliance.network.firewall.iptables import IptablesBackend
 from appliance.network.firewall.nft import NftBackend
-from appliance.network.firewall.proof import prove
-from appliance.network.firewall.rules import Chain, FirewallSettings, PortRange, RateLimit, Rule, Verdict
 from appliance.network.probe import PROBE_UID, Outcome, probe_port
 from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.requirements import need_program, need_root
@@ -397,7 +404,7 @@ def test_auto_takes_the_one_that_takes_every_rule(
 CONFINED = """
 import sys
 from appliance.network.firewall.firewall import Firewall
-from appliance.network.firewall.rules import FirewallSettings
+from appliance.network.firewall.firewall_rules import FirewallSettings
 from appliance.network.namespaces import Namespace, NetworkError
 from appliance.network.probe import probe_port
 firewall = Firewall(Namespace.own(), sys.argv[2])

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.network.firewall.firewall import BackendChoice, Firewall
-from appliance.network.firewall.rules import FirewallSettings, PortRange
+from appliance.network.firewall.firewall_rules import FirewallSettings, PortRange
 from examples.landshark.lab import Host, Lab
 from tests.support.forged_syns import flood_command
 from tests.support.requirements import need_program, need_root

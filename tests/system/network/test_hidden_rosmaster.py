@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from appliance.network.firewall.firewall import BackendChoice, Firewall
-from appliance.network.firewall.rules import FirewallSettings
+from appliance.network.firewall.firewall_rules import FirewallSettings
 from appliance.network.probe import probe_port
 from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_program, need_root

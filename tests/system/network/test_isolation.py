@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network import links
-from appliance.network.firewall.rules import PortRange
+from appliance.network import interfaces
+from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
-from appliance.network.listeners import listening_ports
+from appliance.network.listening_sockets import listening_ports
 from appliance.network.namespaces import Namespace, NetworkError
 from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_program, need_root
@@ -101,8 +101,8 @@ def state(host: Host) -> tuple[str, ...]:
     return (
         rules,
         *(f"{key}={host.namespace.sysctl(key)}" for key in keys),
-        *links.links(host.namespace),
-        *(text for text in links.networks(host.namespace) if "." in text),
+        *interfaces.links(host.namespace),
+        *(text for text in interfaces.networks(host.namespace) if "." in text),
     )
 
 
@@ -189,11 +189,11 @@ def test_the_hosts_own_processes_reach_the_appliance(bare: Host, tmp_path: Path)
 def test_nothing_else_is_reached_through_the_host(lab: Lab, bare: Host, node: Host, tmp_path: Path) -> None:
     """A host that routes to the namespace by itself reaches no port of it, and the host routes for nobody."""
     far = lab.host("far", "10.99.0.1/24", gateway="10.99.0.2")
-    links.add_address(bare.namespace, "eth0", "10.99.0.2/24")
+    interfaces.add_address(bare.namespace, "eth0", "10.99.0.2/24")
     with isolated(bare, tmp_path) as isolation:
         appliance = isolation.ends[4].appliance
-        links.add_route(node.namespace, f"{appliance}/32", bare.address)
-        links.add_route(node.namespace, "10.99.0.0/24", bare.address)
+        interfaces.add_route(node.namespace, f"{appliance}/32", bare.address)
+        interfaces.add_route(node.namespace, "10.99.0.0/24", bare.address)
         with (
             serving(isolation.namespace, 9999),
             serving(isolation.namespace, MASTER),
@@ -242,8 +242,8 @@ def test_going_down_puts_everything_back(bare: Host, tmp_path: Path) -> None:
 def test_a_router_stays_a_router(lab: Lab, bare: Host, node: Host, tmp_path: Path) -> None:
     """A host that forwarded before goes on forwarding for others while the appliance runs and afterwards."""
     far = lab.host("far", "10.99.0.1/24", gateway="10.99.0.2")
-    links.add_address(bare.namespace, "eth0", "10.99.0.2/24")
-    links.add_route(node.namespace, "10.99.0.0/24", bare.address)
+    interfaces.add_address(bare.namespace, "eth0", "10.99.0.2/24")
+    interfaces.add_route(node.namespace, "10.99.0.0/24", bare.address)
     bare.namespace.sysctl("net.ipv4.ip_forward", "1")
     with serving(far.namespace, 9999) as server:
         with isolated(bare, tmp_path):
@@ -254,7 +254,7 @@ def test_a_router_stays_a_router(lab: Lab, bare: Host, node: Host, tmp_path: Pat
 CRASHER = """
 import signal, sys
 from pathlib import Path
-from appliance.network.firewall.rules import PortRange
+from appliance.network.firewall.firewall_rules import PortRange
 from appliance.network.isolation import Isolation, IsolationSettings
 from appliance.network.namespaces import Namespace
 isolation = Isolation(Namespace(sys.argv[1]), IsolationSettings(
@@ -293,7 +293,7 @@ def test_a_crash_leaves_one_set_after_the_next_start(bare: Host, node: Host, tmp
 
 def test_the_subnet_collides_with_no_route(bare: Host, tmp_path: Path) -> None:
     """A free subnet is chosen; one that is given and collides is an error that names the route."""
-    links.add_address(bare.namespace, "eth0", "10.111.0.9/26")
+    interfaces.add_address(bare.namespace, "eth0", "10.111.0.9/26")
     with isolated(bare, tmp_path) as isolation:
         assert isolation.ends[4].network == "10.111.0.64/30"
     with isolated(bare, tmp_path, subnet="10.50.0.0/29", subnet6="fd00:50::/64") as isolation:
@@ -313,7 +313,7 @@ def test_a_foreign_namespace_or_interface_is_not_taken(bare: Host, tmp_path: Pat
         assert foreign.exists()
     finally:
         foreign.delete()
-    links.create_bridge(bare.namespace, wanted.link)
+    interfaces.create_bridge(bare.namespace, wanted.link)
     before = state(bare)
     with pytest.raises(NetworkError, match=f"interface {wanted.link}"):
         Isolation(bare.namespace, wanted).up()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network import links
+from appliance.network import interfaces
 from appliance.network.namespaces import Namespace, NetworkError, namespaces
 from examples.landshark.lab import Lab, clear_leftovers
 from tests.support.requirements import need_root
@@ -68,7 +68,7 @@ def test_works_under_a_running_event_loop() -> None:
 
     async def main() -> list[str]:
         with Lab("rosrv-lab") as lab:
-            return links.links(lab.host("robot", "10.77.0.10/24").namespace)
+            return interfaces.links(lab.host("robot", "10.77.0.10/24").namespace)
 
     with ThreadPoolExecutor() as thread:  # this one may have a loop: that of the tests in a browser
         assert sorted(thread.submit(asyncio.run, main()).result()) == ["eth0", "lo"]

@@ -11,7 +11,7 @@ import pytest
 
 from appliance.channel.own_node import ADDRESS
 from appliance.network.firewall.firewall import BackendChoice, Firewall
-from appliance.network.firewall.rules import FirewallSettings, OwnNode, PortRange
+from appliance.network.firewall.firewall_rules import FirewallSettings, OwnNode, PortRange
 from appliance.supervisor.users import account_of
 from examples.landshark.lab import Host, Lab
 from tests.support.appliance import Appliance

@@ -11,15 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network import links
+from appliance.network import interfaces
 from examples.landshark.lab import Host, Lab
 from tests.support.requirements import need_program, need_root
 from tests.support.translators import TRANSLATORS, guest_behind, load
 from tests.system.network.test_isolation import serving, source_seen
 
-COMMAND = (
-    "import sys, typer; from appliance.cli.protect import protect; sys.argv[0] = 'rosrv'; typer.run(protect)"
-)
+COMMAND = "import sys, typer; from appliance.cli.protect_verb import protect; sys.argv[0] = 'rosrv'; typer.run(protect)"
 FEW = "40000-40099"  # a range that is scanned fast
 INSIDE, KEPT, OUTSIDE = 40007, 40022, 39000
 
@@ -126,9 +124,9 @@ def test_nobody_behind_the_machine_is_taken_for_it(
     """A container on the robot arrives at the appliance as the robot; with the protection it does not arrive at all."""
     need_program("iptables-legacy-restore", "iptables")
     behind = lab.host("container", "10.76.0.2/24")
-    links.delete_link(behind.namespace, "eth0")
+    interfaces.delete_link(behind.namespace, "eth0")
     guest = guest_behind(robot.namespace, behind.namespace, TRANSLATORS[0])
-    links.add_route(gateway.namespace, f"{TRANSLATORS[0].network}.0/24", robot.address)
+    interfaces.add_route(gateway.namespace, f"{TRANSLATORS[0].network}.0/24", robot.address)
     with serving(gateway.namespace, 11311) as master, serving(attacker.namespace, 80) as elsewhere:
         assert source_seen(master, guest, gateway.address, 11311) == robot.address
         close(robot, gateway)
@@ -299,7 +297,7 @@ def test_without_root_the_error_says_so(robot: Host) -> None:
         "except NetworkError as error: print(error)\n"
     )
     process = robot.popen(
-        [sys.executable, "-c", "import appliance.network.protect\n" + program],
+        [sys.executable, "-c", "import appliance.network.close_ports\n" + program],
         stdout=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])},

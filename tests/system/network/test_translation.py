@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network import links
+from appliance.network import interfaces
 from appliance.network.firewall.firewall import BackendChoice, Firewall
+from appliance.network.firewall.firewall_rules import FirewallSettings
 from appliance.network.firewall.nft import NftBackend
-from appliance.network.firewall.rules import FirewallSettings
 from appliance.network.namespaces import Namespace
 from examples.landshark.lab import Host, Lab
 from tests.support.docker import Engine
@@ -45,7 +45,7 @@ def machine(lab: Lab) -> Host:
 def behind(lab: Lab) -> Namespace:
     """A namespace for the guest, which the lab clears away with its host."""
     host = lab.host("guest", "10.76.0.2/24")
-    links.delete_link(host.namespace, "eth0")
+    interfaces.delete_link(host.namespace, "eth0")
     return host.namespace
 
 

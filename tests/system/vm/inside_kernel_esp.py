@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network import links
+from appliance.network import interfaces
 from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.nodes import RosSession
 from tests.support.processes import LIMIT
@@ -58,7 +58,7 @@ def test_esp_is_the_kernels(site: TunnelSite, joined: JoinedHost) -> None:
     assert status["ipsec"]["up"] == 1
     states = told(middle(site), "ip", "xfrm", "state")
     assert states.count("rfc4106(gcm(aes))") == 2
-    assert links.links(middle(site).namespace).count("ipsec0") == 0
+    assert interfaces.links(middle(site).namespace).count("ipsec0") == 0
     assert status["firewall"]["backend"] == "nft"
     rules = told(middle(site), "nft", "list", "ruleset")
     assert "ip saddr 10.113.11.0/24 meta ipsec missing" in rules
@@ -79,9 +79,9 @@ def test_a_node_publishes_through_the_kernel(site: TunnelSite, joined: JoinedHos
 def test_a_forged_address_gets_nowhere(site: TunnelSite, joined: JoinedHost) -> None:
     """Packets in clear text from a virtual address are dropped, while those in the tunnel are answered: of a host
     whose tunnel stands, of one whose does not, and of nobody's."""
-    links.add_route(site.attacker.namespace, f"{OWN}/32", MIDDLE)
+    interfaces.add_route(site.attacker.namespace, f"{OWN}/32", MIDDLE)
     for forged in (joined.address, "10.113.11.77"):
-        links.add_address(site.attacker.namespace, INTERFACE, f"{forged}/32")
+        interfaces.add_address(site.attacker.namespace, INTERFACE, f"{forged}/32")
         assert connect(site.attacker, forged, MIDDLE) == "nothing"
         assert connect(site.attacker, forged, OWN) == "nothing"
     assert connect(site.attacker, ATTACKER, MIDDLE) == "connected", "the way there is open"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network import links
+from appliance.network import interfaces
 from appliance.network.namespaces import Namespace, namespaces
 from examples.landshark.lab import INTERFACE, Host, Lab
 from tests.support.appliance import Appliance
@@ -44,8 +44,10 @@ def state_of_the_machine() -> dict[str, object]:
         "iptables": "ROSRV" in told("iptables-legacy-save") + told("ip6tables-legacy-save"),
         "states": told("ip", "xfrm", "state"),
         "policies": told("ip", "xfrm", "policy"),
-        "interfaces": sorted(links.links(Namespace.own())),
-        "addresses": sorted(one for one in links.addresses(Namespace.own()) if not one.startswith("fe80")),
+        "interfaces": sorted(interfaces.links(Namespace.own())),
+        "addresses": sorted(
+            one for one in interfaces.addresses(Namespace.own()) if not one.startswith("fe80")
+        ),
         "namespaces": [one.name for one in namespaces() if not one.name.startswith("rosrv-machine")],
         "forwarding": Path("/proc/sys/net/ipv4/ip_forward").read_text(),
     }
@@ -76,7 +78,7 @@ def test_the_appliance_on_a_machine(lab: Lab, tmp_path: Path, isolation: str, ba
                 ):
                     there.talker("rospy", "/orders", name="boss")
                     here.listener("rospy", "/orders", name="arm").wait_for(event="received", timeout=LONG)
-                links.add_address(attacker.namespace, INTERFACE, f"{joined.address}/32")
+                interfaces.add_address(attacker.namespace, INTERFACE, f"{joined.address}/32")
                 assert connect(attacker, joined.address, MIDDLE) == "nothing"
                 assert connect(attacker, ATTACKER, MIDDLE) == "connected"
                 assert connect(ocu, joined.address, OWN) == "connected"

@@ -12,7 +12,7 @@ from appliance.api.history import History
 from appliance.api.journal import Journal
 from appliance.api.services import Services
 from appliance.channel.answers.measures import Measures
-from appliance.config import Settings
+from appliance.configuration.settings import Settings
 from tests.support.answers import example
 
 

@@ -9,8 +9,8 @@ import pytest
 from appliance.api.access import Doorkeeper
 from appliance.api.problems import ProblemError
 from appliance.channel.messages.api import TokenKept
-from appliance.store import tokens
-from appliance.store.tokens import TokenRow, make_token
+from appliance.store import access_tokens
+from appliance.store.access_tokens import TokenRow, make_token
 
 
 def kept(row: TokenRow) -> TokenKept:
@@ -57,8 +57,8 @@ def test_the_costly_check_runs_once_for_a_good_token(monkeypatch: pytest.MonkeyP
         checks.append(secret)
         return real(secret, salt)
 
-    real = tokens.hash_secret
-    monkeypatch.setattr(tokens, "hash_secret", counted)
+    real = access_tokens.hash_secret
+    monkeypatch.setattr(access_tokens, "hash_secret", counted)
     door = Doorkeeper(10)
     door.state([kept(row)])
     for _ in range(3):
@@ -75,7 +75,7 @@ def test_guessing_a_secret_is_cut_short(monkeypatch: pytest.MonkeyPatch) -> None
         checks.append(secret)
         return b"never"
 
-    monkeypatch.setattr(tokens, "hash_secret", counted)
+    monkeypatch.setattr(access_tokens, "hash_secret", counted)
     door = Doorkeeper(5)
     door.state([kept(row)])
     wrong = f"Bearer rosrv_{row.id}_" + "A" * 43

@@ -14,7 +14,7 @@ import appliance.api
 from appliance.api.console import VIEWS, routes
 from appliance.api.gate import is_console
 from appliance.api.problems import ProblemError
-from appliance.config import Settings
+from appliance.configuration.settings import Settings
 from appliance.policy.model import Category
 
 FILES = Path(appliance.api.__file__).parent / "console"

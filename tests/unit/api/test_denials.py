@@ -9,13 +9,13 @@ from appliance.api.denials import DENIALS, asks_policy, is_denial
 from appliance.api.judgement import explained
 from appliance.audit.events import EVENTS
 from appliance.audit.record import Record, RuleReference
-from appliance.audit_trail import rule_reference
 from appliance.channel.answers.policy import PolicyKnown, Why
 from appliance.channel.messages.relay import Violation
 from appliance.master.graph.graph import revocation
-from appliance.policy.compiler import compile_policy
-from appliance.policy.live import Live, may_keep
+from appliance.policy.live_rights import Live, may_keep
+from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.settings import AT_ONCE
+from appliance.telemetry.audit_trail import rule_reference
 from distribution.audit_events_page import uses
 
 HOST = "10.0.0.9"

@@ -15,8 +15,8 @@ from starlette.types import Receive, Scope, Send
 
 from appliance.api.certificate import tls_context
 from appliance.api.listener import Listener
-from appliance.config import ApiLimits
-from appliance.shares.pool import Standing
+from appliance.configuration.settings import ApiLimits
+from appliance.quotas.pool import Standing
 
 REQUEST = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 Connect = Callable[[], Awaitable[tuple[asyncio.StreamReader, asyncio.StreamWriter]]]

@@ -1,4 +1,4 @@
-"""Tests of `appliance.metrics` and `appliance.api.metrics`."""
+"""Tests of `appliance.telemetry.metrics` and `appliance.api.metrics`."""
 
 import os
 import time
@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from appliance.api.metrics import rendered
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import RecorderState
-from appliance.metrics import BOUNDS, METRICS, Meter, markdown
+from appliance.telemetry.metrics import BOUNDS, METRICS, Meter, markdown
 from tests.support.answers import example
 
 PAGE = Path(__file__).parents[3] / "docs" / "metrics.md"
@@ -168,8 +168,8 @@ def test_nothing_is_said_of_a_forwarding_that_nobody_wants() -> None:
 
 
 def test_the_page_is_what_the_code_says() -> None:
-    """docs/metrics.md lists what is measured (python -m appliance.metrics)."""
-    generated = PAGE.read_text().split("<!-- generated: python -m appliance.metrics -->\n")[1]
+    """docs/metrics.md lists what is measured (python -m appliance.telemetry.metrics)."""
+    generated = PAGE.read_text().split("<!-- generated: python -m appliance.telemetry.metrics -->\n")[1]
     assert generated.startswith(markdown())
 
 

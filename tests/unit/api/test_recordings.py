@@ -15,7 +15,7 @@ from appliance.api.problems import ProblemError
 from appliance.api.services import Services
 from appliance.channel.admin import AdminAnswer
 from appliance.channel.answers.recordings import Recording
-from appliance.recorder.bag import BagWriter, Message
+from appliance.recorder.bag_writer import BagWriter, Message
 from appliance.recorder.mcap import as_mcap
 from tests.support.answers import example
 from tests.unit.recorder.test_bag import HEADER, SECOND, body

@@ -11,7 +11,7 @@ from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
 from appliance.api.streams import Held, Streams
 from appliance.channel.answers.tokens import TokenRole
-from appliance.shares.table import REST_STREAM_PEERS, REST_STREAMS
+from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
 
 def bearer(name: str, role: TokenRole = "viewer") -> Bearer:

@@ -10,8 +10,8 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log import AuditLog
-from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints
 from appliance.ipsec.removals import Kept, RemovalRefusedError, Removals
+from appliance.ipsec.signed_checkpoints import CheckpointRefusedError, SignedCheckpoints
 
 MakeLog = Callable[..., AuditLog]
 

@@ -2,7 +2,7 @@
 
 from appliance.audit.budget import RATE, Budget, weight
 from appliance.audit.record import Record
-from appliance.shares.pool import Bounds, Standing
+from appliance.quotas.pool import Bounds, Standing
 
 ROBOT, GUEST = "10.0.0.1", "10.0.0.66"
 BOUNDS = Bounds(whole=1 << 40, host=1 << 20, strangers=0, kept=1 << 39)

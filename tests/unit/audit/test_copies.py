@@ -10,6 +10,7 @@ import msgspec
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from appliance.audit.chain_findings import Kind, Verification
 from appliance.audit.copies import (
     SYSLOG_ELEMENT,
     CopiesUnreadableError,
@@ -17,9 +18,8 @@ from appliance.audit.copies import (
     read_copies,
     signed_checkpoints,
 )
-from appliance.audit.findings import Kind, Verification
 from appliance.audit.retention import Retention
-from appliance.audit.verify import verify
+from appliance.audit.verification import verify
 from tests.support.audit import decision, settle
 from tests.support.forgery import write_anew
 from tests.unit.audit.conftest import MakeLog, Notary

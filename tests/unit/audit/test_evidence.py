@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from appliance.audit.evidence import evidence, evidence_line
+from appliance.audit.chain_findings import Kind
+from appliance.audit.chain_proofs import evidence, evidence_line
 from appliance.audit.export_proof import ExportUnreadableError, ExportVerification, verify_export
-from appliance.audit.findings import Kind
 from appliance.audit.log import AuditLog
-from appliance.audit.output import as_json
 from appliance.audit.query import Filter
+from appliance.audit.record_format import as_json
 from appliance.audit.retention import Retention
 from appliance.audit.search import export
 from appliance.audit.signatures import read_public_key

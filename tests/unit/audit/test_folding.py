@@ -7,7 +7,7 @@ import msgspec
 
 from appliance.audit.folding import Folder, FoldSettings
 from appliance.audit.record import Record, RuleReference
-from appliance.shares.pool import Bounds
+from appliance.quotas.pool import Bounds
 
 _numbers = itertools.count(1)
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from appliance.audit.database import open_for_reading
-from appliance.audit.holders import holders
+from appliance.audit.lock_holders import holders
 from appliance.audit.log import AuditLog
+from appliance.audit.log_database import open_for_reading
 from tests.support.audit import decision, settle
 
 _HOLD = """\

@@ -20,7 +20,7 @@ from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.record import Repeated
 from appliance.audit.search import export, search, show
-from appliance.audit.verify import verify
+from appliance.audit.verification import verify
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
 from tests.support.waiting import eventually

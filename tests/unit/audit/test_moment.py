@@ -2,7 +2,7 @@
 
 import pytest
 
-from appliance.audit.moment import MomentError, parse_moment
+from appliance.audit.timestamps import MomentError, parse_moment
 
 _NOW = 1_800_000_000_000_000_000
 _SECOND = 1_000_000_000

@@ -5,8 +5,8 @@ import json
 import msgspec
 import pytest
 
-from appliance.audit.output import Entry, as_json, as_object, printable, rfc3339, without_contents
 from appliance.audit.record import Record, RuleReference, Severity
+from appliance.audit.record_format import Entry, as_json, as_object, printable, rfc3339, without_contents
 from appliance.audit.why import lines_of
 
 _RECORD = Record(

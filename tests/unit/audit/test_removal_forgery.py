@@ -9,16 +9,16 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
+from appliance.audit.chain_findings import Kind, Verification
 from appliance.audit.copies import signed_checkpoints
-from appliance.audit.findings import Kind, Verification
 from appliance.audit.log import AuditLog
+from appliance.audit.log_writer import ChainWriter, RemovedRange
 from appliance.audit.query import Filter
 from appliance.audit.record import Record, Severity
 from appliance.audit.retention import Retention
 from appliance.audit.search import export, search
-from appliance.audit.verify import verify
-from appliance.audit.writer import ChainWriter, RemovedRange
-from appliance.sealed_texts import Removal
+from appliance.audit.verification import verify
+from appliance.signing.signed_statements import Removal
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, Notary
 from tests.unit.audit.test_retention import await_removal, make_old

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
-from appliance.audit.findings import Kind
+from appliance.audit.chain_findings import Kind
 from appliance.audit.query import Filter
 from appliance.audit.record import Record, Severity
 from appliance.audit.retention import Retention, worth_keeping
 from appliance.audit.search import export, search
-from appliance.audit.verify import verify
+from appliance.audit.verification import verify
 from tests.support.audit import decision, settle
 from tests.support.waiting import eventually
 from tests.unit.audit.conftest import MakeLog, Notary

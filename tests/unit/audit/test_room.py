@@ -11,7 +11,7 @@ from appliance.audit.budget import Budget
 from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.search import search
-from appliance.shares.pool import Standing
+from appliance.quotas.pool import Standing
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
 from tests.support.waiting import eventually

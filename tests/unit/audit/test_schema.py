@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
+from appliance.audit.chain_proofs import Chain
 from appliance.audit.events import EVENTS
-from appliance.audit.evidence import Chain
-from appliance.audit.output import Entry, as_object
 from appliance.audit.record import Record, RuleReference
+from appliance.audit.record_format import Entry, as_object
 from appliance.audit.schema import json_schema
 from distribution.audit_record_page import CHAIN, markdown
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from appliance.audit.database import LogUnreadableError
 from appliance.audit.log import AuditLog
+from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import RuleReference, Severity
 from appliance.audit.search import Follower, export, search, show

@@ -15,12 +15,12 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 
 from appliance.audit.chain import genesis, record_hash
+from appliance.audit.chain_findings import Kind
 from appliance.audit.checkpoints import Remembered, read_remembered
-from appliance.audit.database import COLUMNS, LogUnreadableError
-from appliance.audit.findings import Kind
+from appliance.audit.log_database import COLUMNS, LogUnreadableError
 from appliance.audit.signatures import KeyUnreadableError, read_public_key
-from appliance.audit.verify import verify
-from appliance.sealed_texts import parse_checkpoint
+from appliance.audit.verification import verify
+from appliance.signing.signed_statements import parse_checkpoint
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog
 
@@ -524,7 +524,7 @@ def test_signed_while_it_is_verified(
         return read_remembered(directory, log_id)
 
     before = verify(log).checkpoints
-    monkeypatch.setattr("appliance.audit.verify.read_remembered", meanwhile)
+    monkeypatch.setattr("appliance.audit.verification.read_remembered", meanwhile)
     result = verify(log, signer=tmp_path / "signer")
     assert result.findings == []
     assert result.checkpoints > before
@@ -532,7 +532,7 @@ def test_signed_while_it_is_verified(
 
 def test_more_findings_than_are_told(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a log with findings without end the first are told, and how many more there are, up to which record."""
-    monkeypatch.setattr("appliance.audit.verify._MOST_FINDINGS", 10)
+    monkeypatch.setattr("appliance.audit.verification._MOST_FINDINGS", 10)
     attack(log, "DELETE FROM record WHERE sequence % 5 = 0 AND sequence <= 150")
     result = verify(log)
     removed = [one for one in result.findings if one.kind is Kind.MISSING]

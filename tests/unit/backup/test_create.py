@@ -17,13 +17,13 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 from appliance.audit.log import AuditLog
-from appliance.audit.verify import verify
+from appliance.audit.verification import verify
 from appliance.backup import create as backup
 from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up
-from appliance.backup.database import copy_database
+from appliance.backup.database_copy import copy_database
 from appliance.backup.restore import restore
-from appliance.ipsec.checkpoints import SignedCheckpoints
+from appliance.ipsec.signed_checkpoints import SignedCheckpoints
 from tests.support.audit import decision, settle
 from tests.support.requirements import need_root
 

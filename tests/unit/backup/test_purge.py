@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from appliance.backup.contents import BackupError
 from appliance.backup.purge import purge
 from appliance.cli.main import app
-from appliance.supervisor.state import StateDirectory
+from appliance.supervisor.state_directory import StateDirectory
 
 KEY = b"-----BEGIN PRIVATE KEY-----"
 

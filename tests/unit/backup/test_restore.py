@@ -11,7 +11,7 @@ from appliance.backup.contents import BackupError
 from appliance.backup.restore import restore
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.restore_mark import refuse_half_restored
-from appliance.supervisor.state import foreign
+from appliance.supervisor.state_directory import foreign
 from tests.support.backups import LOG, archive, header
 from tests.support.requirements import need_root
 

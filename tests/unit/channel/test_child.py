@@ -6,7 +6,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from appliance.channel.channel import Channel
-from appliance.channel.child import Child
+from appliance.channel.child_process import Child
 from appliance.channel.messages import (
     AuthorityStated,
     AuthorityWanted,

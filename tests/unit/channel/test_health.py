@@ -1,11 +1,11 @@
-"""Tests of `appliance.channel.health`."""
+"""Tests of `appliance.channel.status_summary`."""
 
 from typing import Any
 
 import pytest
 
 from appliance.channel.answers.status import ProcessInfo, Status
-from appliance.channel.health import no_relay, process_names, unserved
+from appliance.channel.status_summary import no_relay, process_names, unserved
 from tests.support.answers import example
 
 SERVING: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Tests of `appliance.cli.config`, as a user would type it."""
+"""Tests of `appliance.cli.config_verbs`, as a user would type it."""
 
 import json
 import subprocess

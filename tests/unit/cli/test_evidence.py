@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from appliance.cli import evidence
+from appliance.cli import evidence_verbs
 from appliance.evidence.bundle import BundleError
 from tests.support.command import rosrv
 
@@ -28,7 +28,7 @@ def test_a_bundle_has_its_name_when_it_is_whole(
             raise BundleError("a text was changed while it was exported", "failed")
         yield b"whole"
 
-    monkeypatch.setattr(evidence, "export", export)
+    monkeypatch.setattr(evidence_verbs, "export", export)
     order = ("evidence", "export", "--since", "1h", "-o", str(place), "--state", str(tmp_path))
     done = rosrv(*order)
     assert done.returncode == breaks, done.stderr

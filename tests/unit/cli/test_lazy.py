@@ -28,7 +28,7 @@ def test_the_table_says_what_the_verbs_say() -> None:
 def test_the_command_imports_only_what_a_verb_needs() -> None:
     """The command, and asking a running appliance, import no network library, REST server, bags or compiler."""
     program = (
-        "import sys, appliance.cli.main, appliance.cli.status, appliance.cli.monitor.in_force\n"
+        "import sys, appliance.cli.main, appliance.cli.status_verb, appliance.cli.monitor.in_force\n"
         "heavy = ('pyroute2', 'fastapi', 'uvicorn', 'rosbags', 'lark', 'numpy', 'httpx', 'cryptography', 'pydantic')\n"
         "print(*[one for one in heavy if one in sys.modules])"
     )

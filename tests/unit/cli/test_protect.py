@@ -78,7 +78,7 @@ def test_what_a_check_saw_is_told_where_an_appliance_is_named(monkeypatch: pytes
     """Under the name of the host, with the ports that were open; nobody is told when no appliance was named."""
     asked = answering(monkeypatch, example(PortsTold, name="ocu"))
     monkeypatch.setattr(
-        "appliance.cli.protect.scan", lambda address, _ports, _s: ScanResult(address, (40001,), 99, 0)
+        "appliance.cli.protect_verb.scan", lambda address, _ports, _s: ScanResult(address, (40001,), 99, 0)
     )
     check = ["protect", "--check", "192.0.2.7", "--ports", "40000-40099"]
     assert CliRunner().invoke(app, check).exit_code == 1
@@ -103,7 +103,7 @@ def test_ports_that_could_not_be_tried_are_not_closed(
     monkeypatch: pytest.MonkeyPatch, result: ScanResult, status: int, state: str, words: str
 ) -> None:
     """One port that no packet was sent to, and the machine's state is unknown; one that is open, and it is open."""
-    monkeypatch.setattr("appliance.cli.protect.scan", lambda *_arguments: result)
+    monkeypatch.setattr("appliance.cli.protect_verb.scan", lambda *_arguments: result)
     check = ["protect", "--check", "192.0.2.7", "--ports", "40000-40099"]
     done = CliRunner().invoke(app, check)
     assert done.exit_code == status

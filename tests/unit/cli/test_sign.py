@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.serialization import (
 from typer.testing import CliRunner
 
 from appliance.cli.main import app
-from appliance.site_keys import signer
+from appliance.signing.site_keys import signer
 from tests.support.site_key import KEY, LINE, NAME
 
 PLAIN = NoEncryption()

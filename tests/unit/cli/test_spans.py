@@ -1,8 +1,8 @@
-"""Tests of `appliance.cli.spans`."""
+"""Tests of `appliance.cli.durations`."""
 
 import pytest
 
-from appliance.cli.spans import seconds_of
+from appliance.cli.durations import seconds_of
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from appliance.channel.answers.status import ProcessInfo, Status
-from appliance.cli import status
+from appliance.cli import status_verb
 from appliance.cli.status_view import age, processes_table, shortened
 from tests.support.answers import example
 
@@ -49,7 +49,7 @@ def screen(
 ) -> list[str]:
     """The lines on a terminal of this width."""
     monkeypatch.setenv("COLUMNS", str(width))
-    status.show(shown, status.troubles_of(shown))
+    status_verb.show(shown, status_verb.troubles_of(shown))
     return capsys.readouterr().out.splitlines()
 
 

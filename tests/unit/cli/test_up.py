@@ -12,7 +12,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from appliance.cli.up import _announce
-from appliance.config import Settings
+from appliance.configuration.settings import Settings
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.supervisor import ControlReady
 

@@ -16,7 +16,7 @@ import pytest
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.compiler import process
-from appliance.specifications.files import Sources, SpecificationsRefusedError, check, checked
+from appliance.specifications.specification_files import Sources, SpecificationsRefusedError, check, checked
 from rosmop.fast.serialization import decoded_part
 from tests.support.waiting import eventually
 

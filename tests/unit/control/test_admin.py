@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
+from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer, PolicyConfirm, decode, encode
 from appliance.channel.answers.policy import PolicyConfirmed
 from appliance.cli import admin_socket
 from appliance.cli.admin_socket import ADMIN_SOCKET, AdminSocket, NotRunningError
-from appliance.control.admin import AdminServer
+from appliance.control.admin_socket import AdminServer
 from appliance.control.administration import Administration
-from appliance.withdrawal import take_effect
 
 pytestmark = pytest.mark.anyio
 

@@ -11,7 +11,7 @@ from appliance.channel.admin import answer_to
 from appliance.channel.answers.graph import TopicMessage
 from appliance.channel.messages import api
 from appliance.control.administration import Orders, request_of
-from appliance.control.looks import Looks
+from appliance.control.queries import Looks
 
 METHODS = [
     method

@@ -6,11 +6,11 @@ from typing import Any, cast
 
 import pytest
 
-from appliance import shipped
-from appliance.audit_trail import AuditTrail
+from appliance.base import shipped
 from appliance.channel.answers.status import ClockState
 from appliance.cli.status_view import doubted_clock
-from appliance.control.clock import Clock
+from appliance.control.clock_check import Clock
+from appliance.telemetry.audit_trail import AuditTrail
 
 
 class Trail:

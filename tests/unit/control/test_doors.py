@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from appliance.audit.log import AuditLog
-from appliance.audit_trail import AuditTrail
-from appliance.config import Settings
-from appliance.control.doors import Doors, class_of
-from appliance.policy.compiler import compile_policy
+from appliance.configuration.settings import Settings
+from appliance.control.listener_limits import Doors, class_of
 from appliance.policy.model import address_of
+from appliance.policy.policy_compiler import compile_policy
+from appliance.quotas.pool import Standing
 from appliance.rpc.server import HttpRequest
-from appliance.shares.pool import Standing
+from appliance.telemetry.audit_trail import AuditTrail
 
 pytestmark = pytest.mark.anyio
 

@@ -17,7 +17,7 @@ from appliance.channel.messages import (
     SocketsRestored,
     TunnelsEnclosed,
 )
-from appliance.control.lifeline import ROUTES_AT_ONCE, ControlLifeline
+from appliance.control.supervisor_link import ROUTES_AT_ONCE, ControlLifeline
 
 _LIMIT_SECONDS = 30
 

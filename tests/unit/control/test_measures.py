@@ -6,10 +6,10 @@ from typing import Any, cast
 import pytest
 
 from appliance.channel.messages import TopicTraffic
-from appliance.control.measures import by_resource, carried_of, from_zero
+from appliance.control.measurements import by_resource, carried_of, from_zero
+from appliance.master.endpoints import traffic
+from appliance.master.endpoints.traffic import MOST_RESOURCES, OTHERS, Carried
 from appliance.master.graph.registry import Incarnation, Registry
-from appliance.master.reach import traffic
-from appliance.master.reach.traffic import MOST_RESOURCES, OTHERS, Carried
 from roswire.uris import parse_node_uri
 
 

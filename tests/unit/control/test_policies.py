@@ -23,7 +23,7 @@ from appliance.control.policies import Policies, PolicyRefusedError, RevisionCha
 from appliance.policy import judgement
 from appliance.policy.model import Address, Category, Request
 from appliance.policy.policy import Policy
-from appliance.store.state import StateStore
+from appliance.store.state_file import StateStore
 from tests.support.control_parts import OPEN, Records
 from tests.support.site_key import LINE, OTHER_KEY, OTHER_LINE, signed
 

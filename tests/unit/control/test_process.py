@@ -9,12 +9,12 @@ from typing import Any, cast
 import pytest
 
 from appliance.control.process import _end_others, _restore
+from appliance.master.endpoints.endpoint_addresses import Places
+from appliance.master.endpoints.proxy_endpoints import Faces
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.registry import Durable, Incarnation, Kind, Registry
-from appliance.master.reach.faces import Faces
-from appliance.master.reach.places import Places
-from appliance.master.upkeep.enactor import Enactor, write
-from appliance.store.state import StateStore
+from appliance.master.reconcile.enactor import Enactor, write
+from appliance.store.state_file import StateStore
 from roswire.uris import parse_node_uri
 from tests.support.idle import idle, idle_class
 

@@ -9,15 +9,15 @@ import msgspec
 import pytest
 
 from appliance.audit.ids import IdSource
-from appliance.audit_trail import AuditTrail
 from appliance.channel import admin, messages
 from appliance.channel.answers.recordings import Recording, Trigger
 from appliance.channel.channel import Channel
-from appliance.config import RecorderRules
+from appliance.configuration.settings import RecorderRules
 from appliance.control.errors import SenselessError, UnknownThingError
 from appliance.control.recording_orders import RecorderAwayError, RecordingOrders
-from appliance.recorder.plan import RecordingPlan
-from appliance.recorder.shelf import MOST_LENT
+from appliance.recorder.recording_plan import RecordingPlan
+from appliance.recorder.recording_store import MOST_LENT
+from appliance.telemetry.audit_trail import AuditTrail
 
 KEPT = Recording(
     "a" * 20, 1, 2, [Trigger(1, "drop", "r", "t")], [], 1, 1, 300, "5a", complete=True, why_not=""

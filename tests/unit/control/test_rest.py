@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import messages
 from appliance.channel.admin import AdminAnswer, AnyRequest, HostEnrol, PolicyLoad, StatusWanted, decode
 from appliance.channel.answers.status import Status
@@ -24,8 +25,7 @@ from appliance.channel.messages.api import (
     TokensStated,
 )
 from appliance.control.rest import RestLink
-from appliance.store.tokens import TokenRow, make_token
-from appliance.withdrawal import WithdrawnError, take_effect
+from appliance.store.access_tokens import TokenRow, make_token
 from tests.support.answers import example
 from tests.support.heard import Heard
 

@@ -27,9 +27,9 @@ from appliance.channel.answers.hosts import Endpoint
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.policy import PolicyKnown
 from appliance.channel.messages.api import Asked, RequestMade, TokenKept
-from appliance.config import ApiLimits, Settings
+from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.rest_meaning import NoOrderError, meant
-from appliance.store.tokens import make_token
+from appliance.store.access_tokens import make_token
 from tests.support.answers import example
 
 LOOKS: dict[type, Any] = {

@@ -3,9 +3,9 @@
 import ipaddress
 
 from appliance.channel.answers.recordings import APPLIANCE, ROBOT, UNKNOWN
-from appliance.control.standing import HostStanding, charged_to
-from appliance.policy.compiler import compile_policy
-from appliance.shares.pool import Standing
+from appliance.control.quota_class import HostStanding, charged_to
+from appliance.policy.policy_compiler import compile_policy
+from appliance.quotas.pool import Standing
 
 NAMED, OTHER = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from appliance.control.switched_off import SwitchedOffWatch
-from appliance.store.state import StateStore
+from appliance.store.state_file import StateStore
 
 
 class Scene:

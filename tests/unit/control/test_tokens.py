@@ -1,4 +1,4 @@
-"""Tests of `appliance.control.tokens`: the first token reaches whoever started the appliance, whatever dies before."""
+"""Tests of `appliance.control.token_orders`: the first token reaches its owner, whichever process dies first."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 from appliance.audit.log import AuditLog
-from appliance.audit_trail import AuditTrail
 from appliance.channel.admin import TokenAdd
-from appliance.control.tokens import Tokens
-from appliance.store.database import StoreError
-from appliance.store.state import StateStore
-from appliance.store.tokens import is_secret, parse_token
+from appliance.control.token_orders import Tokens
+from appliance.store.access_tokens import is_secret, parse_token
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
+from appliance.telemetry.audit_trail import AuditTrail
 
 pytestmark = pytest.mark.anyio
 

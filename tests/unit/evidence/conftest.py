@@ -10,7 +10,6 @@ import pytest
 
 from appliance.audit.log import AuditLog
 from appliance.audit.record import Severity
-from appliance.audit_trail import AuditTrail
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer, AdminRequest
 from appliance.channel.answers.monitors import RevisionTexts
@@ -18,7 +17,8 @@ from appliance.channel.answers.policy import PolicyKnown
 from appliance.channel.answers.recordings import Recording
 from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
 from appliance.evidence.bundle import Kept, Span, export
-from appliance.fingerprints import fingerprint, fingerprint_of_all
+from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
+from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.answers import example
 from tests.support.audit import decision, settle
 from tests.unit.audit.conftest import MakeLog, key, make_log, notary, path

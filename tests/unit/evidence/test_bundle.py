@@ -30,7 +30,7 @@ from appliance.audit.retention import Retention
 from appliance.audit.search import search
 from appliance.channel.answers.recordings import RecordedTopic, Trigger
 from appliance.evidence import bundle as bundles
-from appliance.evidence import verify
+from appliance.evidence import bundle_verifier
 from appliance.evidence.bundle import VERIFIER, BundleError, Span, export
 from tests.support.answers import example
 from tests.support.audit import decision, settle
@@ -82,7 +82,7 @@ class Reviewer:
     def status(self, bundle: Path, *options: object) -> int:
         """The exit status."""
         self._capsys.readouterr()
-        status = verify.main([str(bundle), "--key", str(self._key), *map(str, options)])
+        status = bundle_verifier.main([str(bundle), "--key", str(self._key), *map(str, options)])
         self.said = self._capsys.readouterr().out
         return status
 
@@ -234,11 +234,11 @@ def test_members_that_unpack_to_much_take_no_memory(
     place = tmp_path / "x.zip"
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
         for member, data in members_of(bundle).items():
-            archive.writestr(member, b"[" * (6 * verify.MOST) if member == name else data)
+            archive.writestr(member, b"[" * (6 * bundle_verifier.MOST) if member == name else data)
     tracemalloc.start()
     try:
         assert reviewer.status(place) == 1
-        assert tracemalloc.get_traced_memory()[1] < 4 * verify.MOST
+        assert tracemalloc.get_traced_memory()[1] < 4 * bundle_verifier.MOST
     finally:
         tracemalloc.stop()
 
@@ -361,10 +361,10 @@ def test_a_pipe_keeps_nobody_waiting(bundle: Path, tmp_path: Path, reviewer: Rev
     shutil.unpack_archive(bundle, folder)
     (folder / name).unlink()
     os.mkfifo(folder / name)
-    assert verify.main([str(folder)]) == (2 if name == "audit.pub" else 1)
+    assert bundle_verifier.main([str(folder)]) == (2 if name == "audit.pub" else 1)
     pipe = folder / name
-    assert verify.main([str(pipe)]) == 2
-    assert verify.main([str(bundle), "--key", str(pipe)]) == 2
+    assert bundle_verifier.main([str(pipe)]) == 2
+    assert bundle_verifier.main([str(bundle), "--key", str(pipe)]) == 2
     assert reviewer.status(bundle, "--checkpoints", pipe) == 2
     assert "is not a regular file" in reviewer.said
 
@@ -375,7 +375,7 @@ def test_an_empty_file_is_no_bundle(bundle: Path, tmp_path: Path, reviewer: Revi
     empty.touch()
     (tmp_path / "folder").mkdir()
     assert (reviewer.status(empty), reviewer.status(tmp_path / "folder")) == (2, 1)
-    assert verify.main([str(bundle), "--key", str(empty)]) == 2
+    assert bundle_verifier.main([str(bundle), "--key", str(empty)]) == 2
     assert reviewer.status(bundle, "--checkpoints", empty) == 0
 
 
@@ -383,7 +383,7 @@ def test_a_bomb_is_not_unpacked(
     bundle: Path, tmp_path: Path, reviewer: Reviewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A ZIP file that unpacks to more than a bundle of its size can, or whose members overlap, is not read."""
-    monkeypatch.setattr(verify, "UNPACKED", 1 << 20)
+    monkeypatch.setattr(bundle_verifier, "UNPACKED", 1 << 20)
     place, many = tmp_path / "x.zip", bytes(1 << 25)
     with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("policies/9.ini", many)
@@ -420,7 +420,7 @@ def test_many_runs_take_few_steps() -> None:
             asked += 1
             return int(self) < other
 
-    runs = verify.Runs([[3 * number + 1, 3 * number + 2] for number in range(30_000)])
+    runs = bundle_verifier.Runs([[3 * number + 1, 3 * number + 2] for number in range(30_000)])
     runs.last = [Counted(last) for last in runs.last]
     assert [runs.meet(number, number) for number in (0, 1, 2, 3, 4, 90_000)] == [
         False,
@@ -440,7 +440,7 @@ def resealed(members: Members) -> Members:
     manifest = json.loads(members["manifest.json"])
     for name, about in manifest["members"].items():
         data = members[name]
-        about["sha256"] = verify.sha256(data).hex()
+        about["sha256"] = bundle_verifier.sha256(data).hex()
     return {**members, "manifest.json": json.dumps(manifest, indent=1).encode() + b"\n"}
 
 
@@ -578,7 +578,7 @@ def _as_before(previous: bytes, columns: tuple[object, ...]) -> bytes:
 def test_a_load_before_the_upgrade(make_log: MakeLog, tmp_path: Path, reviewer: Reviewer) -> None:
     """What version 0.1.0 wrote is right as it is; that nothing leads from its load to a checkpoint is said."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("appliance.audit.writer.record_hash", _as_before)
+        patch.setattr("appliance.audit.log_writer.record_hash", _as_before)
         before = Control(make_log(checkpoint_seconds=3600))
         before.load_policy(7, OPEN)
         before.work(5)
@@ -673,10 +673,10 @@ def test_columns_are_packed_as_the_log_packs_them() -> None:
     numbers = [sign * (2**power + step) for power in range(63) for step in (-1, 0, 1) for sign in (-1, 1)]
     values = [None, *texts, *(text.encode() for text in texts), *NUMBERS, *numbers, -(2**63), 2**64 - 1]
     for value in values:
-        assert verify.packed(value) == msgspec.msgpack.encode(value), repr(value)[:50]
+        assert bundle_verifier.packed(value) == msgspec.msgpack.encode(value), repr(value)[:50]
     with pytest.raises(StopIteration):
-        verify.packed(2**64)
-    assert struct.unpack(">b", verify.packed(-32)) == (-32,)
+        bundle_verifier.packed(2**64)
+    assert struct.unpack(">b", bundle_verifier.packed(-32)) == (-32,)
 
 
 def test_the_verifier_is_a_program_for_python_3_8() -> None:

@@ -5,8 +5,8 @@ from typing import Any
 
 import yaml
 
-from appliance.config_sources import resolve
-from appliance.policy.compiler import compile_policy
+from appliance.configuration.sources import resolve
+from appliance.policy.policy_compiler import compile_policy
 
 ROOT = Path(__file__).parents[3]
 ROLE = ROOT / "examples/ansible/roles/rosrv"

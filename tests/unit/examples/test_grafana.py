@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from appliance.metrics import METRICS
+from appliance.telemetry.metrics import METRICS
 from tests.support.requirements import need_program
 
 ROOT = Path(__file__).parents[3]

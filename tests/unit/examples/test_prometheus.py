@@ -7,7 +7,7 @@ from typing import Any
 import yaml
 
 from appliance.audit.events import EVENTS
-from appliance.metrics import METRICS
+from appliance.telemetry.metrics import METRICS
 
 FOLDER = Path(__file__).parents[3] / "examples" / "prometheus"
 

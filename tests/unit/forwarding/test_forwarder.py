@@ -14,8 +14,8 @@ from appliance.audit.query import Filter
 from appliance.audit.record import Severity
 from appliance.audit.retention import Retention
 from appliance.audit.search import Page, search
-from appliance.audit.verify import verify
-from appliance.forwarding.forwarder import Chosen, Forwarder
+from appliance.audit.verification import verify
+from appliance.forwarding.log_forwarder import Chosen, Forwarder
 from appliance.forwarding.syslog import Formatter
 from tests.support.audit import decision, settle
 from tests.support.syslog import Message, parse
@@ -349,7 +349,7 @@ def test_what_retention_takes_while_it_is_read(
         page = search(*arguments, **named)
         return Page(page.entries[5:], page.cursor)
 
-    monkeypatch.setattr("appliance.forwarding.forwarder.search", removing)
+    monkeypatch.setattr("appliance.forwarding.log_forwarder.search", removing)
     one.step()
     assert kept.sequences()[-1] > before
     assert one.progress.missed == 5

@@ -6,12 +6,12 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.config import Syslog
-from appliance.control.forwarder import Forwarded
+from appliance.configuration.settings import Syslog
+from appliance.control.forwarder_link import Forwarded
 from appliance.forwarding.process import Reports
+from appliance.telemetry.audit_trail import AuditTrail
 
 
 class Control:

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.audit.copies import SYSLOG_ELEMENT, SignedCheckpoint
-from appliance.audit.output import Entry
 from appliance.audit.record import Record, RuleReference, Severity
+from appliance.audit.record_format import Entry
 from appliance.forwarding.syslog import ELEMENT, Formatter
 from tests.support.syslog import parse
 

@@ -1,4 +1,4 @@
-"""Tests of `appliance.hosts.endpoint`."""
+"""Tests of `appliance.hosts.tunnel_address`."""
 
 import asyncio
 from typing import Any
@@ -7,9 +7,9 @@ import pytest
 
 from appliance.channel.answers.hosts import Endpoint
 from appliance.channel.messages import EndpointFound
-from appliance.config import Ipsec, Settings
-from appliance.hosts.endpoint import find_endpoint
-from appliance.hosts.table import HostRefusedError
+from appliance.configuration.settings import Ipsec, Settings
+from appliance.hosts.host_table import HostRefusedError
+from appliance.hosts.tunnel_address import find_endpoint
 
 
 def _settings(endpoint: str | None = None, **more: Any) -> Settings:

@@ -43,24 +43,24 @@ from appliance.channel.messages import (
     TunnelsStated,
     TunnelsWanted,
 )
-from appliance.hosts.authority import Authority, AuthorityError
+from appliance.hosts.certificate_requests import Authority, AuthorityError
 from appliance.hosts.certification import Certification
-from appliance.hosts.hosts import Hosts
-from appliance.hosts.hosts_file import Declared
-from appliance.hosts.rest_place import RestPlace
-from appliance.hosts.table import (
+from appliance.hosts.enrolment import Hosts
+from appliance.hosts.host_table import (
     HostForbiddenError,
     HostRefusedError,
     HostsChangedError,
     HostTable,
 )
-from appliance.hosts.tunnels import Tunnels
-from appliance.ipsec import authority as ipsec
-from appliance.ipsec.proof import RequestRefusedError
+from appliance.hosts.hosts_file import Declared
+from appliance.hosts.rest_place import RestPlace
+from appliance.hosts.tunnel_state import Tunnels
+from appliance.ipsec import certificate_authority as ipsec
+from appliance.ipsec.proof_of_possession import RequestRefusedError
 from appliance.ipsec.requests import make_key, signing_request
 from appliance.policy.model import Address
-from appliance.store.database import StoreError
-from appliance.store.state import StateStore
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
 from tests.support.audit import HeardTrail
 
 
@@ -172,7 +172,7 @@ def add(bench: Bench, name: str, address: str | None = None) -> Coroutine[Any, A
 @pytest.fixture(autouse=True)
 def nobody_waits_for_charon(monkeypatch: pytest.MonkeyPatch) -> None:
     """There is none here: its answer is not awaited."""
-    monkeypatch.setattr("appliance.hosts.tunnels._TAKEN_SECONDS", 0.0)
+    monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 0.0)
 
 
 def run(directory: Path, work: Callable[[Bench], Coroutine[Any, Any, None]], **options: str) -> None:
@@ -780,7 +780,7 @@ def test_only_what_charon_took_of_this_life_counts_as_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its process may report a greater number of an earlier life of control: the clock was set back since."""
-    monkeypatch.setattr("appliance.hosts.tunnels._TAKEN_SECONDS", 0.05)
+    monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 0.05)
 
     async def work(bench: Bench) -> None:
         ours, theirs = socket.socketpair()
@@ -800,7 +800,7 @@ def test_only_what_charon_took_of_this_life_counts_as_taken(
         charon.send(TunnelsReported(number + 3_600_000_000_000, []))
         assert not await bench.tunnels.until_taken()
         charon.send(TunnelsReported(number, []))
-        monkeypatch.setattr("appliance.hosts.tunnels._TAKEN_SECONDS", 30.0)
+        monkeypatch.setattr("appliance.hosts.tunnel_state._TAKEN_SECONDS", 30.0)
         assert await bench.tunnels.until_taken()
         running.cancel()
         for one in (link, charon):

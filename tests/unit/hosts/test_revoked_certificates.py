@@ -12,8 +12,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
 from appliance.hosts.revoked_certificates import RevokedCertificates
-from appliance.ipsec.authority import Authority
-from appliance.store.state import StateStore
+from appliance.ipsec.certificate_authority import Authority
+from appliance.store.state_file import StateStore
 
 DAY = 86_400.0
 LONGEST = 65_535  # bytes of a value of vici

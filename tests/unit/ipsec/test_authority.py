@@ -13,15 +13,15 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import NameOID
 
-from appliance.ipsec.authority import (
+from appliance.ipsec.certificate_authority import (
     CERTIFICATE_FILE,
     KEY_FILE,
     LIST_FILE,
     LONGEST_REQUEST,
     Authority,
 )
-from appliance.ipsec.files import SignerKeyError
-from appliance.ipsec.proof import RequestRefusedError
+from appliance.ipsec.key_files import SignerKeyError
+from appliance.ipsec.proof_of_possession import RequestRefusedError
 
 
 def request_of(

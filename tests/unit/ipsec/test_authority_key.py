@@ -7,9 +7,9 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ed25519
 
-from appliance.ipsec.authority import CERTIFICATE_FILE, KEY_FILE, Authority
 from appliance.ipsec.authority_key import read_passphrase
-from appliance.ipsec.files import SignerKeyError
+from appliance.ipsec.certificate_authority import CERTIFICATE_FILE, KEY_FILE, Authority
+from appliance.ipsec.key_files import SignerKeyError
 from appliance.ipsec.requests import make_key, signing_request
 
 

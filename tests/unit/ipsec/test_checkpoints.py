@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.ipsec.checkpoints import MOST_LOGS, CheckpointRefusedError, SignedCheckpoints
+from appliance.ipsec.signed_checkpoints import MOST_LOGS, CheckpointRefusedError, SignedCheckpoints
 
 _NONE = "0" * 64
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.ipsec.authority import Authority
-from appliance.ipsec.kit import filled
+from appliance.ipsec.certificate_authority import Authority
+from appliance.ipsec.enrolment_kit import filled
 from appliance.ipsec.requests import make_key, signing_request
 
 SPELLINGS = {"before 3.2": "s/CN *= */CN = /; s/O *= */O = /", "3.2": "s/CN *= */CN=/; s/O *= */O=/"}

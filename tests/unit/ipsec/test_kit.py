@@ -10,9 +10,9 @@ import pytest
 from msgspec import structs
 
 from appliance.channel.answers.hosts import KitParts
-from appliance.ipsec.kit import Kit, archive, swanctl_conf
-from appliance.network.firewall.rules import PortRange
-from appliance.network.protect import protection
+from appliance.ipsec.enrolment_kit import Kit, archive, swanctl_conf
+from appliance.network.close_ports import protection
+from appliance.network.firewall.firewall_rules import PortRange
 
 HOST = KitParts(
     revision=1,

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.ipsec.checkpoints import CheckpointRefusedError, SignedCheckpoints, read_checkpoint
 from appliance.ipsec.removals import LARGEST_RECORD, Kept, RemovalRefusedError, Removals
+from appliance.ipsec.signed_checkpoints import CheckpointRefusedError, SignedCheckpoints, read_checkpoint
 
 LOG = "a" * 32
 _DAY = 86_400_000_000_000

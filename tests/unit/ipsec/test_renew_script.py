@@ -12,8 +12,8 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from appliance.ipsec.authority import Authority
-from appliance.ipsec.kit import filled
+from appliance.ipsec.certificate_authority import Authority
+from appliance.ipsec.enrolment_kit import filled
 from appliance.ipsec.requests import make_key, signing_request
 
 CURL = """#!/bin/sh

@@ -25,7 +25,7 @@ from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.search import search
 from appliance.audit.signatures import read_public_key
-from appliance.audit.verify import verify
+from appliance.audit.verification import verify
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages import (
     AuthorityStated,
@@ -48,7 +48,7 @@ from appliance.channel.messages import (
     SignerLink,
     Stop,
 )
-from appliance.ipsec.authority import Authority
+from appliance.ipsec.certificate_authority import Authority
 from appliance.ipsec.removals import Kept
 from appliance.ipsec.signer import KEY_FILE, PUBLIC_KEY_FILE, Signer, load_or_create_key
 from tests.support.audit import decision, settle

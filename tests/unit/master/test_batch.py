@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from appliance.master.rosmaster import BatchingClient
-from appliance.rpc.client import BrokenOffError, CallFailedError
+from appliance.rpc.xmlrpc_client import BrokenOffError, CallFailedError
 from roswire.errors import EncodingError
 
 

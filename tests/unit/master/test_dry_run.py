@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from appliance.master.graph.registry import Incarnation, Kind, new_key
-from appliance.policy.compiler import compile_policy
-from appliance.policy.live import Live, endings
-from appliance.store.state import PermissionRow
+from appliance.policy.live_rights import Live, endings
+from appliance.policy.policy_compiler import compile_policy
+from appliance.store.state_file import PermissionRow
 from roswire.uris import parse_node_uri
 from tests.support.control_parts import ControlParts
 from tests.support.examples import examples

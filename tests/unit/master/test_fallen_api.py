@@ -18,9 +18,9 @@ from appliance.channel.admin import A, AdminAnswer, AdminRequest, AnyRequest, To
 from appliance.channel.channel import Channel
 from appliance.channel.messages.api import ApiLink, Asked, RequestAnswered, RequestMade
 from appliance.control.rest import RestLink
-from appliance.control.tokens import Tokens
-from appliance.order_proof import proof_of, reading_key, statement
-from appliance.store.state import StateStore
+from appliance.control.token_orders import Tokens
+from appliance.signing.request_signing import proof_of, reading_key, statement
+from appliance.store.state_file import StateStore
 from tests.support.heard import Heard
 
 REVOKE = Asked("10.0.0.1", "DELETE", "/v1/hosts/laptop", '"3"', "", "", b"")

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from appliance.master.parameter_charges import APPLIANCE, LimitReachedError, measure, member_weight
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.model import Address
-from appliance.shares.pool import Bounds, Standing
+from appliance.quotas.pool import Bounds, Standing
 from roswire.parameter_tree import parts_of
 from roswire.xmlrpc import Value
 from tests.support.examples import examples

@@ -24,24 +24,24 @@ from appliance.master.calls.call import (
     Verb,
     method,
 )
+from appliance.master.calls.call_table import MASTER_CALLS
 from appliance.master.calls.gate import Contest, Gate, HostLimits
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.node_calls import NODE_CALLS
-from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registry import Incarnation, Kind, Registry, new_key
 from appliance.master.graph.revocation import CALLS
 from appliance.policy.actions import VERBS
 from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
-from appliance.policy.compiler import compile_policy
 from appliance.policy.diff import diff
 from appliance.policy.explain import explain
 from appliance.policy.grant import Asked, UngrantableError, grant
 from appliance.policy.judgement import Known
 from appliance.policy.learn import Observation, learn
-from appliance.policy.live import Live, may_keep
+from appliance.policy.live_rights import Live, may_keep
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import needs_node, rights_of
 from appliance.rpc.server import Peer
 from roswire.parameter_tree import Tree

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from appliance.network.firewall.rules import HOOKS, Chain, Family, PortRange, Verdict
+from appliance.network.firewall.firewall_rules import HOOKS, Chain, Family, PortRange, Verdict
 from appliance.network.isolation import Ends, IsolationSettings, isolation_rules
 
 ENDS: dict[Family, Ends] = {

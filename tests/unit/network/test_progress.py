@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from appliance.network import progress
-from appliance.network.progress import Progress, communicate
+from appliance.network import patience
+from appliance.network.patience import Progress, communicate
 
 BUSY = """
 import sys, time
@@ -32,9 +32,9 @@ def program(text: str) -> "subprocess.Popen[str]":
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress, "STILL_SECONDS", 0.3)
-    monkeypatch.setattr(progress, "_LOOK_SECONDS", 0.05)
-    monkeypatch.setattr(progress, "_SAY_SECONDS", 0.1)
+    monkeypatch.setattr(patience, "STILL_SECONDS", 0.3)
+    monkeypatch.setattr(patience, "_LOOK_SECONDS", 0.05)
+    monkeypatch.setattr(patience, "_SAY_SECONDS", 0.1)
 
 
 def test_what_gets_on_is_waited_for_with_words(caplog: pytest.LogCaptureFixture) -> None:
@@ -54,7 +54,7 @@ def test_what_hangs_is_ended_with_words() -> None:
 
 def test_what_runs_in_a_circle_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     """However busy a program is, there is an end to the patience with it."""
-    monkeypatch.setattr(progress, "LONGEST_SECONDS", 0.5)
+    monkeypatch.setattr(patience, "LONGEST_SECONDS", 0.5)
     with program("while True: pass") as endless, pytest.raises(TimeoutError, match="nft did not end"):
         communicate(endless, "", "nft")
 

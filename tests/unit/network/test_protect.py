@@ -2,14 +2,14 @@
 
 import pytest
 
-from appliance.network.firewall.rules import PortRange
-from appliance.network.protect import (
+from appliance.network.close_ports import (
     local_port_range,
     parse_address,
     parse_ports,
     parse_services,
     protection,
 )
+from appliance.network.firewall.firewall_rules import PortRange
 
 RANGE = PortRange(32768, 60999)
 

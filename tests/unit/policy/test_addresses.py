@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.policy.hosts import HostTable
+from appliance.policy.host_sets import HostTable
 from appliance.policy.model import address_of
 
 

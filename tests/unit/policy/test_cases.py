@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from appliance.policy.actions import VERBS
 from appliance.policy.cases import CaseResult, run_cases
-from appliance.policy.compiler import compile_policy
-from appliance.policy.findings import PolicyError
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import PolicyError
 from tests.support.examples import examples
 
 POLICY = compile_policy(

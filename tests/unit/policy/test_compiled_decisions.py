@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from appliance.policy.compiler import compile_policy
-from appliance.policy.findings import PolicyError
 from appliance.policy.model import Category, Request
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import PolicyError
 from tests.support.examples import examples
 
 Rules = list[tuple[str, str, list[str]]]  # section, key, words of the value

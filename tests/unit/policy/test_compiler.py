@@ -7,11 +7,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from appliance.policy.compiler import compile_policy
-from appliance.policy.findings import MAXIMUM_FINDINGS, PolicyError, Severity
+from appliance.policy.ini_reader import MAXIMUM_CHARACTERS
 from appliance.policy.model import TELLS
 from appliance.policy.policy import Policy
-from appliance.policy.reader import MAXIMUM_CHARACTERS
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import MAXIMUM_FINDINGS, PolicyError, Severity
 from tests.support.examples import examples
 
 SAMPLE_OF_ROSRV = """# machine-a: 192.168.15.69

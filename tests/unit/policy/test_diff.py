@@ -2,9 +2,9 @@
 
 import ipaddress
 
-from appliance.policy.compiler import compile_policy
 from appliance.policy.diff import diff
 from appliance.policy.model import Category, Request
+from appliance.policy.policy_compiler import compile_policy
 
 OLD = "[Nodes]\ndefault = *\n[Publishers]\ndefault = 10.0.0.1\n/cmd = 10.0.0.5\n"
 

@@ -8,7 +8,7 @@ import pytest
 from appliance.policy.actions import VERBS
 from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
-from appliance.policy.compiler import compile_policy
+from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.sections import NAMES
 
 PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text(encoding="utf-8")

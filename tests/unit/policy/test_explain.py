@@ -2,9 +2,9 @@
 
 import ipaddress
 
-from appliance.policy.compiler import compile_policy
 from appliance.policy.explain import Explanation, explain, render
 from appliance.policy.model import Category, Request
+from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of
 
 POLICY = compile_policy(

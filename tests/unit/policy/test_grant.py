@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from appliance.policy.compiler import compile_policy
 from appliance.policy.grant import Asked, UngrantableError, asked, grant
 from appliance.policy.judgement import Known
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of, rights_of_call
 from roswire.parameter_tree import Tree
 from roswire.xmlrpc import Value

@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.policy.commands import COMMANDS
-from appliance.policy.compiler import compile_policy
 from appliance.policy.learn import Learned, Observation, learn
 from appliance.policy.model import Category, Request
 from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of, rights_of_call
 
 ROBOT = ipaddress.ip_address("192.0.2.10")

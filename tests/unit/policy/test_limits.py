@@ -4,12 +4,12 @@ import ipaddress
 
 import pytest
 
-from appliance.policy.compiler import compile_policy
 from appliance.policy.diff import diff
 from appliance.policy.explain import explain, render
-from appliance.policy.findings import PolicyError
-from appliance.policy.limits import NO_LIMIT, Part, Rate
 from appliance.policy.model import Category, Request
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import PolicyError
+from appliance.policy.rate_limits import NO_LIMIT, Part, Rate
 
 HEAD = """[Groups]
 guests = 10.0.0.0/24

@@ -4,7 +4,7 @@ import ipaddress
 
 import pytest
 
-from appliance.policy.compiler import compile_policy
+from appliance.policy.policy_compiler import compile_policy
 
 RIGHT = """[Groups]
 op = 10.0.0.5

@@ -4,8 +4,8 @@ import ipaddress
 
 import pytest
 
-from appliance.policy.compiler import compile_policy
-from appliance.policy.live import Live, endings, live_by, may_keep
+from appliance.policy.live_rights import Live, endings, live_by, may_keep
+from appliance.policy.policy_compiler import compile_policy
 from roswire.parameter_tree import Tree
 
 HOST = ipaddress.ip_address("10.0.0.5")

@@ -6,9 +6,9 @@ import re
 import pytest
 
 from appliance.policy.commands import COMMANDS, DECIDED_ELSEWHERE, NAMED_ONLY
-from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Address, Category, Decision, Request, told_of
 from appliance.policy.policy import Policy
+from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of
 
 FIGURE = """

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag1 import Reader
 
-from appliance.recorder.bag import BagWriter, Message
+from appliance.recorder.bag_writer import BagWriter, Message
 
 HEADER = {
     "topic": "/chatter",

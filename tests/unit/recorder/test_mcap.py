@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from rosbags.rosbag2.storage_mcap import McapReader
 
-from appliance.recorder.bag import BagWriter, Message
+from appliance.recorder.bag_writer import BagWriter, Message
 from appliance.recorder.mcap import as_mcap
 from tests.unit.recorder.test_bag import HEADER, SECOND, body
 

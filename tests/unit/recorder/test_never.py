@@ -2,7 +2,7 @@
 
 import pytest
 
-from appliance.config import RecorderRules
+from appliance.configuration.settings import RecorderRules
 from appliance.recorder.never import NAMED, known_sums, left_out_because
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions

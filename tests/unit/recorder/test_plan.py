@@ -9,8 +9,8 @@ from msgspec import structs
 
 from appliance.audit.record import Severity
 from appliance.channel.answers.recordings import OPERATORS, ROBOT, UNKNOWN, TriggerKind
-from appliance.config import RecorderRules
-from appliance.recorder.plan import HourlyLimit, RecordingPlan, span
+from appliance.configuration.settings import RecorderRules
+from appliance.recorder.recording_plan import HourlyLimit, RecordingPlan, span
 from tests.unit.recorder.test_shelf import SECOND, recording
 
 NOW = 10_000 * SECOND

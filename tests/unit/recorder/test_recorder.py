@@ -15,12 +15,12 @@ from rosbags.rosbag1 import Reader
 from appliance.audit.log import AuditLog
 from appliance.channel import messages
 from appliance.channel.answers.recordings import Recording, Trigger
-from appliance.config import RecorderRules
+from appliance.configuration.settings import RecorderRules
 from appliance.recorder.never import NAMED
 from appliance.recorder.recorder import SETTLE_SECONDS, Recorder
 from appliance.recorder.recording import RecordingInProgress
+from appliance.recorder.recording_store import MOST_LENT, Shelf
 from appliance.recorder.ring import LEFT_OUT, SMALLEST, RingWriter
-from appliance.recorder.shelf import MOST_LENT, Shelf
 from appliance.relay.recorder_ring import LeftOut
 from tests.support.audit import decision, settle
 from tests.unit.recorder.test_ring import HEADER, Clock, frame, opened

@@ -7,7 +7,7 @@ import msgspec
 import pytest
 
 from appliance.channel.answers.recordings import OPERATORS, ROBOT, Recording, Trigger, TriggerKind
-from appliance.recorder.shelf import ABOUT, Shelf
+from appliance.recorder.recording_store import ABOUT, Shelf
 
 MIB = 1 << 20
 SECOND = 1_000_000_000
@@ -153,7 +153,7 @@ def test_where_the_robot_has_all_a_guest_has_no_recording(tmp_path: Path) -> Non
 
 def test_descriptions_have_room_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Control is told of all recordings in one message, however many topics they have."""
-    monkeypatch.setattr("appliance.recorder.shelf._MOST_DESCRIBED", 1000)
+    monkeypatch.setattr("appliance.recorder.recording_store._MOST_DESCRIBED", 1000)
     shelf = Shelf(tmp_path, disk=64 * MIB, seconds=None, clock=time.time_ns)
     for number in range(1, 9):
         put(shelf, recording(number))

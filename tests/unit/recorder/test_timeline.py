@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from appliance.channel.answers.recordings import Recording, Sender
-from appliance.recorder.bag import BagWriter, Message
 from appliance.recorder.bag_reader import BagReader, Place
+from appliance.recorder.bag_writer import BagWriter, Message
 from appliance.recorder.timeline import MOST_EVENTS, messages_around, timeline
 from tests.unit.recorder.test_bag import HEADER, SECOND, body
 

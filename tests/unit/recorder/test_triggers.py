@@ -6,7 +6,7 @@ import pytest
 
 from appliance.audit.record import Record, Severity
 from appliance.channel.answers.recordings import TriggerKind
-from appliance.config import RecorderRules
+from appliance.configuration.settings import RecorderRules
 from appliance.recorder.triggers import trigger_of
 
 KINDS: tuple[TriggerKind, ...] = get_args(TriggerKind)

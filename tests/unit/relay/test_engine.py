@@ -40,9 +40,9 @@ from appliance.channel.messages import (
     UpstreamRefused,
     UpstreamWanted,
 )
+from appliance.relay.bounds import MIB
 from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.upstream import Publisher
-from appliance.relay.limits import MIB
 from roswire.tcpros import (
     encode_frame,
     encode_header,

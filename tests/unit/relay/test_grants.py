@@ -12,7 +12,7 @@ from appliance.channel.messages import (
     ServicePlaced,
     ServiceWithdrawn,
 )
-from appliance.relay.grants import Service, StatedTable
+from appliance.relay.granted import Service, StatedTable
 from appliance.relay.loop import ANYBODY, UNKNOWN
 
 NODE = NodePlaced("k", "/talker", "10.0.0.1")

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.channel.messages import LookEnded, LookWanted, MessageSeen
-from appliance.relay.looks import MOST_LOOKS, MOST_MESSAGES
+from appliance.relay.topic_taps import MOST_LOOKS, MOST_MESSAGES
 from roswire.tcpros import encode_frame, encode_header
 from tests.unit.relay.world import ASK, HEADER, Peer, World
 

@@ -16,8 +16,8 @@ from appliance.channel.messages import (
     TopicTraffic,
     TrafficReported,
 )
-from appliance.relay.connections.links import Link
-from appliance.relay.limits import Limits
+from appliance.relay.bounds import Limits
+from appliance.relay.connections.loop_channel import Link
 from appliance.relay.loop import Loop
 from appliance.relay.report import Reporter
 

@@ -17,7 +17,7 @@ from appliance.channel.messages import (
     UpstreamLost,
     UpstreamWanted,
 )
-from appliance.relay.limits import MIB
+from appliance.relay.bounds import MIB
 from roswire.tcpros import encode_frame, encode_header
 from tests.unit.relay.world import ASK, CALL, HEADER, LIMITS, LOOPBACK, Peer, World
 

@@ -22,10 +22,10 @@ from appliance.channel.messages import (
     UpstreamFound,
     UpstreamWanted,
 )
-from appliance.relay.connections.links import Link
-from appliance.relay.engine import Engine
-from appliance.relay.limits import MIB, Limits
+from appliance.relay.bounds import MIB, Limits
+from appliance.relay.connections.loop_channel import Link
 from appliance.relay.loop import Loop
+from appliance.relay.relay import Engine
 from roswire.tcpros import HeaderParser, encode_header
 
 LOOPBACK = "127.0.0.1"

@@ -5,7 +5,7 @@ from itertools import pairwise
 from typing import Any
 
 from roswire.definitions import Definitions
-from roswire.layout import ArrayPart, FixedPart, Layout, Leaf, Place, StringPart
+from roswire.message_layout import ArrayPart, FixedPart, Layout, Leaf, Place, StringPart
 from roswire.message_text import PRIMITIVES
 
 Values = dict[str, Any]

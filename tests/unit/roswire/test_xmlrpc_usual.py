@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from roswire.errors import PeerError
 from roswire.xmlrpc import Limits, Value, build_response, parse_call
-from roswire.xmlrpc.reader import Document
-from roswire.xmlrpc.usual import usual_answer, usual_call
+from roswire.xmlrpc.fast_path import usual_answer, usual_call
+from roswire.xmlrpc.xmlrpc_reader import Document
 from tests.support.examples import examples
 
 NAMES = st.one_of(

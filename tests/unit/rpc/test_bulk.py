@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.master.parameter_charges import measure
+from appliance.quotas.pool import Standing
 from appliance.rpc.bulk import AT_ONCE, Bulk, LargeWrites, bulk_turns, weigh
 from appliance.rpc.processor_time import ProcessorTime
-from appliance.shares.pool import Standing
 from roswire.xmlrpc import Value, build_response
 
 TIME = ProcessorTime(lambda host: host)

@@ -1,4 +1,4 @@
-"""Tests of `appliance.rpc.client`."""
+"""Tests of `appliance.rpc.xmlrpc_client`."""
 
 import asyncio
 import contextlib
@@ -8,8 +8,8 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.master.reach.node_api import ANSWER, NodeApi
-from appliance.rpc.client import CallFailedError, UnansweredError, XmlRpcClient
+from appliance.master.endpoints.node_api import ANSWER, NodeApi
+from appliance.rpc.xmlrpc_client import CallFailedError, UnansweredError, XmlRpcClient
 from roswire.uris import NodeUri
 from roswire.xmlrpc import build_response
 

@@ -13,6 +13,16 @@ import pytest
 import uvloop
 
 from appliance.policy.model import Address
+from appliance.quotas.pool import Bounds, Standing
+from appliance.quotas.table import (
+    RVMASTER_ARRIVALS,
+    RVMASTER_BYTES,
+    RVMASTER_CONNECTIONS,
+    RVMASTER_FAREWELLS,
+    RVMASTER_REQUESTS,
+)
+from appliance.rpc.connection_table import Visitors
+from appliance.rpc.fair_queue import Turns
 from appliance.rpc.front import HttpLimits, plain_address
 from appliance.rpc.processor_time import ProcessorTime
 from appliance.rpc.server import (
@@ -24,16 +34,6 @@ from appliance.rpc.server import (
     Peer,
     listen,
     not_at_once,
-)
-from appliance.rpc.turns import Turns
-from appliance.rpc.visitors import Visitors
-from appliance.shares.pool import Bounds, Standing
-from appliance.shares.table import (
-    RVMASTER_ARRIVALS,
-    RVMASTER_BYTES,
-    RVMASTER_CONNECTIONS,
-    RVMASTER_FAREWELLS,
-    RVMASTER_REQUESTS,
 )
 from roswire.xmlrpc import FaultReceived, parse_response
 

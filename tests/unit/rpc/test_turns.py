@@ -4,8 +4,8 @@ import asyncio
 import ipaddress
 from typing import Any
 
-from appliance.rpc.turns import Turns
-from appliance.shares.pool import Bounds, Standing
+from appliance.quotas.pool import Bounds, Standing
+from appliance.rpc.fair_queue import Turns
 
 HOST = ipaddress.ip_address("10.0.0.1")
 OTHER = ipaddress.ip_address("10.0.0.2")

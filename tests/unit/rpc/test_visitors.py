@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from appliance.policy.model import Address
-from appliance.rpc.visitors import Stage, Visitors
-from appliance.shares.pool import Bounds, Standing
+from appliance.quotas.pool import Bounds, Standing
+from appliance.rpc.connection_table import Stage, Visitors
 
 ROBOT, OTHER = ipaddress.ip_address("10.0.0.1"), ipaddress.ip_address("10.0.0.2")
 

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from appliance.config import Limits, Settings
+from appliance.configuration.settings import Limits, Settings
 from appliance.master.calls.gate import HostLimits
-from appliance.relay.process import descriptors_for
-from appliance.shares.descriptors import connections_within
-from appliance.shares.table import (
+from appliance.quotas.descriptors import connections_within
+from appliance.quotas.table import (
     DESCRIPTORS,
     NODE_PORTS,
     RELAY_CONNECTIONS,
@@ -19,6 +18,7 @@ from appliance.shares.table import (
     RVMASTER_CONNECTIONS,
     RVMASTER_FAREWELLS,
 )
+from appliance.relay.process import descriptors_for
 from appliance.supervisor.roles import ROLES
 
 BESIDE = 1024  # databases, links, listeners, calls to ROSMaster, threads

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from appliance.shares.pool import Bounds, Pool, Standing
+from appliance.quotas.pool import Bounds, Pool, Standing
 
 STRANGER, NAMED, REGISTERED = Standing
 

@@ -3,7 +3,7 @@
 import ast
 from pathlib import Path
 
-from appliance.shares.table import SHARES
+from appliance.quotas.table import SHARES
 from distribution.shares_page import page
 
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)

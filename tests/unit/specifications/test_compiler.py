@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
+from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import messages
 from appliance.channel.channel import Channel
-from appliance.specifications import compiler as module
-from appliance.specifications.compiler import SpecificationCompiler
-from appliance.specifications.files import Sources, SpecificationsRefusedError
-from appliance.withdrawal import WithdrawnError, awaited
+from appliance.specifications import compiler_link as module
+from appliance.specifications.compiler_link import SpecificationCompiler
+from appliance.specifications.specification_files import Sources, SpecificationsRefusedError
 
 SOURCES = Sources({"a.rv": "text"})
 FOUND = messages.Contents({"a": "a.rv"})

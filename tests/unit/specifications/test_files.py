@@ -4,7 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from appliance.specifications.files import Sources, SpecificationsRefusedError, check, read_folder
+from appliance.specifications.specification_files import (
+    Sources,
+    SpecificationsRefusedError,
+    check,
+    read_folder,
+)
 
 SPEC = "a() { event said() /chatter std_msgs/String '{}' { } }"
 OWN = "b() { event trigger() /trigger own_msgs/Trigger '{}' { } }"

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from appliance.specifications.files import Sources, read_folder
 from appliance.specifications.folder import SpecificationFolder
+from appliance.specifications.specification_files import Sources, read_folder
 
 
 @pytest.fixture

@@ -11,19 +11,19 @@ import pytest
 from msgspec.structs import asdict
 
 from appliance.audit.log import AuditLog
+from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import admin, messages
 from appliance.specifications.allocation import Allocation, Move, Resource
-from appliance.specifications.files import Checked, Sources, SpecificationsRefusedError, check
 from appliance.specifications.live_topics import Published
-from appliance.specifications.monitors import (
+from appliance.specifications.specification_files import Checked, Sources, SpecificationsRefusedError, check
+from appliance.specifications.specification_revisions import Check
+from appliance.specifications.specifications import (
     DryRunUnderWayError,
     Monitors,
     MonitorsChangedError,
     UnknownMonitorError,
 )
-from appliance.specifications.revisions import Check
-from appliance.store.state import StateStore
-from appliance.withdrawal import WithdrawnError, awaited
+from appliance.store.state_file import StateStore
 from tests.support.audit import HeardTrail
 from tests.support.site_key import LINE, NAME, OTHER_KEY, OTHER_LINE, signed
 from tests.support.stated import parts_here

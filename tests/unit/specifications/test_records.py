@@ -7,9 +7,9 @@ import pytest
 from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.search import export
-from appliance.audit_trail import AuditTrail
 from appliance.channel.messages import MonitorEvent
 from appliance.specifications.records import MonitorRecords
+from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import settle
 
 NAMES = ("event", "reason", "severity", "host", "category", "resource", "rule", "decision", "more", "self")

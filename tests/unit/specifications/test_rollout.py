@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 from appliance.audit.log import AuditLog
-from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.specifications.allocation import TOPIC, Allocation, Move, Resource
-from appliance.specifications.files import Sources, SpecificationsRefusedError, check
 from appliance.specifications.rollout import Revision, Rollout
+from appliance.specifications.specification_files import Sources, SpecificationsRefusedError, check
+from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import HeardTrail
 from tests.support.stated import parts_here
 

@@ -18,13 +18,13 @@ import pytest
 
 from appliance.store import ahead as ahead_module
 from appliance.store.ahead import Statement, WriteAhead, WriteAheadClosedError
-from appliance.store.database import Database, StoreError
+from appliance.store.writer_thread import Database, StoreError
 from tests.support.requirements import need_root
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from appliance.store.database import Database
+from appliance.store.writer_thread import Database
 database = Database(Path(sys.argv[1]) / "state.db", sys.argv[2], failed=print)
 for number in range(5000):
     database.submit("INSERT OR REPLACE INTO thing VALUES ('last', ?)", (number,))
@@ -118,7 +118,7 @@ def test_what_cannot_be_written_does_not_hold_up_the_end(tmp_path: Path, failure
 def test_who_waits_is_told_that_the_disk_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An operator is not kept waiting without a word; with room again all that was queued is written."""
     need_root()
-    monkeypatch.setattr("appliance.store.database._SETTLE_SECONDS", 0.05)
+    monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 0.05)
     place = tmp_path / "disk"
     place.mkdir()
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "rosrv-store-test", place], check=True)
@@ -135,7 +135,7 @@ def test_who_waits_is_told_that_the_disk_is_full(tmp_path: Path, monkeypatch: py
             with pytest.raises(StoreError, match=r"state\.db: .*full; make room"):
                 await database.settled()
             filler.unlink()
-            monkeypatch.setattr("appliance.store.database._SETTLE_SECONDS", 30)
+            monkeypatch.setattr("appliance.store.writer_thread._SETTLE_SECONDS", 30)
             await database.settled()
 
         asyncio.run(scene())

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from appliance.store.ahead import Statement, WriteAhead
-from appliance.store.state import (
+from appliance.store.state_file import (
     LARGEST_CHANGE,
     IncarnationRow,
     PermissionRow,

@@ -1,8 +1,8 @@
-"""Tests of `appliance.store.tokens`."""
+"""Tests of `appliance.store.access_tokens`."""
 
 import pytest
 
-from appliance.store.tokens import BadTokenNameError, is_secret, make_token, parse_token
+from appliance.store.access_tokens import BadTokenNameError, is_secret, make_token, parse_token
 
 
 def test_a_token_proves_itself_and_nothing_else_does() -> None:

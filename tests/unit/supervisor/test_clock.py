@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from appliance.supervisor import clock
-from appliance.supervisor.clock import clock_is_synchronised
+from appliance.supervisor import clock_sync
+from appliance.supervisor.clock_sync import clock_is_synchronised
 
 
 @pytest.mark.parametrize(
@@ -25,20 +25,20 @@ def test_what_the_kernel_says(
         given.contents.status = status
         return answer
 
-    monkeypatch.setattr(clock, "_libc", SimpleNamespace(adjtimex=adjtimex))
+    monkeypatch.setattr(clock_sync, "_libc", SimpleNamespace(adjtimex=adjtimex))
     assert clock_is_synchronised() is expected
     assert asked == [0]
 
 
 def test_the_structure_is_the_kernels() -> None:
     """The flags stand where the 64-bit kernel has them (adjtimex(2)), and it has room for all it writes."""
-    assert clock.Timex.status.offset == 40
-    assert ctypes.sizeof(clock.Timex) >= 208
+    assert clock_sync.Timex.status.offset == 40
+    assert ctypes.sizeof(clock_sync.Timex) >= 208
 
 
 def test_this_kernel_is_asked() -> None:
     """The real call writes what it should: maximum errors are positive where it answers."""
-    timex = clock.Timex()
+    timex = clock_sync.Timex()
     answer = ctypes.CDLL(None).adjtimex(ctypes.pointer(timex))
     assert answer == -1 or timex.maxerror > 0
     assert clock_is_synchronised() is (None if answer == -1 else not timex.status & 0x0040)

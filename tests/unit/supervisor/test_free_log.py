@@ -7,7 +7,7 @@ from typing import cast
 import pytest
 
 from appliance.channel.messages import LogHeld
-from appliance.supervisor.life import Life
+from appliance.supervisor.process_handle import Life
 from appliance.supervisor.roles import Facts, roles_of
 from appliance.supervisor.supervisor import Supervisor
 

@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.guard`, with surroundings that do what a test says."""
+"""Tests of `appliance.supervisor.isolation_watchdog`, with surroundings that do what a test says."""
 
 import asyncio
 import errno
@@ -10,8 +10,8 @@ from appliance.channel.answers.status import FirewallState
 from appliance.channel.messages import EndpointFound, FirewallReported, Message, ProbeFailed, ProbePassed
 from appliance.network.esp import Esp
 from appliance.network.namespaces import NetworkError
-from appliance.supervisor.enclosure import Enclosure
-from appliance.supervisor.guard import Guard
+from appliance.supervisor.isolation_lifecycle import Enclosure
+from appliance.supervisor.isolation_watchdog import Guard
 
 
 class Surroundings(Enclosure):

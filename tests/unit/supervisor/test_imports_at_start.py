@@ -12,12 +12,12 @@ NEVER: Final = {"rich", "pygments", "typer", "lark", "numpy", "pyroute2", "z3", 
 """What is not needed until somebody asks for help, loads specifications or builds a namespace."""
 
 ENTRIES: Final = {role.name: role.entry.partition(":")[0] for role in ROLES if role.entry is not None}
-_BARE = {"pydantic", "rosbags", "appliance.inventory"}
+_BARE = {"pydantic", "rosbags", "appliance.configuration.inventory"}
 _LINKED = _BARE | {"appliance.channel.admin"}
 ALSO: Final = {
-    "signer": _LINKED | {"appliance.config"}, "control": _BARE,
+    "signer": _LINKED | {"appliance.configuration.settings"}, "control": _BARE,
     "relay": _LINKED | {
-        "cryptography", "appliance.config", "roswire.definitions",
+        "cryptography", "appliance.configuration.settings", "roswire.definitions",
     },
     "charon": _LINKED, "compiler": _LINKED, "syslog": _LINKED, "recorder": {"pydantic", "appliance.channel.admin"},
     "api": _BARE | {"fastapi", "prometheus_client", "sse_starlette", "yaml", "appliance.policy.policy"},
@@ -38,19 +38,19 @@ def imported(*modules: str) -> set[str]:
 @pytest.mark.parametrize("role", ENTRIES)
 def test_a_process_imports_no_library_it_may_never_need(role: str) -> None:
     """Where nothing is monitored, no namespace is built and nobody asks for help, nothing of that is waited for."""
-    found = imported("appliance.supervisor.child", "appliance.supervisor.logs", ENTRIES[role])
+    found = imported("appliance.supervisor.child_entry", "appliance.supervisor.logs", ENTRIES[role])
     assert found.isdisjoint(NEVER | ALSO.get(role, set()))
 
 
 def test_the_supervisor_imports_no_library_it_may_never_need() -> None:
     """Neither does `rosrv up`, which has `typer` for its flags."""
     assert imported("appliance.cli.main", "appliance.cli.up").isdisjoint(
-        NEVER - {"typer"} | {"appliance.channel.admin", "appliance.inventory"}
+        NEVER - {"typer"} | {"appliance.channel.admin", "appliance.configuration.inventory"}
     )
 
 
 def test_the_launcher_of_a_program_has_no_loop_and_no_log() -> None:
     """What becomes rosmaster or rosout at once imports what it takes to give up its rights, no more."""
-    assert imported("appliance.supervisor.child").isdisjoint(
+    assert imported("appliance.supervisor.child_entry").isdisjoint(
         {"asyncio", "structlog", "appliance.channel.admin"}
     )

@@ -1,8 +1,13 @@
-"""Tests of `appliance.supervisor.life`: which process hangs, and which is only slow."""
+"""Tests of `appliance.supervisor.process_handle`: which process hangs, and which is only slow."""
 
 import pytest
 
-from appliance.supervisor.life import ANSWER_SECONDS, FIRST_ANSWER_SECONDS, LONGEST_START_SECONDS, hangs
+from appliance.supervisor.process_handle import (
+    ANSWER_SECONDS,
+    FIRST_ANSWER_SECONDS,
+    LONGEST_START_SECONDS,
+    hangs,
+)
 
 
 @pytest.mark.parametrize(

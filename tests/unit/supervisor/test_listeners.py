@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.listeners`."""
+"""Tests of `appliance.supervisor.inherited_listeners`."""
 
 import os
 import socket
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.supervisor.listeners import KeptSockets, RefusedSocketError
+from appliance.supervisor.inherited_listeners import KeptSockets, RefusedSocketError
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.ports`."""
+"""Tests of `appliance.supervisor.port_check`."""
 
 import os
 import socket
@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.ports import first_free, free_port, require_free, spare_ports
+from appliance.supervisor.port_check import first_free, free_port, require_free, spare_ports
 
 
 def test_a_free_port_is_free() -> None:

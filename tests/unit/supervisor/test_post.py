@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.post`: how long a place stays empty."""
+"""Tests of `appliance.supervisor.process_slot`: how long a place stays empty."""
 
 import time
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from appliance.supervisor.post import LOUD_AFTER, Post
+from appliance.supervisor.process_slot import LOUD_AFTER, Post
 from appliance.supervisor.roles import Facts, Role
 
 

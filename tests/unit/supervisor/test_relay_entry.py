@@ -4,9 +4,9 @@ import json
 from dataclasses import fields
 from pathlib import Path
 
-from appliance.config import Relay, Settings
-from appliance.config_sources import plain
-from appliance.relay.limits import Limits
+from appliance.configuration.settings import Relay, Settings
+from appliance.configuration.sources import plain
+from appliance.relay.bounds import Limits
 from appliance.supervisor.relay_entry import limits_of
 
 

@@ -6,7 +6,7 @@ import os
 import pytest
 from pydantic import ByteSize
 
-from appliance.config import RecorderRules
+from appliance.configuration.settings import RecorderRules
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.rings import Rings
 

@@ -7,8 +7,8 @@ from typing import cast
 import pytest
 
 from appliance.supervisor import shutdown
-from appliance.supervisor.life import Life
-from appliance.supervisor.post import Post
+from appliance.supervisor.process_handle import Life
+from appliance.supervisor.process_slot import Post
 from appliance.supervisor.roles import Role
 
 

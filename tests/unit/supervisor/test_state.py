@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.state`, as the user who runs them."""
+"""Tests of `appliance.supervisor.state_directory`, as the user who runs them."""
 
 import os
 import socket
@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from appliance.base.atomic_files import name_to_make
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import Role
-from appliance.supervisor.state import StateDirectory
+from appliance.supervisor.state_directory import StateDirectory
 from appliance.supervisor.users import account_of
-from appliance.whole_files import name_to_make
 
 ROLES = (
     Role(name="control", user="rosrv", part="control"),

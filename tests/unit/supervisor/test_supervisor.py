@@ -13,7 +13,7 @@ from structlog.testing import capture_logs
 from appliance.channel.messages import CompilerWanted, RouteWanted
 from appliance.supervisor import supervisor as module
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.life import Life
+from appliance.supervisor.process_handle import Life
 from appliance.supervisor.roles import Facts, Role
 from appliance.supervisor.supervisor import ControlReady, Supervisor
 

@@ -1,4 +1,4 @@
-"""Tests of `appliance.supervisor.walls`, where a wall is raised in a process of its own: there is no way back."""
+"""Tests of `appliance.supervisor.sandbox`, where a wall is raised in a process of its own: there is no way back."""
 
 import json
 import subprocess
@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 
 from appliance.supervisor.roles import ROLES, Facts
-from appliance.supervisor.walls import landlock, seccomp
-from appliance.supervisor.walls.calls import FORBIDDEN, LISTED, STARTS_PROGRAMS
-from appliance.supervisor.walls.folders import around, furnished, runnable
-from appliance.supervisor.walls.plan import UNIX, Walls
+from appliance.supervisor.sandbox import landlock, seccomp
+from appliance.supervisor.sandbox.folders import around, furnished, runnable
+from appliance.supervisor.sandbox.sandbox_plan import UNIX, Walls
+from appliance.supervisor.sandbox.system_calls import FORBIDDEN, LISTED, STARTS_PROGRAMS
 
 _PROGRAM = """
 import json, os, socket
 from appliance.supervisor import privileges
 from appliance.supervisor.users import Account
-from appliance.supervisor.walls import seccomp
-from appliance.supervisor.walls.plan import Walls
+from appliance.supervisor.sandbox import seccomp
+from appliance.supervisor.sandbox.sandbox_plan import Walls
 privileges.drop(Account("me", os.geteuid() or 61015, os.getegid() or 61015), parent=os.getppid())
 seccomp.raise_wall(Walls(programs=("/usr",)))
 

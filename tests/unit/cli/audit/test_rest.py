@@ -1,4 +1,4 @@
-"""Tests of `appliance.cli.audit.rest`: the log over REST fails, and goes on, as it does from its file."""
+"""Tests of `appliance.cli.audit.log_over_rest`: the log over REST fails, and goes on, as it does from its file."""
 
 import json
 from collections.abc import Iterator
@@ -7,12 +7,12 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.audit.output import Entry, as_object
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Record
+from appliance.audit.record_format import Entry, as_object
 from appliance.cli.admin_socket import NotRunningError
-from appliance.cli.audit import rest as audit_rest
-from appliance.cli.audit.rest import RestLog
+from appliance.cli.audit import log_over_rest as audit_rest
+from appliance.cli.audit.log_over_rest import RestLog
 from appliance.cli.rest.session import ProblemError, RestClient
 
 END = 'data: {"reason": "the token has ended"}'

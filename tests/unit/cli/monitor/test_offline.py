@@ -6,9 +6,9 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from appliance.cli.main import app
-from appliance.store.state import MonitorRevisionRow, StateStore
+from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.supervisor.errors import StartError
-from appliance.supervisor.state import StateDirectory
+from appliance.supervisor.state_directory import StateDirectory
 
 
 def state_with(tmp_path: Path, who: str) -> Path:

@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from typer.testing import CliRunner
 
 from appliance.cli.main import app
-from appliance.order_proof import is_signed, keys_of, parse_proof, reading_key, statement
+from appliance.signing.request_signing import is_signed, keys_of, parse_proof, reading_key, statement
 
 TOKEN = "rosrv_5c0f3d2b9a11_" + "x" * 43
 SHOWN = f"Bearer {reading_key(TOKEN)}"

@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from typer.testing import CliRunner
 
 from appliance.cli.main import app
-from appliance.cli.selftest.findings import fail, ok, told
+from appliance.cli.selftest.selftest_findings import fail, ok, told
 from appliance.network.namespaces import namespaces
 from tests.support.requirements import need_root
 

@@ -2,7 +2,7 @@
 
 import asyncio
 
-from appliance.master.calls.turns import Claims
+from appliance.master.calls.call_order import Claims
 
 
 def test_one_after_the_other_by_name() -> None:

@@ -7,13 +7,13 @@ import pytest
 
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.calls.call import CALLER_API, SERVICE_API, Attempt, Call, Identity
+from appliance.master.calls.call_table import MASTER_CALLS
 from appliance.master.calls.gate import Contest, Gate, HostLimits, contested
 from appliance.master.calls.node_calls import NODE_CALLS
-from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.registry import PUBLISHER_PATH, Incarnation, Kind, Registry
-from appliance.master.upkeep.liveness import Presence, Probe
-from appliance.policy.compiler import compile_policy
+from appliance.master.reconcile.liveness import Presence, Probe
 from appliance.policy.model import Decision
+from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.server import Peer
 from roswire.parameter_tree import Tree
 from roswire.uris import parse_node_uri, parse_service_uri

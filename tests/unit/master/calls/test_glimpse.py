@@ -4,7 +4,7 @@ import ipaddress
 
 import pytest
 
-from appliance.master.calls.glimpse import asked_for
+from appliance.master.calls.request_peek import asked_for
 from appliance.policy.model import Category
 from appliance.rpc.server import Peer
 from roswire.xmlrpc import Value, build_call

@@ -6,13 +6,13 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.audit_trail import AuditTrail
 from appliance.channel.messages import ConnectionOpened
 from appliance.control.overview import graph_of
 from appliance.master.caller import Caller
 from appliance.master.calls.node_calls import NodeCalls
+from appliance.master.endpoints.traffic import Carried
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reach.traffic import Carried
+from appliance.telemetry.audit_trail import AuditTrail
 from roswire.uris import parse_node_uri
 from tests.support.idle import idle
 

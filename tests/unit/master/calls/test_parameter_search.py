@@ -7,10 +7,10 @@ from typing import Any, cast
 import pytest
 
 from appliance.master.caller import Answer, Caller
+from appliance.master.calls.parameter_calls import ParameterSearch
 from appliance.master.calls.parameter_rights import ParameterRights
-from appliance.master.calls.parameters import ParameterSearch
-from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Decision
+from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.server import Peer
 from roswire.parameter_tree import standing_at
 from tests.support.parameters import mirror

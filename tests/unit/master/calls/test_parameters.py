@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.master.caller import Caller
-from appliance.master.calls.parameters import ParameterCalls, Write
+from appliance.master.calls.parameter_calls import ParameterCalls, Write
 from appliance.master.parameter_charges import LimitReachedError, measure
 from appliance.master.parameter_mirror import ParameterMirror
-from appliance.rpc.client import CallFailedError
 from appliance.rpc.server import Peer
+from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.errors import EncodingError, ProtocolError
 from tests.support.examples import examples
 from tests.support.nodes import PYTHON

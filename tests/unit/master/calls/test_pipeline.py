@@ -15,12 +15,12 @@ from appliance.master.calls import pipeline
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.upkeep.enactor import Enactor
-from appliance.metrics import Meter
-from appliance.policy.compiler import compile_policy
+from appliance.master.reconcile.enactor import Enactor
 from appliance.policy.model import Decision
-from appliance.rpc.client import CallFailedError
+from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.server import HttpRequest, Peer
+from appliance.rpc.xmlrpc_client import CallFailedError
+from appliance.telemetry.metrics import Meter
 from roswire.uris import parse_node_uri
 from roswire.xmlrpc import Value, build_call, parse_response
 from tests.support.examples import examples

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from appliance.master.calls.turns import WriteTurns
+from appliance.master.calls.call_order import WriteTurns
 
 
 async def write(turns: WriteTurns, keys: Sequence[str], order: list[str], go: asyncio.Event) -> None:

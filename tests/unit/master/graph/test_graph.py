@@ -5,7 +5,7 @@ from typing import Any, cast
 import pytest
 
 from appliance.master.graph.registry import Kind, Life
-from appliance.store.state import PermissionRow
+from appliance.store.state_file import PermissionRow
 from roswire.xmlrpc import Value
 from tests.support.control_parts import HOST, POLICY, ControlParts
 

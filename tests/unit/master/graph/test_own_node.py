@@ -6,12 +6,12 @@ import pytest
 
 from appliance.master.caller import ApiUri, Caller
 from appliance.master.calls.call import CALLER_API, SERVICE_API, Attempt
+from appliance.master.calls.call_table import MASTER_CALLS
 from appliance.master.calls.gate import Gate, HostLimits
-from appliance.master.calls.table import MASTER_CALLS
 from appliance.master.graph.own_node import ROSOUT
 from appliance.master.graph.registry import Kind, Registry
-from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Decision
+from appliance.policy.policy_compiler import compile_policy
 from appliance.rpc.server import Peer
 from roswire.uris import parse_node_uri
 

@@ -4,8 +4,8 @@ import pytest
 
 from appliance.master.graph.registry import Kind, Life
 from appliance.master.graph.revocation import revoked
-from appliance.policy.compiler import compile_policy
-from appliance.store.state import PermissionRow
+from appliance.policy.policy_compiler import compile_policy
+from appliance.store.state_file import PermissionRow
 from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, POLICY, ControlParts
 

@@ -5,7 +5,7 @@ import ipaddress
 
 import pytest
 
-from appliance.master.reach.places import Addresses
+from appliance.master.endpoints.endpoint_addresses import Addresses
 from appliance.rpc.server import Peer
 
 

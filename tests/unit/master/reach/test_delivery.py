@@ -6,12 +6,12 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.master.endpoints.delivery import Delivery
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation
-from appliance.master.reach.delivery import Delivery
-from appliance.rpc.client import CallFailedError
-from appliance.shares.pool import Bounds, Standing
-from appliance.shares.table import NODE_CALLS_UNDER_WAY
+from appliance.quotas.pool import Bounds, Standing
+from appliance.quotas.table import NODE_CALLS_UNDER_WAY
+from appliance.rpc.xmlrpc_client import CallFailedError
 from roswire.xmlrpc import FaultReceived, Value
 from tests.support.control_parts import ControlParts
 

@@ -3,8 +3,8 @@
 import ipaddress
 from typing import Any, cast
 
+from appliance.master.endpoints.proxy_endpoints import Faces
 from appliance.master.graph.registry import Incarnation
-from appliance.master.reach.faces import Faces
 from roswire.uris import parse_node_uri
 
 

@@ -4,10 +4,10 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.master.endpoints.delivery import Delivery
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Incarnation, Kind, Life
-from appliance.master.reach.delivery import Delivery
-from appliance.shares.pool import Standing
+from appliance.quotas.pool import Standing
 from roswire.xmlrpc import Value
 from tests.support.control_parts import ControlParts
 

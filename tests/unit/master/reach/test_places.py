@@ -8,12 +8,12 @@ from collections.abc import Iterator
 
 import pytest
 
+from appliance.master.endpoints.endpoint_addresses import NoPortError, Places
 from appliance.master.graph.registry import Incarnation
-from appliance.master.reach.places import NoPortError, Places
-from appliance.policy.compiler import compile_policy
 from appliance.policy.model import Address
 from appliance.policy.policy import DEFAULT_PORTS
-from appliance.shares.table import NODE_PORTS
+from appliance.policy.policy_compiler import compile_policy
+from appliance.quotas.table import NODE_PORTS
 from roswire.uris import parse_node_uri
 
 
@@ -132,7 +132,7 @@ def test_no_port_is_lost_while_none_can_be_opened(first: int, monkeypatch: pytes
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
     with monkeypatch.context() as patch:
-        patch.setattr("appliance.master.reach.places.listen", exhausted)
+        patch.setattr("appliance.master.endpoints.endpoint_addresses.listen", exhausted)
         for _try in range(20):
             with pytest.raises(NoPortError, match="Too many open files"):
                 held.open(HOSTS[0])

@@ -8,25 +8,25 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.audit_trail import AuditTrail
 from appliance.channel import messages
 from appliance.channel.channel import Channel
+from appliance.master.endpoints.delivery import Delivery
+from appliance.master.endpoints.endpoint_addresses import Places
+from appliance.master.endpoints.node_api import NodeApi
+from appliance.master.endpoints.relay_control import RelayControl
+from appliance.master.endpoints.traffic import Carried
 from appliance.master.graph.grants import Grants
 from appliance.master.graph.graph import Graph
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reach.delivery import Delivery
-from appliance.master.reach.node_api import NodeApi
-from appliance.master.reach.places import Places
-from appliance.master.reach.relays import RelayControl
-from appliance.master.reach.traffic import Carried
-from appliance.master.upkeep.enactor import Enactor
-from appliance.policy.compiler import compile_policy
+from appliance.master.reconcile.enactor import Enactor
 from appliance.policy.model import Address
 from appliance.policy.policy import Policy
-from appliance.shares.pool import Bounds
-from appliance.shares.table import GRANTS
+from appliance.policy.policy_compiler import compile_policy
+from appliance.quotas.pool import Bounds
+from appliance.quotas.table import GRANTS
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, Plan
-from appliance.store.state import PermissionRow, StateStore
+from appliance.store.state_file import PermissionRow, StateStore
+from appliance.telemetry.audit_trail import AuditTrail
 from roswire.uris import parse_node_uri
 from tests.support.stated import stated
 

@@ -7,8 +7,8 @@ import pytest
 
 from appliance.audit.record import Severity
 from appliance.channel.messages import ConnectionRefused
+from appliance.master.endpoints.traffic import Carried
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.reach.traffic import Carried
 from roswire.uris import parse_node_uri
 
 

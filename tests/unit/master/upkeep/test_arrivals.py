@@ -5,9 +5,9 @@ from typing import Any, cast
 
 import pytest
 
+from appliance.master.endpoints.endpoint_addresses import NoPortError
 from appliance.master.graph.registry import Incarnation, Registry
-from appliance.master.reach.places import NoPortError
-from appliance.master.upkeep.arrivals import Arrivals
+from appliance.master.reconcile.arrivals import Arrivals
 from appliance.policy.model import Address
 from tests.support.control_parts import ControlParts
 

@@ -9,8 +9,8 @@ import pytest
 
 from appliance.master.graph.effects import NodeCall
 from appliance.master.graph.registry import Kind, Life
-from appliance.master.upkeep import liveness
-from appliance.rpc.client import RefusedError
+from appliance.master.reconcile import liveness
+from appliance.rpc.xmlrpc_client import RefusedError
 from roswire.xmlrpc import Value
 from tests.support.control_parts import OPEN, POLICY, ControlParts
 

@@ -6,7 +6,7 @@ from typing import Any, cast
 import pytest
 
 from appliance.master.graph.registry import Kind, Registration
-from appliance.rpc.client import CallFailedError
+from appliance.rpc.xmlrpc_client import CallFailedError
 from tests.support.control_parts import POLICY, ControlParts
 
 pytestmark = pytest.mark.anyio

@@ -7,8 +7,8 @@ from typing import Any, cast
 import pytest
 
 from appliance.master.graph.registry import Incarnation, Kind, Registry
-from appliance.master.upkeep import reminders
-from appliance.master.upkeep.reminders import Reminders
+from appliance.master.reconcile import reminders
+from appliance.master.reconcile.reminders import Reminders
 from roswire.uris import parse_node_uri
 
 HOST = ipaddress.ip_address("10.0.0.5")

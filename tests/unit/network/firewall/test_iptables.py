@@ -1,7 +1,15 @@
 """Tests of what the iptables back end makes of a rule, without a kernel."""
 
+from appliance.network.firewall.firewall_rules import (
+    Chain,
+    Interface,
+    PortRange,
+    RateLimit,
+    Rule,
+    Verdict,
+    inner_port,
+)
 from appliance.network.firewall.iptables import RenderedRule, render_rule
-from appliance.network.firewall.rules import Chain, Interface, PortRange, RateLimit, Rule, Verdict, inner_port
 
 SYN = ("tcp-flags", ("SYN,ACK", "SYN"))
 

@@ -10,8 +10,7 @@ import pytest
 
 from appliance.network.firewall.backend import BackendMissingError, FirewallError
 from appliance.network.firewall.firewall import statuses
-from appliance.network.firewall.nft import NftBackend, render, render_rule
-from appliance.network.firewall.rules import (
+from appliance.network.firewall.firewall_rules import (
     Chain,
     FirewallSettings,
     PortRange,
@@ -21,6 +20,7 @@ from appliance.network.firewall.rules import (
     appliance_rules,
     inner_port,
 )
+from appliance.network.firewall.nft import NftBackend, render, render_rule
 from appliance.network.namespaces import Namespace
 
 PORT = {"match": {"op": "==", "left": {"payload": {"protocol": "tcp", "field": "dport"}}, "right": 11312}}

@@ -6,7 +6,7 @@ import pytest
 
 from appliance.network.firewall.backend import RuleCounter
 from appliance.network.firewall.firewall import statuses
-from appliance.network.firewall.rules import (
+from appliance.network.firewall.firewall_rules import (
     Chain,
     FirewallSettings,
     Forwarder,

@@ -11,7 +11,7 @@ from appliance.channel.messages import (
     ServicePlaced,
 )
 from appliance.relay.connections.admission import asked_for, bound_name, flaw, missing
-from appliance.relay.grants import StatedTable
+from appliance.relay.granted import StatedTable
 
 TOPIC = {"topic": "/chatter", "md5sum": "*", "callerid": "/listener"}
 SERVICE = {"service": "/mode", "md5sum": "*", "callerid": "/client"}

@@ -1,9 +1,9 @@
 """Peers that wait at the relay: whose place goes to whom."""
 
-from appliance.relay.connections.anteroom import Anteroom
+from appliance.quotas.pool import Standing
+from appliance.quotas.table import RELAY_HEADERS
 from appliance.relay.connections.memory import HostShares
-from appliance.shares.pool import Standing
-from appliance.shares.table import RELAY_HEADERS
+from appliance.relay.connections.pending_connections import Anteroom
 
 
 class World:

@@ -2,8 +2,8 @@
 
 import pytest
 
-from appliance.relay.connections.first_words import APPEARED, SECONDS, SPEECH, FirstWords
 from appliance.relay.connections.frames import Batch
+from appliance.relay.connections.startup_replay import APPEARED, SECONDS, SPEECH, FirstWords
 from tests.support.relay_memory import share
 
 

@@ -7,8 +7,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from appliance.channel.messages import UNLIMITED, FlowLimit
-from appliance.relay.connections.flow import BURST, Flow, Flows, FlowShare, PublicationFlow
 from appliance.relay.connections.frames import Batch
+from appliance.relay.connections.rate_limit import BURST, Flow, Flows, FlowShare, PublicationFlow
 from tests.support.relay_memory import share
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from appliance.channel.channel import Channel
 from appliance.channel.messages import NodePlaced, NodeWithdrawn, RelayLink, UpstreamWanted
-from appliance.relay.connections.links import Link
+from appliance.relay.connections.loop_channel import Link
 from appliance.relay.loop import QUANTUM, Loop
 
 

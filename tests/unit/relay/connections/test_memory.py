@@ -1,8 +1,8 @@
 """No host takes the memory that the others need, and nothing holds memory for what never comes."""
 
+from appliance.quotas.pool import Bounds, Standing
+from appliance.relay.bounds import Limits
 from appliance.relay.connections.memory import HostShares, Memory, Stall
-from appliance.relay.limits import Limits
-from appliance.shares.pool import Bounds, Standing
 
 
 def shares(whole: int) -> HostShares:

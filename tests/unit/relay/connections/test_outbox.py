@@ -6,9 +6,9 @@ from dataclasses import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from appliance.relay.bounds import Limits
 from appliance.relay.connections.frames import LITTLE
-from appliance.relay.connections.outbox import Outbox
-from appliance.relay.limits import Limits
+from appliance.relay.connections.send_queue import Outbox
 from tests.support.examples import examples
 from tests.support.relay_memory import share
 

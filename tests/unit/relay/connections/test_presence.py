@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from appliance.quotas.pool import Standing
+from appliance.relay.bounds import Limits
 from appliance.relay.connections.frames import Scratch
 from appliance.relay.connections.memory import Memory
-from appliance.relay.connections.presence import Presences, looks_for_names
+from appliance.relay.connections.named_subscribers import Presences, looks_for_names
 from appliance.relay.context import RelayContext
-from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
-from appliance.relay.monitors.middle import Middle
+from appliance.relay.monitors.interceptor import Middle
 from appliance.relay.report import Reporter
-from appliance.shares.pool import Standing
 from roswire.tcpros import HeaderParser
 
 TOPIC = "/fibonacci/goal"

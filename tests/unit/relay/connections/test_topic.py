@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 import pytest
 
 from appliance.channel.messages import DELAY_BOUNDS, FlowLimit, LatchRefused, TopicTraffic
-from appliance.relay.connections.flow import Flow
 from appliance.relay.connections.frames import Batch
-from appliance.relay.connections.topic import Recorder, RelayedTopic
+from appliance.relay.connections.rate_limit import Flow
+from appliance.relay.connections.relayed_topic import Recorder, RelayedTopic
 from tests.support.relay_memory import share
 from tests.support.steps import steps
 

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple, cast
 
 import pytest
 
-from appliance.audit.output import Entry, without_contents
 from appliance.audit.record import Record, Severity
+from appliance.audit.record_format import Entry, without_contents
 from appliance.audit.why import lines_of
-from appliance.audit_trail import AuditTrail
 from appliance.channel.messages import MonitorEvent
-from appliance.relay.monitors.places import Place
+from appliance.relay.monitors.observation_points import Place
 from appliance.specifications.records import MonitorRecords
+from appliance.telemetry.audit_trail import AuditTrail
 from rosmop.run.explanations import moment
 from rosmop.tests.acting import message
 from rosmop.tests.random_specifications import Traffic, definitions

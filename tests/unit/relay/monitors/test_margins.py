@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from appliance.channel.messages import Approach, MarginRow
-from appliance.relay.monitors.margins import Margins
+from appliance.relay.monitors.margin_counts import Margins
 from rosmop.run.engine import MonitorSet
 from roswire.standard import standard_definitions
 from tests.unit.relay.monitors.test_middle import string

@@ -26,7 +26,7 @@ from appliance.channel.messages import (
 )
 from appliance.relay.connections.frames import Batch
 from appliance.relay.monitors.loader import Loader
-from appliance.relay.monitors.places import Place
+from appliance.relay.monitors.observation_points import Place
 from rosmop.run.slice_quota import HolderOf
 from roswire.tcpros import encode_frame, encode_header, encode_service_error, encode_service_reply
 from tests.support.stated import stated

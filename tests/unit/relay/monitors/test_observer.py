@@ -8,7 +8,7 @@ import pytest
 
 from appliance.channel.messages import MonitorEvent, MonitorsCounted, MonitorsReported
 from appliance.relay.monitors import observations
-from appliance.relay.monitors.places import Place
+from appliance.relay.monitors.observation_points import Place
 from rosmop.tests.acting import message
 from rosmop.tests.random_specifications import Traffic, definitions
 from tests.unit.relay.monitors.test_passage import Monitored

@@ -11,17 +11,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from appliance.channel.messages import Message, MonitorRow
+from appliance.relay.bounds import Limits
 from appliance.relay.connections.frames import FrameReceiver, Scratch
-from appliance.relay.limits import Limits
 from appliance.relay.loop import Loop
-from appliance.relay.monitors.lane import Lane
-from appliance.relay.monitors.middle import Middle
-from appliance.relay.monitors.places import Place
+from appliance.relay.monitors.interceptor import Middle
+from appliance.relay.monitors.observation_points import Place
+from appliance.relay.monitors.topic_pipeline import Lane
 from appliance.relay.report import Reporter
 from rosmop.fast.wasm_runner import Walked
 from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.engine import MonitorSet
-from rosmop.runtime.context import Published
+from rosmop.runtime.action_context import Published
 from rosmop.tests.acting import message
 from rosmop.tests.random_specifications import (
     Messages,

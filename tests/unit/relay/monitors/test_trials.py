@@ -12,7 +12,7 @@ from appliance.channel.messages import (
     PublicationRefused,
     SpecificationsTaken,
 )
-from appliance.relay.monitors import trials
+from appliance.relay.monitors import shadow
 from roswire.tcpros import encode_frame, encode_header, encode_service_reply
 from tests.support.stated import stated
 from tests.unit.relay.monitors.test_middle import (
@@ -124,7 +124,7 @@ def test_a_loop_without_end_delays_and_drops_nothing(world: Trying, monkeypatch:
     """It ends at a tenth of what others may take, once in a second; what it saw is not complete: it begins anew."""
     world.state_trials(GUARD, tried=("guard",))
     publisher, subscriber = world.typed()
-    monkeypatch.setattr(trials.Trials, "tick", lambda _self: None)  # the second is not over
+    monkeypatch.setattr(shadow.Trials, "tick", lambda _self: None)  # the second is not over
     for _ in range(20):
         publisher.send(string("loop") + string("bad"))
     world.gets(subscriber, (string("loop") + string("bad")) * 20)
@@ -142,7 +142,7 @@ def test_a_loop_without_end_delays_and_drops_nothing(world: Trying, monkeypatch:
 
 def test_ticks_without_end_rest_for_the_second(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
     """One is tried, and the loop goes on; another when the second is over."""
-    monkeypatch.setattr(trials.Trials, "tick", lambda _self: None)
+    monkeypatch.setattr(shadow.Trials, "tick", lambda _self: None)
     text = "s() { int n = 0; event tick() every 1ms { while (true) { n = n; } } }"
     world.state_trials(text, tried=("s",))
     assert "one on trial may not take" in world.event("trial missed", monitor="s").text
@@ -167,8 +167,8 @@ def test_trials_have_a_share_of_the_processor_and_no_more(
         more[0] += 0.03
         return thread_time() + more[0]
 
-    monkeypatch.setattr("appliance.relay.monitors.trials.time.thread_time", slow)
-    monkeypatch.setattr(trials.Trials, "tick", lambda _self: None)  # the second is not over
+    monkeypatch.setattr("appliance.relay.monitors.shadow.time.thread_time", slow)
+    monkeypatch.setattr(shadow.Trials, "tick", lambda _self: None)  # the second is not over
     publisher.send(string("a") * 100)
     world.gets(subscriber, string("a") * 100)
     world.until(lambda: not world.engine.middle.trials.waiting)
@@ -182,7 +182,7 @@ def test_trials_have_a_share_of_the_processor_and_no_more(
 
 def test_what_waits_is_bounded(world: Trying, monkeypatch: pytest.MonkeyPatch) -> None:
     """More messages than can be kept are missed by the trial, not by the subscriber."""
-    monkeypatch.setattr(trials, "_MOST_WAITING", 5)
+    monkeypatch.setattr(shadow, "_MOST_WAITING", 5)
     world.state_trials(GUARD, tried=("guard",))
     publisher, subscriber = world.typed()
     publisher.send(string("a") * 30)

@@ -1,0 +1,146 @@
+"""Records as evidence: with each, its place in the chain, as far as a signed checkpoint.
+
+What is exported proves itself elsewhere, also when a filter left most records out: each record has the hash before it
+and its own, the content hashes of those that follow it and are left out (`then`), up to the next record that is
+exported or to the signed checkpoint (`checkpoint`) that seals it. `export_proof.py` holds that against the public key.
+"""
+
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from appliance.audit.chain import content_hash, genesis, link
+from appliance.audit.copies import SignedCheckpoint
+from appliance.audit.log_database import COLUMNS, LogUnreadableError, reading
+from appliance.audit.query import Filter
+from appliance.audit.record_format import Entry, as_json
+from appliance.audit.search import search
+from appliance.signing.signed_statements import NO_CHECKPOINT
+
+_Hash = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
+
+
+class Chain(msgspec.Struct, frozen=True, kw_only=True):
+    """The place of a record in the chain; hashes in hexadecimal.
+
+    `then` is None where what follows cannot be shown without its content: version 0.1.0 wrote it.
+    """
+
+    previous: _Hash
+    hash: _Hash
+    then: list[_Hash] | None
+    checkpoint: SignedCheckpoint | None = None
+
+
+def evidence(path: Path, wanted: Filter, page: int = 1000) -> Iterator[tuple[Entry, Chain]]:
+    """All records that `wanted` asks for, oldest first, each with its place; a page in memory at a time.
+
+    Raises `LogUnreadableError` and `FilterError`.
+    """
+    cursor: str | None = "0"
+    waiting: Entry | None = None
+    while cursor is not None:
+        entries, cursor = search(path, wanted, cursor, page, newest_first=False)
+        if waiting is not None:
+            entries = [waiting, *entries]
+        last = cursor is None
+        yield from _placed(path, entries, whole=last)
+        waiting = entries[-1] if entries and not last else None
+
+
+def evidence_line(entry: Entry, chain: Chain) -> str:
+    """One line of NDJSON, without the newline: the record as everywhere, and `chain`."""
+    return f'{as_json(entry)[:-1]},"chain":{msgspec.json.encode(chain).decode("ascii")}}}'
+
+
+def _placed(path: Path, entries: list[Entry], *, whole: bool) -> Iterator[tuple[Entry, Chain]]:
+    """The records with their places; the last of them only if nothing follows it (`whole`)."""
+    following = [entry.sequence for entry in entries[1:]] + ([0] if whole else [])
+    with reading(path) as connection:
+        connection.execute("BEGIN")
+        places = Places(connection)
+        placed = [
+            (entry, places.place(entry.sequence, after))
+            for entry, after in zip(entries, following, strict=False)
+        ]
+    for entry, chain in placed:
+        if chain is None:
+            raise LogUnreadableError(
+                f"{path}: retention removed record {entry.sequence} while it was exported: export again"
+            )
+        yield entry, chain
+
+
+class Places:
+    """The places of records in one state of a log, asked for at sequences that grow."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+        (self._log,) = connection.execute("SELECT id FROM log").fetchone()
+        self._sealing: SignedCheckpoint | None = None
+        self._unsealed = False
+        self._before: tuple[int, str] = (-1, "")
+
+    def place(self, sequence: int, following: int) -> Chain | None:
+        """The place of a record, as far as the next one that is exported (0: none is); None if it is gone by now."""
+        query = "SELECT hash FROM record WHERE sequence = ?"
+        row = self._connection.execute(query, (sequence,)).fetchone()
+        if row is None:
+            return None
+        digest: bytes = row[0]
+        checkpoint = self._checkpoint(sequence)
+        ends = checkpoint if checkpoint and (not following or checkpoint.sequence < following) else None
+        upto = ends.sequence if ends else following - 1
+        previous = self._previous(sequence)
+        self._before = sequence, digest.hex()
+        return Chain(
+            previous=previous,
+            hash=digest.hex(),
+            then=self._contents(digest, sequence, upto) if upto > sequence else [],
+            checkpoint=ends,
+        )
+
+    def _previous(self, sequence: int) -> str:
+        if self._before[0] == sequence - 1:
+            return self._before[1]
+        query = "SELECT hash FROM record WHERE sequence = ?"
+        row = self._connection.execute(query, (sequence - 1,)).fetchone()
+        if row is not None:
+            return str(row[0].hex())
+        if sequence == 1:
+            return genesis(str(self._log)).hex()
+        query = "SELECT detail FROM record WHERE event = 'records removed' ORDER BY sequence DESC LIMIT 1"
+        row = self._connection.execute(query).fetchone()
+        return str(msgspec.json.decode(row[0])["last_hash"]) if row is not None else NO_CHECKPOINT
+
+    def _checkpoint(self, sequence: int) -> SignedCheckpoint | None:
+        """The first signed checkpoint that seals a record."""
+        known = self._sealing
+        if self._unsealed or (known is not None and known.sequence >= sequence):
+            return None if self._unsealed else known
+        query = (
+            "SELECT text, signature, public_key FROM checkpoint WHERE number > ? AND sequence >= ?"
+            " AND signature IS NOT NULL AND public_key IS NOT NULL ORDER BY number LIMIT 1"
+        )
+        row = self._connection.execute(query, (known.number if known else 0, sequence)).fetchone()
+        self._unsealed = row is None
+        self._sealing = None if row is None else SignedCheckpoint.of(*row)
+        return self._sealing
+
+    def _contents(self, digest: bytes, after: int, upto: int) -> list[str] | None:
+        """The content hashes of the records after one up to another; None where they do not make the chain."""
+        rows = self._connection.execute(
+            f"SELECT {COLUMNS}, hash FROM record WHERE sequence > ? AND sequence <= ? ORDER BY sequence",  # noqa: S608  fixed names
+            (after, upto),
+        )
+        contents = []
+        for row in rows:
+            content = content_hash(row[:-1])
+            digest = link(digest, content)
+            if digest != row[-1]:
+                return None
+            contents.append(content.hex())
+        return contents

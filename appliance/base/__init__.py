@@ -1,0 +1,1 @@
+"""Code that every package may use: files, clocks, input checks. It imports nothing of the appliance."""

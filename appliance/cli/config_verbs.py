@@ -1,0 +1,57 @@
+"""`rosrv config check|show`: what configuration is in force, and whether it is right."""
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import yaml
+
+from appliance.configuration.sources import ConfigError, json_schema, plain, resolve
+
+_CheckedFile = Annotated[Path | None, typer.Argument(metavar="[FILE]", help="The same as --config FILE")]
+_File = Annotated[
+    Path | None, typer.Option("--config", help="Configuration file (default: ./appliance.yaml)")
+]
+_Json = Annotated[bool, typer.Option("--json", help="Machine-readable output")]
+
+
+def check(file: _CheckedFile = None, config: _File = None, as_json: _Json = False) -> None:
+    """Report every mistake in the file and the environment; exit status 1 when there is one.
+
+    Example: rosrv config check appliance.yaml
+    """
+    try:
+        resolve(file or config, os.environ, {})
+    except ConfigError as error:
+        if not as_json:
+            raise
+        for mistake in error.mistakes:
+            _print(json.dumps({"place": mistake.place, "text": mistake.text}))
+        raise typer.Exit(1) from error
+    if not as_json:
+        _print("The configuration is right.")
+
+
+def show(
+    config: _File = None,
+    as_json: _Json = False,
+    schema: Annotated[
+        bool, typer.Option("--schema", help="Print the JSON schema of the file instead")
+    ] = False,
+) -> None:
+    """Print every key with the value that is in force, defaults included.
+
+    Example: rosrv config show --schema
+    """
+    if schema:
+        _print(json.dumps(json_schema(), indent=2))
+        return
+    settings = plain(resolve(config, os.environ, {}))
+    _print(json.dumps(settings) if as_json else yaml.safe_dump(settings, sort_keys=False).rstrip())
+
+
+def _print(text: str) -> None:
+    sys.stdout.write(text + "\n")

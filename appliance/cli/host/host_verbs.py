@@ -1,0 +1,217 @@
+"""`rosrv host add|list|kit|reload|revoke`: who may come through a tunnel."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from msgspec.structs import replace
+
+from appliance.api.kits import Wishes
+from appliance.base.validation_messages import meant
+from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
+from appliance.channel.answers.hosts import Host, PortsSeen
+from appliance.cli import completion
+from appliance.cli.durations import span_given
+from appliance.cli.host.kit_files import KitWriter, placed, wishes_of, write_script
+from appliance.cli.host.private_output import new_output, usage_error
+from appliance.cli.output import moment, printable, say, say_json
+from appliance.cli.target import Appliance, speaks
+
+_Name = Annotated[
+    str,
+    typer.Argument(
+        help="The host's name: `host:NAME` in the policy", show_default=False, autocompletion=completion.hosts
+    ),
+]
+_Endpoint = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Address or name at which the host reaches the appliance (UDP 500 and 4500; default: `ipsec.endpoint` of"
+        " the configuration, else the machine's address towards its default route)",
+    ),
+]
+_Csr = Annotated[
+    Path | None,
+    typer.Option(help="Signing request (PEM) of a key that the host made: the kit has no private key then"),
+]
+_Days = Annotated[float, typer.Option(help="Days until the certificate ends")]
+_Out = Annotated[
+    Path | None,
+    typer.Option(
+        help="File to write; must not exist (default: rosrv-NAME.tar.gz; with --token rosrv-NAME-join.sh); - for"
+        " standard output"
+    ),
+]
+_Open = Annotated[
+    list[str] | None, typer.Option("--open", help="Services of the host that stay open: tcp/22")
+]
+_Ports = Annotated[str, typer.Option(help="The host's local port range, where ROS nodes listen")]
+_Within = Annotated[str, typer.Option(help="With --token: how long it is good: 30m, 1h, 7d")]
+
+
+@speaks
+def add(  # noqa: PLR0917  typer gives every flag by its name
+    running: Appliance,
+    name: _Name,
+    appliance: _Endpoint = None,
+    address: Annotated[
+        str | None, typer.Option(help="Its virtual address (default: the next free one)")
+    ] = None,
+    token: Annotated[
+        bool,
+        typer.Option("--token", help="Print a one-time token and write a script; the host makes its own key"),
+    ] = False,
+    within: _Within = "1h",
+    csr: _Csr = None,
+    days: _Days = 90,
+    out: _Out = None,
+    opened: _Open = None,
+    ports: _Ports = "32768-60999",
+) -> None:
+    """Enrol a host: write its kit, one archive with all it needs; or with --token, let it enrol itself.
+
+    Example: rosrv host add ocu-1 --token
+    """
+    wishes = wishes_of(appliance, ports, opened)
+    if token:
+        if csr is not None:
+            raise usage_error(
+                "--csr and --token are two ways: with a token the host brings its request itself"
+            )
+        order = HostToken(name, token_seconds=_seconds(within), days=days, address=address, new=True)
+        _write_script(running, order, wishes, out)
+    else:
+        _write_kit(running, HostAdd(name, "", days, address), csr, wishes, out)
+
+
+@speaks
+def kit(  # noqa: PLR0917  as above
+    running: Appliance,
+    name: _Name,
+    appliance: _Endpoint = None,
+    token: Annotated[
+        bool, typer.Option("--token", help="A one-time token instead: the host comes with another key")
+    ] = False,
+    within: _Within = "1h",
+    csr: _Csr = None,
+    days: _Days = 90,
+    out: _Out = None,
+    opened: _Open = None,
+    ports: _Ports = "32768-60999",
+) -> None:
+    """Write a new kit for an enrolled host: a new certificate; the one before is revoked and its tunnel closed.
+
+    Example: rosrv host kit ocu-1
+    """
+    wishes = wishes_of(appliance, ports, opened)
+    if token:
+        order = HostToken(name, token_seconds=_seconds(within), days=days)
+        _write_script(running, order, wishes, out)
+    else:
+        _write_kit(running, HostRenew(name, "", days), csr, wishes, out)
+
+
+@speaks
+def list_hosts(
+    running: Appliance,
+    group: Annotated[str | None, typer.Option(help="Only hosts of this group of hosts.yaml")] = None,
+) -> None:
+    """List the hosts that are enrolled, awaited or declared, with their tunnels; and machines in clear text.
+
+    Example: rosrv host list
+    """
+    body = running.ask_or_exit(HostList())
+    groups = sorted({name for row in body.hosts for name in row.groups})
+    if group is not None and group not in groups:
+        known = meant(group, groups) or f": {', '.join(groups[:20]) or 'it has none'}"
+        typer.echo(printable(f"rosrv: hosts.yaml has no group {group!r}{known}"), err=True)
+    for row in body.hosts:
+        if group is not None and group not in row.groups:
+            continue
+        if running.as_json:
+            say_json(row)
+        else:
+            say("  ".join(_words(row)))
+    if running.as_json or group is not None:
+        return
+    if not body.hosts:
+        say("no host is enrolled, awaited or declared: rosrv host add NAME")
+    for machine in body.machines:
+        nodes = f"{machine.nodes} nodes in clear text"
+        say("  ".join([f"{machine.address:<37} {nodes:<13}", _ports_words(machine.ports)]))
+    for trouble in body.troubles:
+        say(f"! {trouble}")
+
+
+@speaks
+def reload(running: Appliance) -> None:
+    """Read hosts.yaml again. It opens and closes tunnels that it wants or does not want; it enrols and revokes nobody.
+
+    Example: rosrv host reload
+    """
+    body = running.answer_or_exit(HostsReload())
+    say(f"{len(body.declared)} hosts are declared")
+    for word, names in (("may come again", body.opened), ("tunnel closed", body.closed)):
+        if names:
+            say(f"{word}: {', '.join(names)}")
+    for difference in body.divergence:
+        say(f"! {difference}")
+
+
+@speaks
+def revoke(running: Appliance, name: _Name) -> None:
+    """Let a host in no more, close its tunnel and take back what it has, now; or await it no longer.
+
+    Example: rosrv host revoke ocu-1
+    """
+    body = running.answer_or_exit(HostRevoke(name))
+    if not body.serial:
+        say(f"{body.name} is awaited no longer: its one-time token opens nothing")
+    else:
+        say(f"{body.name} ({body.address}) is revoked; {body.taken_back} registrations and grants taken back")
+
+
+def _seconds(within: str) -> float:
+    return span_given("--within", within, "30m, 1h or 7d", "rosrv host")
+
+
+def _write_kit(
+    running: Appliance, order: HostAdd | HostRenew, csr: Path | None, wishes: Wishes, out: Path | None
+) -> None:
+    with new_output(out, f"rosrv-{order.name}.tar.gz", as_json=running.as_json) as output:
+        writer = KitWriter(output, csr=csr)
+        wishes, reason = placed(running, wishes)
+        body = running.ask_or_exit(replace(order, request=writer.request))
+        writer.write(body, wishes, reason, as_json=running.as_json)
+
+
+def _write_script(running: Appliance, order: HostToken, wishes: Wishes, out: Path | None) -> None:
+    asked = replace(order, endpoint=wishes.endpoint or None, ports=wishes.ports, open=[*wishes.opened])
+    with new_output(out, f"rosrv-{order.name}-join.sh", as_json=running.as_json) as output:
+        write_script(output, running.ask_or_exit(asked), as_json=running.as_json)
+
+
+def _words(row: Host) -> list[str]:
+    parts = [f"{row.name:<20} {row.address or '-':<16} {row.state:<13}"]
+    if row.state == "up":
+        parts.append(f"from {row.remote} for {row.seconds} s, {row.bytes_in} B in, {row.bytes_out} B out")
+    if row.last_seen is not None:
+        parts.append(f"last seen {moment(row.last_seen)}")
+    if row.expires is not None and row.state != "revoked":
+        parts.append(f"certificate until {moment(row.expires)}" + (" (soon!)" if row.expires_soon else ""))
+    if row.token_expires is not None:
+        parts.append(f"token until {moment(row.token_expires)}")
+    if row.state not in ("not enrolled", "revoked", "awaited"):
+        parts.append(_ports_words(row.ports))
+    if row.groups:
+        parts.append(f"in {', '.join(row.groups)}")
+    if row.divergence:
+        parts.append(f"({row.divergence})")
+    return parts
+
+
+def _ports_words(ports: PortsSeen) -> str:
+    if ports.checked is None:
+        return "ports never checked"
+    return f"ports {ports.state} ({moment(ports.checked)})"

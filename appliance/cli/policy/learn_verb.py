@@ -1,0 +1,95 @@
+"""`rosrv policy learn`: a least-privilege policy out of the audit log."""
+
+import os
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from appliance.audit.log_database import LogUnreadableError
+from appliance.audit.query import Filter, FilterError
+from appliance.audit.timestamps import MomentError, parse_moment
+from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.durations import Since
+from appliance.cli.output import counted, refused, say_json
+from appliance.cli.policy.policy_input import Robot, networks_of, request_of, usage_error
+from appliance.cli.target import Appliance, speaks
+from appliance.policy.learn import Learned, Observation, learn
+from appliance.policy.model import Category
+from appliance.policy.policy_compiler import compile_policy
+from appliance.policy.policy_findings import PolicyError
+
+_OWN_NODE = "the appliance's own node"
+
+
+@speaks
+def learn_policy(
+    appliance: Appliance,
+    *,
+    since: Since = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="File, must not exist")] = None,
+    robot: Robot = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON object: the text, and what it stands on")
+    ] = False,
+) -> None:
+    """Write the policy that grants what was done according to the audit log, and nothing else.
+
+    Run the robot with `audit-only = all` below [Options] first. Exit status 1 when nothing was found.
+
+    Example: rosrv policy learn --state /var/lib/rosrv --robot 192.168.1.10 --output learned.ini
+    """
+    learned = learn(_observations(appliance, since), networks_of(robot))
+    if not learned.requests:
+        begun = f" since {since}" if since is not None else ""
+        hint = "run the robot with `audit-only = all` below [Options] first"
+        raise refused([f"rosrv: no request that passed is in the audit log{begun}: {hint}"])
+    _check(learned, robot)
+    if output is not None:
+        _write(output, learned.text)
+    if as_json:
+        say_json({"requests": learned.requests, "left_out": learned.left_out, "text": learned.text})
+        return
+    if output is None:
+        sys.stdout.write(learned.text)
+    told = f"rosrv: learned from {counted(learned.requests, 'request')}"
+    if learned.left_out:
+        told += f"; {counted(learned.left_out, 'request')} left out that no rule can grant"
+    typer.echo(told, err=True)
+
+
+def _observations(appliance: Appliance, since: str | None) -> Iterator[Observation]:
+    try:
+        start = None if since is None else parse_moment(since, time.time_ns())
+        passed = Filter(decision=("allow", "would deny"), event="decision", since=start)
+        for entry in appliance.audit().export(passed):
+            record = entry.record
+            if record.reason == _OWN_NODE or record.host is None or record.category not in set(Category):
+                continue
+            request = request_of(
+                record.host, record.caller_id or "", str(record.category), record.resource or ""
+            )
+            detail = record.detail
+            yield Observation(request, str(detail.get("call", "")), str(detail.get("key", "")))
+    except (LogUnreadableError, NotRunningError, MomentError, FilterError) as error:
+        raise usage_error(str(error)) from error
+
+
+def _check(learned: Learned, robot: list[str] | None) -> None:
+    try:
+        compile_policy(learned.text, file="learned", robot=networks_of(robot))
+    except PolicyError as error:
+        what = "rosrv: what was learned is no policy (see above): these names need a rule by hand"
+        raise refused([*error.findings, what]) from error
+
+
+def _write(output: Path, text: str) -> None:
+    try:
+        descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+    except OSError as error:
+        raise usage_error(f"{output}: {error.strerror}") from error
+    with os.fdopen(descriptor, "w", encoding="ascii") as file:
+        file.write(text)

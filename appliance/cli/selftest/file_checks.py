@@ -1,0 +1,218 @@
+"""Is what an operator wrote right, and what the appliance keeps in order: configuration, policy, monitors, state."""
+
+import datetime
+import os
+import stat
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from cryptography import x509
+
+from appliance.audit.log_database import LogUnreadableError
+from appliance.audit.query import Filter
+from appliance.audit.search import search
+from appliance.base.input_files import read_given, read_given_text
+from appliance.base.shipped import SHIPPED, before_program
+from appliance.cli.selftest.selftest_findings import Found, fail, ok, skip, told, warn
+from appliance.configuration.settings import Settings
+from appliance.hosts.hosts_file import DeclaredHostsError, read_declared
+from appliance.policy.cases import run_cases
+from appliance.policy.judgement import Known, judge
+from appliance.policy.policy import Policy
+from appliance.policy.policy_findings import PolicyError
+from appliance.signing.site_keys import read_signature
+from appliance.specifications.specification_files import SpecificationsRefusedError, check, read_folder
+from appliance.supervisor.state_directory import foreign
+
+_LITTLE_SPACE, _NO_SPACE = 1 << 30, 50 << 20
+_SOON_DAYS = 30
+_AHEAD_SECONDS = 60.0
+
+
+def files(settings: Settings) -> Iterator[Found]:
+    """What the configuration names, and the state directory."""
+    yield from told("policy", lambda: _policy(settings.policy, settings.site_keys))
+    yield from told("monitors", lambda: _monitors(settings.monitors, settings.site_keys))
+    yield from told("hosts", lambda: _hosts(settings.hosts))
+    yield from told("state", lambda: _state(settings.state))
+
+
+def _policy(file: Path, site_keys: Sequence[str]) -> Iterator[Found]:
+    try:
+        text = read_given_text(file)
+        policy = judge(text, str(file), Known(site_keys=site_keys), read_signature(file)).policy
+    except OSError as error:
+        if isinstance(error, FileNotFoundError) and file == Settings().policy.absolute():
+            first = SHIPPED / "policies" / "default.ini"
+            yield warn("policy", f"{file}: nobody has written one yet", f"to begin with: --policy {first}")
+            return
+        yield fail(
+            "policy",
+            f"{file}: {error.strerror}",
+            "without a policy the appliance does not start: --policy FILE",
+        )
+        return
+    except UnicodeDecodeError:
+        yield fail("policy", f"{file}: is not UTF-8", "save the file as UTF-8")
+        return
+    except PolicyError as error:
+        yield fail("policy", str(error.findings[0]), f"rosrv policy check {file}")
+        return
+    if policy.warnings:
+        yield warn("policy", f"{file}: {len(policy.warnings)} warnings", f"rosrv policy check {file}")
+    else:
+        yield ok("policy", f"{file} is right")
+    yield from _cases(file, policy)
+
+
+def _cases(file: Path, policy: Policy) -> Iterator[Found]:
+    beside = file.with_name(file.name + ".tests.yaml")
+    try:
+        results = run_cases(policy, read_given_text(beside), str(beside))
+    except FileNotFoundError:
+        return
+    except (OSError, UnicodeDecodeError, PolicyError) as error:
+        yield fail("policy tests", str(error), "a policy whose tests cannot be read is not reloaded")
+        return
+    failed = [result for result in results if not result.passed]
+    if failed:
+        yield fail("policy tests", str(failed[0]), f"rosrv policy test {file}")
+    else:
+        yield ok("policy tests", f"{len(results)} passed")
+
+
+def _monitors(folder: Path | None, site_keys: Sequence[str]) -> Iterator[Found]:
+    if folder is None:
+        yield skip("monitors", "no folder of specifications is configured")
+        return
+    try:
+        checked = check(read_folder(folder), site_keys)
+    except SpecificationsRefusedError as error:
+        yield fail("monitors", error.findings[0], f"rosrv monitor check {folder}/*.rv")
+        return
+    text = f"{len(checked.monitors)} in {folder}"
+    if checked.warnings:
+        yield warn(
+            "monitors", f"{text}, {len(checked.warnings)} warnings", f"rosrv monitor check {folder}/*.rv"
+        )
+    else:
+        yield ok("monitors", text)
+
+
+def _hosts(file: Path) -> Iterator[Found]:
+    try:
+        declared = read_declared(file)
+    except DeclaredHostsError as error:
+        yield fail("hosts", str(error), "mend the file; nobody is enrolled by it meanwhile")
+        return
+    yield ok("hosts", f"{len(declared)} declared in {file}" if declared else "none is declared")
+
+
+def _state(state: Path) -> Iterator[Found]:
+    if not state.exists():
+        parent = next(folder for folder in state.absolute().parents if folder.exists())
+        if os.access(parent, os.W_OK):
+            yield ok("state", f"{state} will be made")
+        else:
+            yield fail(
+                "state", f"{state} cannot be made in {parent}", "run as root, or name another: --state DIR"
+            )
+        return
+    mode = state.stat().st_mode
+    if not stat.S_ISDIR(mode):
+        yield fail("state", f"{state} is no directory", "name another: --state DIR")
+        return
+    if os.access(state, os.R_OK) and (reason := foreign(state)) is not None:
+        yield fail("state", reason, "name another, empty or to be made: --state DIR")
+        return
+    if mode & 0o022:
+        yield fail("state", f"{state}: others may write (mode {mode & 0o777:o})", f"chmod 711 {state}")
+    elif not os.access(state, os.W_OK):
+        yield warn(
+            "state", f"{state}: may not be written by this user", "run as the appliance's owner, or root"
+        )
+    else:
+        yield ok("state", f"{state}, mode {mode & 0o777:o}")
+    yield from told("secrets", lambda: _secrets(state))
+    yield from told("space", lambda: _space(state))
+    yield from told("clock", lambda: _clock(state))
+    yield from told("certificates", lambda: _certificates(state))
+
+
+def _secrets(state: Path) -> Iterator[Found]:
+    """Keys and tokens that others could read."""
+    open_to_others = []
+    for path in (
+        *state.glob("signer/*.key"),
+        state / "api" / "key.pem",
+        state / "first-token",
+        *state.glob("control/*.db"),
+    ):
+        try:
+            mode = path.stat().st_mode
+        except OSError:
+            continue
+        if mode & 0o007:
+            open_to_others.append(f"{path} ({mode & 0o777:o})")
+    if open_to_others:
+        yield fail("secrets", f"others may read {', '.join(open_to_others)}", "chmod o= what is named")
+    if (state / "first-token").exists():
+        advice = f"keep it elsewhere, then: rm {state / 'first-token'}"
+        yield warn("first token", f"{state / 'first-token'} is still there", advice)
+
+
+def _space(state: Path) -> Iterator[Found]:
+    room = os.statvfs(state)
+    free = room.f_bavail * room.f_frsize
+    shown = f"{free / (1 << 30):.1f} GiB free"
+    if free < _NO_SPACE:
+        yield fail("space", shown, "make room: requests are denied when the audit log cannot be written")
+    elif free < _LITTLE_SPACE:
+        yield warn("space", shown, "make room, or bound the log: audit.retention_bytes in appliance.yaml")
+    else:
+        yield ok("space", shown)
+
+
+def _clock(state: Path) -> Iterator[Found]:
+    before = before_program()
+    if before:
+        yield fail(
+            "clock", f"it stands {before / 86_400:.0f} days before this program was made", "set the clock"
+        )
+        return
+    log = state / "control" / "audit.db"
+    if not os.access(log, os.R_OK):
+        return
+    try:
+        entries = search(log, Filter(), limit=1).entries
+    except LogUnreadableError as error:
+        yield fail("audit log", str(error), "rosrv audit verify")
+        return
+    ahead = entries[0].record.time / 1e9 - time.time() if entries else 0.0
+    if ahead > _AHEAD_SECONDS:
+        yield fail(
+            "clock", f"the last record of the audit log is {ahead:.0f} s in the future", "set the clock"
+        )
+    else:
+        yield ok("clock", datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%MZ"))
+
+
+def _certificates(state: Path) -> Iterator[Found]:
+    for path in (state / "api" / "certificate.pem", state / "signer" / "ca.pem"):
+        try:
+            certificate = x509.load_pem_x509_certificate(read_given(path))
+        except (FileNotFoundError, PermissionError):
+            continue
+        except ValueError:
+            yield fail(
+                "certificate", f"{path} is no certificate", "restore it, or remove it: a new one is made"
+            )
+            continue
+        left = certificate.not_valid_after_utc - datetime.datetime.now(datetime.UTC)
+        if left.days < 0:
+            yield fail("certificate", f"{path} has expired", "remove it, restart: a new one is made")
+        elif left.days < _SOON_DAYS:
+            yield warn("certificate", f"{path} ends in {left.days} days", "renew it before then")
+        else:
+            yield ok("certificate", f"{path.name} of {path.parent.name}: {left.days} days left")

@@ -1,0 +1,183 @@
+"""Does the running appliance do what it must: its own status, a call through RVMaster, a message through the relay."""
+
+import secrets
+import time
+from collections.abc import Iterator
+from urllib.parse import urlsplit, urlunsplit
+
+from appliance.audit.log_database import LogUnreadableError
+from appliance.audit.query import Filter, FilterError
+from appliance.channel.admin import StatusWanted
+from appliance.channel.answers.status import ProcessInfo, Status
+from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.selftest.probe_nodes import TOPIC, RefusedError, call, message_through_the_relay
+from appliance.cli.selftest.selftest_findings import Found, fail, ok, skip, told, warn
+from appliance.cli.status_verb import troubles_of
+from appliance.cli.target import Appliance
+
+_CALLER = "/rosrv_selftest"  # and a number of its own each time: what one caller reads again is counted only
+_MANY_RESTARTS = 3
+_MANY_RECORDS = 200_000
+_RECORD_SECONDS = 5.0
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.05, 1.0
+
+
+def running(appliance: Appliance) -> Iterator[Found]:
+    """Everything of the running appliance."""
+    try:
+        answer = appliance.ask(StatusWanted())
+    except NotRunningError as error:
+        yield fail(
+            "appliance",
+            str(error),
+            "start it (rosrv up), or leave --state and --api out to try the machine only",
+        )
+        return
+    if not answer.ok:
+        yield fail("appliance", answer.error, "the log of rosrv up says why")
+        return
+    status = answer.given()
+    yield ok(
+        "appliance", f"{status.version}, {len(status.processes)} processes, nodes find it at {status.master}"
+    )
+    yield from told("status", lambda: _status(status))
+    yield from told("processes", lambda: _processes(status.processes))
+    yield from told("audit log", lambda: _audit(appliance))
+    master = _reachable(appliance, status.master)
+    yield from told("RVMaster", lambda: check_call(appliance, master))
+    yield from told("relay", lambda: _message(master))
+
+
+def _status(status: Status) -> Iterator[Found]:
+    troubles = list(troubles_of(status))
+    for trouble in troubles:
+        yield fail("status", trouble, "rosrv status")
+    if not troubles:
+        probe = status.probe or "not run yet"
+        hidden = "no firewall" if status.isolation == "none" else f"probe of the ROS Master {probe}"
+        yield ok("status", f"isolation {status.isolation}, {hidden}")
+
+
+def _processes(rows: list[ProcessInfo]) -> Iterator[Found]:
+    restarted = [f"{row.role} {row.restarts} times" for row in rows if row.restarts >= _MANY_RESTARTS]
+    if restarted:
+        yield warn("processes", f"started again: {', '.join(restarted)}", "the log of rosrv up says why")
+    else:
+        yield ok("processes", f"{len(rows)} run")
+
+
+def _audit(appliance: Appliance) -> Iterator[Found]:
+    source = appliance.audit()
+    try:
+        last = source.last()
+        if last > _MANY_RECORDS:
+            yield skip("audit log", f"{last} records are not proven here", "rosrv audit verify")
+            return
+        result = source.verify(None, None, lambda _sequence: None)
+    except (LogUnreadableError, NotRunningError, FilterError) as error:
+        yield skip("audit log", str(error))
+        return
+    if result.ok:
+        yield ok("audit log", f"{result.records} records are complete and unchanged")
+    else:
+        yield fail("audit log", result.findings[0].message, "rosrv audit verify")
+
+
+def _reachable(appliance: Appliance, master: str) -> str:
+    """Where RVMaster is for this machine: over REST the appliance is where REST is, if it names only itself."""
+    place = appliance.place
+    parts = urlsplit(master)
+    if place is None or parts.hostname not in ("127.0.0.1", "::1", "localhost"):
+        return master
+    host = str(urlsplit(place).hostname)
+    shown = f"[{host}]" if ":" in host else host
+    return urlunsplit((parts.scheme, f"{shown}:{parts.port}", "", "", ""))
+
+
+def check_call(appliance: Appliance, master: str) -> Iterator[Found]:
+    """A call as any tool makes it: it must be answered, and be in the audit log."""
+    before = _last(appliance)
+    caller = f"{_CALLER}_{secrets.token_hex(4)}"
+    began, refusal = time.monotonic(), ""
+    try:
+        call(master, "getPid", caller)
+        text = "a call was allowed"
+    except RefusedError as error:
+        refusal = str(error)
+        text = f"a call was refused by the policy ({refusal[:120]})"
+    except OSError as error:
+        yield fail(
+            "RVMaster", f"{master} does not answer: {error}", "is this machine let in (network, firewall)?"
+        )
+        return
+    text += f" in {(time.monotonic() - began) * 1000:.1f} ms"
+    if before is None:
+        yield skip("RVMaster", f"{text}; this user may not read the audit log")
+        return
+    try:
+        recorded = _recorded(appliance, before, caller, refusal)
+    except (LogUnreadableError, NotRunningError) as error:
+        yield skip("RVMaster", f"{text}; whether it was recorded cannot be seen: {error}")
+        return
+    if recorded:
+        yield ok("RVMaster", f"{text}, and recorded")
+    else:
+        yield fail("RVMaster", f"{text}, but is not in the audit log", "rosrv status; rosrv audit verify")
+
+
+def _last(appliance: Appliance) -> int | None:
+    try:
+        return appliance.audit().last()
+    except (LogUnreadableError, NotRunningError):
+        return None
+
+
+def _recorded(appliance: Appliance, before: int, caller: str, refusal: str) -> bool:
+    """Whether a record after the sequence `before` is of our call; a refusal names its record.
+
+    Looked for again and again, for over REST each look is a request: the pauses grow. Raises `LogUnreadableError` or
+    `NotRunningError` where the last look failed.
+    """
+    source, deadline, pause = appliance.audit(), time.monotonic() + _RECORD_SECONDS, _FIRST_PAUSE
+    while True:
+        is_last = time.monotonic() > deadline
+        try:
+            page = source.search(Filter(), None, 1000, newest_first=True)
+        except (LogUnreadableError, NotRunningError):
+            if is_last:
+                raise
+        else:
+            new = [entry.record for entry in page.entries if entry.sequence > before]
+            if any(record.caller_id == caller or (refusal and record.id in refusal) for record in new):
+                return True
+            if is_last:
+                return False
+        time.sleep(pause)  # noqa: TID251  nothing on the other side tells who only asks
+        pause = min(2 * pause, _LONGEST_PAUSE)
+
+
+def _message(master: str) -> Iterator[Found]:
+    """A message from a publisher to a subscriber here, through the relay."""
+    began = time.monotonic()
+    try:
+        message = message_through_the_relay(master)
+    except RefusedError as error:
+        yield skip(
+            "relay",
+            f"not tried, the policy does not let this machine: {str(error)[:120]}",
+            f"grant {TOPIC} and /rosrv_selftest_* to this machine to try it",
+        )
+    except OSError as error:
+        yield fail(
+            "relay", f"no message came through: {error}", "can the appliance reach this machine? rosrv status"
+        )
+    else:
+        if message.endswith(b"selftest"):
+            yield ok(
+                "relay",
+                f"a message came through in {(time.monotonic() - began) * 1000:.0f} ms, registration included",
+            )
+        else:
+            yield fail(
+                "relay", "a message came through changed", "a monitor on its topic? rosrv monitor list"
+            )

@@ -1,0 +1,189 @@
+"""Can this machine run the appliance: programs, users, namespaces, firewall, tunnels, ports.
+
+What the kernel says it can do is not believed: a namespace is made, rules are put into it and tried, and it is taken
+away again. Nothing outside of it is touched.
+"""
+
+import os
+import pwd
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from appliance.cli.selftest.selftest_findings import Found, fail, ok, skip, told, warn
+from appliance.configuration.settings import Settings
+from appliance.network import interfaces
+from appliance.network.esp import TUN, choose_esp
+from appliance.network.firewall.backend import FirewallError
+from appliance.network.firewall.backend_check import prove
+from appliance.network.firewall.iptables import IptablesBackend
+from appliance.network.firewall.nft import NftBackend
+from appliance.network.namespaces import Namespace, NetworkError
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.port_check import require_free
+from appliance.supervisor.roles import ROSMASTER, ROSOUT
+from appliance.supervisor.users import NUMERIC_IDS
+
+_SECONDS = 10.0
+_CHARON = Path("/usr/sbin/charon-systemd")
+
+
+def machine(settings: Settings, *, running: bool) -> Iterator[Found]:
+    """Everything of this machine. `running`: an appliance with these settings holds its ports."""
+    yield from told("python", _python)
+    yield from told("programs", _programs)
+    yield from told("users", _users)
+    yield from told("kernel", lambda: _kernel(settings))
+    if running:
+        yield ok("ports", "held by the running appliance")
+    else:
+        yield from told("ports", lambda: _ports(settings))
+
+
+def _python() -> Iterator[Found]:
+    version = ".".join(map(str, sys.version_info[:3]))
+    yield ok("python", f"{version}, {sys.executable}")
+
+
+def _programs() -> Iterator[Found]:
+    for name, path, package, missing in (
+        ("rosmaster", ROSMASTER, "python3-rosmaster", fail),
+        ("rosout", ROSOUT, "rosout", warn),
+        ("charon", _CHARON, "charon-systemd", warn),
+        ("nft", None, "nftables", warn),
+        ("ip", None, "iproute2", warn),
+    ):
+        found = path if path is not None and path.exists() else shutil.which(name)
+        if not found:
+            yield missing(name, "is not installed", f"apt install {package}")
+        else:
+            yield ok(name, f"{found}{_version(package)}")
+
+
+def _version(package: str) -> str:
+    query = ["dpkg-query", "-W", "-f=${Version}", package]
+    try:
+        done = subprocess.run(query, capture_output=True, text=True, timeout=_SECONDS, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return f" ({package} {done.stdout})" if done.returncode == 0 and done.stdout else ""
+
+
+def _users() -> Iterator[Found]:
+    named, numbered = [], []
+    for user, number in NUMERIC_IDS.items():
+        if _name_of_user(user) is not None:
+            named.append(user)
+        elif (owner := _name_of_number(number)) is not None:
+            yield fail(
+                "users",
+                f"the number {number}, which {user} would have, is the user {owner}",
+                f"make the user: useradd --system {user}",
+            )
+        else:
+            numbered.append(str(number))
+    there = f"{len(named)} by name" if named else ""
+    rest = f"{len(numbered)} by number ({numbered[0]} to {numbered[-1]})" if numbered else ""
+    yield ok("users", ", ".join(filter(None, (there, rest))) or "none is missing")
+
+
+def _name_of_user(user: str) -> str | None:
+    try:
+        return pwd.getpwnam(user).pw_name
+    except KeyError:
+        return None
+
+
+def _name_of_number(number: int) -> str | None:
+    try:
+        return pwd.getpwuid(number).pw_name
+    except KeyError:
+        return None
+
+
+def _kernel(settings: Settings) -> Iterator[Found]:
+    if settings.isolation == "none":
+        yield warn(
+            "isolation",
+            "isolation none: no firewall hides the ROS Master",
+            "for a robot use netns or container",
+        )
+    if os.geteuid() != 0:
+        yield skip("kernel", "namespaces and the firewall can be tried as root only", "sudo rosrv selftest")
+        return
+    namespace = Namespace(f"rosrv-selftest-{os.getpid()}")
+    try:
+        namespace.create()
+    except NetworkError as error:
+        outcome = fail if settings.isolation == "netns" else skip
+        yield outcome(
+            "namespaces", str(error), "give the machine or container CAP_SYS_ADMIN, or use container"
+        )
+        return
+    try:
+        yield ok("namespaces", "a network namespace can be made")
+        yield from told("veth", lambda: _veth(namespace))
+        interfaces.set_link(namespace, "lo", up=True)
+        yield from told("firewall", lambda: _firewall(settings, namespace))
+        yield from told("esp", lambda: _esp(namespace))
+    finally:
+        namespace.delete()
+
+
+def _veth(namespace: Namespace) -> Iterator[Found]:
+    try:
+        interfaces.create_veth(namespace, "try0", namespace, "try1")
+    except NetworkError as error:
+        yield fail("veth", str(error), "load the kernel module: modprobe veth")
+    else:
+        yield ok("veth", "a cable between namespaces can be made")
+
+
+def _firewall(settings: Settings, namespace: Namespace) -> Iterator[Found]:
+    refused = []
+    for backend in (NftBackend(namespace), IptablesBackend(namespace)):
+        if settings.firewall.backend not in ("auto", backend.name):
+            continue
+        try:
+            prove(backend, namespace)
+        except FirewallError as error:
+            refused.append(f"{backend.name}: {error}")
+        else:
+            yield ok(
+                "firewall", f"{backend.name}: a rule was put in force, refused another user, and let us pass"
+            )
+            return
+    advice = "load nf_tables, or ip_tables with xt_owner; `isolation: none` goes without a firewall"
+    yield fail("firewall", "; ".join(refused), advice)
+
+
+def _esp(namespace: Namespace) -> Iterator[Found]:
+    try:
+        where = choose_esp(namespace)
+    except NetworkError as error:
+        yield warn("esp", str(error), "only tunnels of trusted hosts need it")
+    else:
+        tun = "" if TUN.exists() else f", {TUN} is not there"
+        if where == "kernel":
+            yield ok("esp", f"in the {where}{tun}")
+        elif os.access(TUN, os.R_OK | os.W_OK):
+            yield ok("esp", f"in {where}, over {TUN}, which its user is given")
+        else:
+            yield warn("esp", f"in {where}, and {TUN} cannot be opened", "load the kernel module `tun`")
+
+
+def _ports(settings: Settings) -> Iterator[Found]:
+    places = {"RVMaster": settings.listen_address, "ROSMaster": ("127.0.0.1", settings.rosmaster_port)}
+    if settings.api_address is not None:
+        places["REST"] = settings.api_address
+    for name, (host, port) in places.items():
+        try:
+            require_free(host, port)
+        except StartError as error:
+            what = re.sub(r": stop that.*", "", str(error))
+            yield fail(f"port of {name}", what, "stop that, or choose another port in appliance.yaml")
+        else:
+            yield ok(f"port of {name}", f"{host}:{port} is free" if port else "any")

@@ -1,0 +1,579 @@
+"""The configuration of the appliance: every key with its default, as `appliance.yaml` spells it.
+
+`appliance.configuration.sources` reads the file, the environment and the flags into it; the supervisor writes
+the result to `run/config.json` in the state directory, from where the other processes load it: what was
+checked once they have without pydantic, which takes each of them a tenth of a second. A key is here because
+something reads it. One file, for it is what an operator can say.
+"""
+
+import dataclasses
+import ipaddress
+import os
+import re
+from collections.abc import Callable
+from ipaddress import IPv4Network
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, dataclass_transform
+
+import msgspec
+
+from appliance.signing.site_keys import checked_key
+
+_NODE_NAME = re.compile(r"(/[A-Za-z][A-Za-z0-9_]{0,99}){1,5}")
+_HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?")
+
+T = TypeVar("T")
+
+
+class Read:
+    """How pydantic reads a value that is annotated with this: what `how` of pydantic makes, said when it reads."""
+
+    def __init__(self, how: Callable[[Any], Any], named: str = "") -> None:
+        """`how(pydantic)` is an annotation, or several; `named` a type of pydantic's that reads it."""
+        self._how = how
+        self._named = named
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """What pydantic asks of an annotation."""
+        import pydantic  # noqa: PLC0415  see the head
+
+        how = self._how(pydantic)
+        return handler.generate_schema(
+            Annotated[
+                getattr(pydantic, self._named) if self._named else source,
+                *(how if isinstance(how, tuple) else (how,)),
+            ]
+        )
+
+
+def key(*, description: str = "", default: Any = dataclasses.MISSING, **rules: Any) -> Any:
+    """A key with its default (or `default_factory`), what it is, and the rules of pydantic's `Field` for it."""
+    metadata = {"description": description or None, **rules}
+    if isinstance(default, list):
+        metadata["json_schema_extra"] = {"default": default}
+        return dataclasses.field(default_factory=lambda: list(default), metadata=metadata)
+    if "default_factory" in metadata:
+        return dataclasses.field(default_factory=metadata.pop("default_factory"), metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(key,))
+def _section(cls: type[T]) -> type[T]:
+    """A table of keys; what it does not know is refused."""
+    cls.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]  # where pydantic looks for it
+    return dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+
+
+Seconds = Annotated[float, Read(lambda its: its.Field(gt=0, le=86_400 * 365, allow_inf_nan=False))]
+Milliseconds = Annotated[float, Read(lambda its: its.Field(ge=1.0, le=1000.0, allow_inf_nan=False))]
+Count = Annotated[int, Read(lambda its: its.Field(gt=0))]
+Size = Annotated[int, Read(lambda its: its.Field(gt=0), "ByteSize")]
+SizeOfMebibytes = Annotated[int, Read(lambda its: its.Field(ge=1 << 20), "ByteSize")]  # one at least
+WithinAnHour = Annotated[float, Read(lambda its: its.Field(gt=0, le=3600, allow_inf_nan=False))]
+
+
+class Unasked(str):
+    """A default for which nobody asked."""
+
+    __slots__ = ()
+
+
+def split_address(text: str) -> tuple[str, int]:
+    """`HOST:PORT` or `[IPv6]:PORT` as host and port. Raises `ValueError`, which says what is wrong."""
+    host, colon, port = text.rpartition(":")
+    if not colon or not port.isascii() or not port.isdigit() or int(port) > 65_535:
+        raise ValueError(
+            f"{text!r} is not HOST:PORT, for example 0.0.0.0:11311 or [::]:11311 (port 0: any free one)"
+        )
+    if host.startswith("[") and host.endswith("]"):
+        return str(ipaddress.IPv6Address(host[1:-1])), int(port)
+    if ":" in host:
+        raise ValueError(f"{text!r}: an IPv6 address is written in brackets, for example [::1]:11311")
+    if not _HOST_NAME.fullmatch(host):
+        raise ValueError(f"{host!r} is not an address of this machine")
+    return host, int(port)
+
+
+def split_receiver(text: str) -> tuple[str, str, int]:
+    """`udp|tcp|tls://ADDRESS:PORT` as protocol, address and port. Raises `ValueError`."""
+    protocol, slashes, place = text.partition("://")
+    example = "for example tls://10.0.0.9:6514 or udp://[fd00::9]:514"
+    if not slashes or protocol not in ("udp", "tcp", "tls"):
+        raise ValueError(f"{text!r} is not udp://, tcp:// or tls:// with ADDRESS:PORT, {example}")
+    host, port = split_address(place)
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        raise ValueError(f"{host!r} is no address; names are not looked up, {example}") from None
+    if not port:
+        raise ValueError(f"{text!r}: port 0 is no receiver's, {example}")
+    return protocol, host, port
+
+
+def _checked_receiver(text: str) -> str:
+    split_receiver(text)
+    return text
+
+
+def _checked_address(text: str) -> str:
+    split_address(text)
+    return text
+
+
+def _checked_endpoint(text: str | None) -> str | None:
+    if text is None:
+        return None
+    example = "for example 192.168.1.20 or robot.example.org"
+    try:
+        address = ipaddress.ip_address(text)
+    except ValueError:
+        if _HOST_NAME.fullmatch(text) is None or text.replace(".", "").isdecimal():
+            raise ValueError(
+                f"{text!r} is neither an address nor a name (no port, no brackets), {example}"
+            ) from None
+        if is_loopback(text):
+            raise ValueError(
+                f"{text} is this machine only, where no other host reaches it, {example}"
+            ) from None
+        return text
+    if address.is_loopback or address.is_unspecified or address.is_multicast or address.is_link_local:
+        raise ValueError(f"{text} is no address at which other hosts reach the appliance, {example}")
+    return str(address)
+
+
+def _none_if_empty(value: object) -> object:
+    return None if value == "" else value  # what compose hands on of a variable that is not set
+
+
+def _checked_name(text: str) -> str:
+    if _NODE_NAME.fullmatch(text) is None:
+        raise ValueError(f"{text!r} is not a global node name, for example /rosrv")
+    return text
+
+
+def _off_as_text(value: object) -> object:
+    return "off" if value is False else value  # YAML reads a bare `off` as false
+
+
+def _checked_api(text: str) -> str:
+    return text if text == "off" else _checked_address(text)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host, as configured, is this machine only."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _as_text(its: Any) -> Any:
+    return its.AfterValidator(str)
+
+
+@_section
+class Advertisement:
+    """The address that nodes of one network are told the appliance has."""
+
+    network: Annotated[str, Read(_as_text, "IPvAnyNetwork")]
+    address: Annotated[str, Read(_as_text, "IPvAnyAddress")]
+
+
+@_section
+class Limits:
+    """What RVMaster and the node faces accept; the defaults are beyond a large robot."""
+
+    body_bytes: Size = key(default=16 << 20, description="body of a request")
+    elements: Count = key(default=1_000_000, description="values in one request")
+    nesting: Count = key(default=100, description="arrays and structs inside each other")
+    string_bytes: Size = key(default=8 << 20, description="one string")
+    multicall_parts: Count = key(default=100_000, description="calls in one system.multicall")
+    parameter_bytes: Size = key(
+        default=64 << 20,
+        description="all parameters together, as they are sent; one host may set half of them",
+    )
+    header_bytes: Size = key(default=64 << 10, description="request line and headers")
+    header_seconds: Seconds = key(default=10.0, description="until request line and headers must be there")
+    idle_seconds: Seconds = key(default=300.0, description="a kept-alive connection without a request")
+    connections_per_host: Count = 512
+    connections: Count = key(default=4096, description="of all hosts")
+    nodes_per_host: Count = 500
+    topics_per_host: Count = 5000
+    node_call_seconds: Seconds = key(default=3.0, description="a call that the appliance makes to a node")
+    offload_bytes: Size = key(
+        default=256 << 10, description="larger bodies are parsed outside the event loop"
+    )
+
+
+@_section
+class Syslog:
+    """Where the audit log is forwarded to (RFC 5424), in a process of its own; off unless `to` is given."""
+
+    to: Annotated[str, Read(lambda its: its.AfterValidator(_checked_receiver))] | None = key(
+        default=None,
+        description="udp://ADDRESS:PORT, tcp://… or tls://…: an address, so that nothing is asked of a name server",
+    )
+    send: Literal["all", "denials"] = key(
+        default="all", description="denials: those, warnings and alarms; signed checkpoints are always sent"
+    )
+    facility: int = key(default=13, ge=0, le=23, description="13 is `log audit`, 10 `authpriv`, 16 `local0`")
+    host_name: str | None = key(
+        default=None, description="the name messages come from; the machine's unless it is given"
+    )
+    ca: Path | None = key(
+        default=None,
+        description="authority of the receiver's certificate (PEM); those the system trusts if not given",
+    )
+    name: str | None = key(
+        default=None, description="name in the receiver's certificate; its address unless it is given"
+    )
+    certificate: Path | None = key(
+        default=None, description="for a receiver that wants to know who sends (PEM)"
+    )
+    key: Path | None = key(default=None, description="of `certificate`; readable by user rosrv-syslog")
+
+    def __post_init__(self) -> None:
+        given = [name for name in ("ca", "name", "certificate", "key") if getattr(self, name) is not None]
+        if given and (self.to is None or not self.to.startswith("tls://")):
+            raise ValueError(f"{', '.join(given)} would do nothing: only tls:// has certificates")
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key go together")
+
+    @property
+    def destination(self) -> tuple[str, str, int]:
+        """`to` as protocol, address and port; only where it is given."""
+        return split_receiver(self.to or "")
+
+
+@_section
+class Audit:
+    """The audit log."""
+
+    durability: Literal["strict", "batched"] = key(
+        default="batched", description="strict: on disk before the answer; batched: within 50 ms"
+    )
+    on_audit_failure: Literal["deny", "allow"] = key(
+        default="deny", description="what is answered while the log cannot be written"
+    )
+    checkpoint_records: Count = key(default=1000, description="records after which a checkpoint is signed")
+    checkpoint_seconds: Seconds = key(default=60.0, description="seconds after which a checkpoint is signed")
+    retention_days: Seconds | None = key(
+        default=None, description="older records are removed, and that is recorded"
+    )
+    retention_bytes: SizeOfMebibytes | None = key(
+        default=None, description="beyond this size the oldest records are removed"
+    )
+    reserve_bytes: SizeOfMebibytes = key(
+        default=64 << 20,
+        description="of the disk: below it who causes many records is slowed more, so that the others are recorded",
+    )
+    syslog: Syslog = Syslog()
+
+
+@_section
+class Liveness:
+    """When a node counts as gone; all in seconds."""
+
+    interval: Seconds = key(default=5.0, description="between two looks at a node")
+    silent: Seconds = key(default=20.0, description="without an answer until the node is unregistered")
+    shadow: Seconds = key(default=600.0, description="for which a gone node's registration can come back")
+
+
+@_section
+class Relay:
+    """What the relay accepts and holds; each key is a field of `appliance.relay.bounds.Limits`."""
+
+    connections: Count = key(default=16_384, description="of all hosts")
+    connections_per_host: Count = 8_192
+    header_bytes: Size = key(default=64 << 10, description="TCPROS connection header")
+    header_seconds: Seconds = key(default=10.0, description="until the connection header must be there")
+    message_bytes: SizeOfMebibytes = key(default=256 << 20, description="one message")
+    queue_messages: Count = key(default=1000, description="messages waiting for one subscriber")
+    queue_bytes: Size = key(default=64 << 20, description="bytes waiting for one subscriber")
+    memory_bytes: Size = key(
+        default=1 << 30,
+        description="of one relay: half for unfinished messages, a quarter each for queues and latched ones",
+    )
+    budget: Milliseconds = key(
+        default=10.0,
+        description="processor time that monitors may take for one message; one that takes longer is a fault",
+    )
+
+
+@_section
+class RecorderRules:
+    """The flight recorder: what was said before and after something happened. Off, for it keeps what a robot says."""
+
+    enabled: bool = key(default=False, description="whether anything is recorded")
+    memory: Annotated[int, Read(lambda its: its.Field(ge=16 << 20), "ByteSize")] = key(
+        default=64 << 20, description="of all relays together, for what they received last; it survives them"
+    )
+    before: WithinAnHour = key(default=60.0, description="seconds before what happened")
+    after: WithinAnHour = key(default=10.0, description="seconds after it")
+    longest: WithinAnHour = key(
+        default=600.0, description="seconds of one recording, however much happens in it"
+    )
+    topics: list[str] = key(default=["/*"], description="what is recorded: names, `*` is anything")
+    never: list[str] = key(
+        default=[
+            "sensor_msgs/Image",
+            "sensor_msgs/CompressedImage",
+            "theora_image_transport/Packet",
+            "audio_common_msgs/AudioData",
+            "audio_common_msgs/AudioDataStamped",
+        ],
+        description="names or types that are never recorded; unless it is given: cameras and microphones",
+    )
+    triggers: list[Literal["drop", "change", "verdict", "fault", "denial", "alarm", "service"]] = key(
+        default=["drop", "verdict", "fault", "alarm", "service"],
+        description="what begins a recording, besides an operator; service: a node's call, if the policy lets it",
+    )
+    per_hour: Count = key(default=6, description="recordings that one host may begin by one kind of trigger")
+    disk: Annotated[int, Read(lambda its: its.Field(ge=64 << 20), "ByteSize")] = key(
+        default=2 << 30, description="of all recordings; one has an eighth of it at most"
+    )
+    days: Seconds | None = key(default=30.0, description="after which a recording is removed; null: never")
+
+    def __post_init__(self) -> None:
+        if self.longest < self.before + self.after:
+            raise ValueError(f"longest is {self.longest:g}, and before and after are more together")
+
+
+@_section
+class Firewall:
+    """The firewall around the ROSMaster (isolation netns and container)."""
+
+    backend: Literal["auto", "iptables", "nft"] = key(
+        default="auto", description="auto: what the kernel really enforces"
+    )
+
+
+def _is_ipv4(pool: object) -> object:
+    if isinstance(pool, str) and ":" in pool:
+        raise ValueError(
+            f"{pool}: virtual addresses are IPv4, which every ROS 1 node speaks; take a private /24"
+        )
+    return pool
+
+
+def _has_room_for_hosts(pool: IPv4Network) -> IPv4Network:
+    if not 16 <= pool.prefixlen <= 29:
+        raise ValueError(f"{pool} must have a prefix length from 16 to 29")
+    return pool
+
+
+@_section
+class Ipsec:
+    """The tunnels of trusted hosts; they are opened when the first host is enrolled."""
+
+    pool: Annotated[
+        IPv4Network,
+        Read(lambda its: (its.BeforeValidator(_is_ipv4), its.AfterValidator(_has_room_for_hosts))),
+    ] = key(
+        default=IPv4Network("10.113.11.0/24"),
+        description="virtual addresses of the hosts in tunnels; the first one is the appliance's",
+    )
+
+    endpoint: Annotated[
+        str | None,
+        Read(lambda its: (its.BeforeValidator(_none_if_empty), its.AfterValidator(_checked_endpoint))),
+    ] = key(
+        default=None,
+        description="address or name at which hosts reach the appliance from outside, for their kits;"
+        " found out unless it is given here or with --appliance",
+    )
+
+    ca: Literal["ecdsa", "ed25519"] = key(
+        default="ecdsa",
+        description="kind of the authority's key, which is made at the first start: P-384, or Ed25519",
+    )
+    ca_passphrase_file: Path | None = key(
+        default=None,
+        description="file, readable by root only, whose first line encrypts the authority's key;"
+        " also ROSRV_CA_PASSPHRASE_FILE",
+    )
+
+
+@_section
+class ApiLimits:
+    """What the REST interface accepts; beyond it a client is told to come back later."""
+
+    body_bytes: Size = key(default=1 << 20, description="body of a request")
+    requests_per_second: Seconds = key(default=50.0, description="of one host, on average")
+    burst: Count = key(default=200, description="requests of one host at once")
+    failures_per_minute: Count = key(default=20, description="requests of one host without a good token")
+    connections: Count = key(default=512, description="of all hosts")
+    connections_per_host: Count = 64
+    header_seconds: Seconds = key(default=10.0, description="until the request's headers must be there")
+    streams: Count = key(default=16, description="clients that follow the audit log, at once")
+
+
+def relays_for_this_machine() -> int:
+    """How many relay processes there are unless it is configured: half of the cores, 1 to 4."""
+    return max(1, min(4, (os.cpu_count() or 1) // 2))
+
+
+def _clear_text_stays_here(tls: bool, info: Any) -> bool:
+    api = info.data.get("api", "off")
+    if not tls and api != "off" and not is_loopback(split_address(api)[0]):
+        raise ValueError(
+            f"tokens would cross the network in clear text: off is for a loopback address, and api is {api}"
+        )
+    return tls
+
+
+def _mediation_fits(mediation: str, info: Any) -> str:
+    if mediation == "monitored" and info.data.get("relaying") == "all":
+        raise ValueError("monitored needs relaying: monitored (--relay monitored)")
+    return mediation
+
+
+@_section
+class Settings:
+    """All of it."""
+
+    policy: Path = key(
+        default=Path("policies/default.ini"), description="the access policy; read again on reload"
+    )
+    monitors: Path | None = key(
+        default=None, description="folder of specifications (.rv) of monitors; read again on reload"
+    )
+    enable: str = key(
+        default="all",
+        description="monitors that no operator has switched, new ones among them: all are enabled, none, NAME,…, or all"
+        " are in shadow mode (shadow)",
+    )
+    forgotten_after: Seconds | None = key(
+        default=86_400.0,
+        description="seconds for which a monitor may be disabled or in shadow mode, or a section of the policy"
+        " audit-only, before that is an alarm; null: never",
+    )
+    on_fault: Literal["drop", "pass"] = key(
+        default="drop", description="what becomes of a message at which an action of a monitor faults"
+    )
+    slices: int = key(
+        default=100_000,
+        ge=1,
+        le=1_000_000,
+        description="slices of a parametric specification: bindings that are monitored at a time, about 700 bytes each",
+    )
+    publish_as: Annotated[str, Read(lambda its: its.AfterValidator(_checked_name))] = key(
+        default="/rosrv", description="the node name under which monitors publish"
+    )
+    monitors_on_rosout: bool = key(
+        default=False,
+        description="put output, verdicts and faults of monitors on /rosout, too (the audit log always has them)",
+    )
+    hide_publisher: bool = key(default=False, description="leave out what monitors publish in getSystemState")
+    site_keys: list[Annotated[str, Read(lambda its: its.AfterValidator(checked_key))]] = key(
+        default=[],
+        description="public keys (`ssh-ed25519 BASE64 COMMENT`); with any, a policy or specification that none of them"
+        " signed is refused",
+    )
+    state: Path = key(
+        default=Path("/var/lib/rosrv"), description="directory of everything that must survive a restart"
+    )
+    listen: Annotated[str, Read(lambda its: its.AfterValidator(_checked_address))] = key(
+        default="0.0.0.0:11311", description="where nodes find their master"
+    )
+    rosmaster_port: int = key(
+        # Not 11411, where rosserial's TCP server listens, and below the ports the kernel gives to clients.
+        default=12311,
+        ge=0,
+        le=65_535,
+        description="loopback port of the hidden ROSMaster; 0: any free one",
+    )
+    isolation: Literal["container", "netns", "none"] = key(
+        default="netns", description="where the appliance lives; none: no firewall, for development only"
+    )
+    relaying: Literal["all", "monitored"] = key(
+        default="all",
+        description="topics and services that go through the relay; `monitored` (those in [Monitor]) is no boundary",
+    )
+    mediation: Annotated[
+        Literal["full", "monitored"], Read(lambda its: its.AfterValidator(_mediation_fits))
+    ] = key(
+        default="full",
+        description="`monitored` tells nodes each other's real URIs; needs relaying: monitored",
+    )
+    api: Annotated[
+        str, Read(lambda its: (its.BeforeValidator(_off_as_text), its.AfterValidator(_checked_api)))
+    ] = key(
+        default_factory=lambda: Unasked("127.0.0.1:8443"),
+        json_schema_extra={"default": "127.0.0.1:8443"},
+        description="HOST:PORT of REST, or off; unless it is given here, another free port when this one is taken",
+    )
+    api_tls: Annotated[bool, Read(lambda its: its.AfterValidator(_clear_text_stays_here))] = key(
+        default=True, description="off: clear text, on a loopback address only"
+    )
+    api_require_proof: bool = key(
+        default=False,
+        description="on: changes over REST are made for signed requests only (docs/rest.md), never for a bare token",
+    )
+    api_networks: list[Annotated[str, Read(_as_text, "IPvAnyNetwork")]] = key(
+        default=[], description="who may connect to REST besides this machine (the firewall's rule)"
+    )
+    api_published: bool = key(
+        default=True,
+        description="off: other machines cannot reach the port although it listens (a container that publishes it on"
+        " loopback), so that hosts cannot enrol themselves",
+    )
+    api_names: list[str] = key(
+        default=[],
+        description="names and addresses for the certificate; other names are refused, addresses are not",
+    )
+    api_notice: str = key(
+        default="", max_length=4000, description="what the console shows before it asks for a token"
+    )
+    api_lock_seconds: Seconds = key(
+        default=900.0,
+        description="without use, after which the console forgets the token and asks for it again",
+    )
+    hosts: Path = key(
+        default=Path("ipsec/hosts.yaml"),
+        description="the hosts that are meant to be enrolled; may be missing",
+    )
+    relays: Annotated[int, Read(lambda its: its.Field(gt=0, le=16))] = key(
+        default_factory=relays_for_this_machine,
+        description="relay processes that share topics and monitors; by default one for every two cores, at most 4",
+    )
+    advertise: list[Advertisement] = key(default=[])
+    limits: Limits = Limits()
+    audit: Audit = Audit()
+    liveness: Liveness = Liveness()
+    relay: Relay = Relay()
+    recorder: RecorderRules = RecorderRules()
+    firewall: Firewall = Firewall()
+    ipsec: Ipsec = Ipsec()
+    api_limits: ApiLimits = ApiLimits()
+
+    def __post_init__(self) -> None:
+        to = self.audit.syslog.to
+        if to is not None and self.isolation == "netns" and is_loopback(split_receiver(to)[1]):
+            raise ValueError(
+                f"audit.syslog.to: {to} is the loopback of the appliance's own namespace (isolation: netns);"
+                " a receiver on this machine is reached by another of its addresses"
+            )
+
+    @property
+    def listen_address(self) -> tuple[str, int]:
+        """`listen` as host and port."""
+        return split_address(self.listen)
+
+    @property
+    def api_address(self) -> tuple[str, int] | None:
+        """`api` as host and port; None when it is off."""
+        return None if self.api == "off" else split_address(self.api)
+
+    @property
+    def own_services(self) -> list[str]:
+        """What the appliance itself offers to nodes: the service that has the flight recorder record."""
+        offered = self.recorder.enabled and "service" in self.recorder.triggers
+        return [f"{self.publish_as}/record_now"] if offered else []
+
+
+def load_resolved(path: Path) -> Settings:
+    """What the supervisor wrote for its children. Raises `OSError`, `msgspec.ValidationError`."""
+    return msgspec.json.decode(path.read_bytes(), type=Settings, dec_hook=lambda kind, text: kind(text))

@@ -1,0 +1,312 @@
+"""From file, environment and flags to `Settings`: later ones override earlier ones.
+
+    1. defaults
+    2. `appliance.yaml` (`--config`, else `ROSRV_CONFIG`, else the one in the working directory if there
+       is one)
+    3. the environment: `ROSRV_LISTEN`, and `ROSRV_LIMITS__BODY_BYTES` for the key `body_bytes` under `limits`
+    4. flags
+
+Every mistake is reported, all at once, each with where it stands and, for a key nobody knows, the
+nearest that is one. Relative paths in the file are relative to the file's folder; elsewhere to the
+working directory.
+"""
+
+import dataclasses
+import difflib
+import functools
+import re
+import sys
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+from appliance.base.input_files import read_given_text
+from appliance.base.validation_messages import must_be, not_yaml
+from appliance.configuration.settings import Settings
+
+if typing.TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+DEFAULT_FILE = Path("appliance.yaml")
+_PREFIX = "ROSRV_"
+_NOT_CONFIGURATION = {"ROSRV_CONFIG", "ROSRV_TOKEN", "ROSRV_API_URL", "ROSRV_API_CA"}
+# What Kubernetes and container links put there for a service that happens to be named `rosrv`.
+_SERVICE_LINK = re.compile(r"ROSRV_(SERVICE_(HOST|PORT.*)|PORT|PORT_\d+_.*|NAME|ENV_.*)")
+_PATH_KEYS = (
+    ("policy",), ("monitors",), ("state",), ("hosts",),
+    ("ipsec", "ca_passphrase_file"),
+    ("audit", "syslog", "ca"), ("audit", "syslog", "certificate"), ("audit", "syslog", "key"),
+)  # fmt: skip
+KeyPath = tuple[str | int, ...]
+_SHORT_NAMES: dict[str, KeyPath] = {
+    "ROSRV_CA_PASSPHRASE_FILE": ("ipsec", "ca_passphrase_file"),
+    "ROSRV_RELAY": ("relaying",),  # as --relay; with a table it is the section, like any other
+}
+_FLAGS = {"relaying": "--relay"}  # `relay` is a section of the file
+_Section = typing.TypeVar("_Section", bound="DataclassInstance")
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """One thing that is wrong, and where it stands: `appliance.yaml:12`, `ROSRV_LISTEN`, `--listen`."""
+
+    place: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.text}"
+
+
+class ConfigError(Exception):
+    """The configuration is wrong; `mistakes` has everything that is."""
+
+    def __init__(self, mistakes: list[Mistake]) -> None:
+        self.mistakes = sorted(mistakes, key=_line_of)
+        super().__init__("\n".join(map(str, self.mistakes)))
+
+
+def _line_of(mistake: Mistake) -> int:
+    line = mistake.place.rpartition(":")[2]
+    return int(line) if line.isdigit() else sys.maxsize
+
+
+def json_schema() -> dict[str, Any]:
+    """The JSON schema of `appliance.yaml`."""
+    return _reader().json_schema()
+
+
+def read(values: Mapping[str, Any]) -> Settings:
+    """The settings that such a file has. Raises `pydantic.ValidationError`."""
+    return _reader().validate_python(values)
+
+
+def plain(settings: Settings) -> dict[str, Any]:
+    """The settings as such a file has them."""
+    found: dict[str, Any] = _reader().dump_python(settings, mode="json")
+    return found
+
+
+@functools.cache
+def _reader() -> TypeAdapter[Settings]:
+    return TypeAdapter(Settings)
+
+
+def resolve(file: Path | None, environment: Mapping[str, str], flags: Mapping[str, Any]) -> Settings:
+    """The settings in force. A flag that is None was not given. Raises `ConfigError`."""
+    gathered = _Gathered()
+    chosen = _choose_file(file, environment)
+    if chosen is not None:
+        gathered.add_file(chosen)
+    gathered.add_environment(environment)
+    gathered.add_flags(flags)
+    return gathered.settings()
+
+
+def _choose_file(file: Path | None, environment: Mapping[str, str]) -> Path | None:
+    if file is not None:
+        return file
+    if environment.get("ROSRV_CONFIG"):
+        return Path(environment["ROSRV_CONFIG"])
+    return DEFAULT_FILE if DEFAULT_FILE.exists() else None
+
+
+class _Gathered:
+    """What was said so far, where each key was said, and what was wrong with it."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, Any] = {}
+        self._places: dict[KeyPath, str] = {}
+        self._mistakes: list[Mistake] = []
+
+    def add_file(self, file: Path) -> None:
+        try:
+            text = read_given_text(file)
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+            raise ConfigError([Mistake(str(file), f"cannot be read: {reason}")]) from error
+        try:
+            node = yaml.compose(text, Loader=yaml.SafeLoader)
+            self._note_places(file, node, ())
+            values = yaml.safe_load(text)
+        except yaml.MarkedYAMLError as error:
+            line = error.problem_mark.line + 1 if error.problem_mark else 1
+            raise ConfigError([Mistake(f"{file}:{line}", not_yaml(error.problem))]) from error
+        except RecursionError as error:
+            raise ConfigError([Mistake(str(file), "is nested too deep, or refers to itself")]) from error
+        except (yaml.YAMLError, ValueError) as error:
+            raise ConfigError([Mistake(str(file), not_yaml(error))]) from error
+        if values is None:
+            return
+        if not isinstance(values, dict):
+            raise ConfigError([Mistake(f"{file}:1", "must have lines of the form `key: value`")])
+        for path in _PATH_KEYS:
+            _resolve_path(values, path, file.absolute().parent)
+        self._values = values
+
+    def add_environment(self, environment: Mapping[str, str]) -> None:
+        for name in sorted(environment):
+            if not name.startswith(_PREFIX) or name in _NOT_CONFIGURATION or _SERVICE_LINK.fullmatch(name):
+                continue
+            path: KeyPath = tuple(part.lower() for part in name.removeprefix(_PREFIX).split("__"))
+            value: Any = environment[name]
+            if value[:1] in "[{":
+                try:
+                    value = yaml.safe_load(value)
+                except yaml.YAMLError as error:
+                    problem = error.problem if isinstance(error, yaml.MarkedYAMLError) else error
+                    self._mistakes.append(Mistake(name, not_yaml(problem)))
+                    continue
+            if name in _SHORT_NAMES and not isinstance(value, dict):
+                path = _SHORT_NAMES[name]
+            self._set(path, value, name)
+
+    def add_flags(self, flags: Mapping[str, Any]) -> None:
+        for key, value in flags.items():
+            if value is not None:
+                self._set((key,), value, _FLAGS.get(key, "--" + key.replace("_", "-")))
+
+    def settings(self) -> Settings:
+        try:
+            settings = read(self._values)
+        except ValidationError as error:
+            for detail in error.errors(include_url=False):
+                self._mistakes.append(self._mistake(detail))
+            raise ConfigError(self._mistakes) from error
+        if self._mistakes:
+            raise ConfigError(self._mistakes)
+        return _with_absolute_paths(settings)
+
+    def _set(self, path: KeyPath, value: Any, place: str) -> None:
+        table: Any = self._values
+        for key in path[:-1]:
+            if not isinstance(table.get(key), dict):
+                table[key] = {}
+            table = table[key]
+        table[path[-1]] = value
+        # Where the file stands no longer matters for what is under this key.
+        for older in [known for known in self._places if known[: len(path)] == path]:
+            del self._places[older]
+        self._places[path] = place
+
+    def _note_places(self, file: Path, node: yaml.Node | None, path: KeyPath) -> None:
+        if isinstance(node, yaml.MappingNode):
+            seen: set[str] = set()
+            for key, value in node.value:
+                place = f"{file}:{key.start_mark.line + 1}"
+                name = str(key.value)
+                if name in seen:
+                    self._mistakes.append(Mistake(place, f"{_dotted((*path, name))} is given a second time"))
+                seen.add(name)
+                self._places[*path, name] = place
+                self._note_places(file, value, (*path, name))
+        elif isinstance(node, yaml.SequenceNode):
+            for index, value in enumerate(node.value):
+                self._places[*path, index] = f"{file}:{value.start_mark.line + 1}"
+                self._note_places(file, value, (*path, index))
+
+    def _mistake(self, error: Mapping[str, Any]) -> Mistake:
+        kind, path, context = error["type"], error["loc"], error.get("ctx")
+        if kind == "invalid_key":
+            path = (*path[:-1], str(path[-1]))
+        place = self._place_of(path)
+        if kind in ("unexpected_keyword_argument", "invalid_key"):
+            return Mistake(place, _unknown_key(path))
+        if kind == "missing":
+            return Mistake(place, f"{_dotted(path)} must be given")
+        if kind == "value_error" and context:  # a sentence of ours, which names the value where that helps
+            return Mistake(place, f"{_about(path, place)}{context['error']}")
+        wanted = must_be(error)
+        return Mistake(place, f"{_about(path, place)}must be {wanted}, not {self._value_at(path)!r}")
+
+    def _place_of(self, path: KeyPath) -> str:
+        for length in range(len(path), 0, -1):
+            if path[:length] in self._places:
+                return self._places[path[:length]]
+        # A table where a plain value belongs: what is in it was said somewhere.
+        return next(
+            (place for known, place in self._places.items() if known[: len(path)] == path), "configuration"
+        )
+
+    def _value_at(self, path: KeyPath) -> Any:
+        value: Any = self._values
+        for key in path:
+            try:
+                value = value[key]
+            except (KeyError, IndexError, TypeError):
+                break
+        return str(value) if isinstance(value, Path) else value
+
+
+def _about(path: KeyPath, place: str) -> str:
+    """Which key a mistake is about, unless its place is the flag of that name."""
+    return "" if not path or (place.startswith("--") and len(path) == 1) else f"{_dotted(path)}: "
+
+
+def _dotted(path: KeyPath) -> str:
+    return ".".join(map(str, path))
+
+
+def _unknown_key(path: KeyPath) -> str:
+    known = sorted(_keys_at(Settings, path[:-1]))
+    nearest = difflib.get_close_matches(str(path[-1]), known, n=1, cutoff=0.5)
+    if not nearest:
+        # A key that stands on the wrong level is the other common mistake.
+        elsewhere = [_dotted(key) for key in _all_keys(Settings, ()) if key[-1] == path[-1]]
+        nearest = elsewhere[:1]
+    advice = f"did you mean {nearest[0]}?" if nearest else f"known here: {', '.join(known)}"
+    return f"unknown key {_dotted(path)}: {advice}"
+
+
+def _with_absolute_paths(section: _Section) -> _Section:
+    """A copy in which no path depends on the working directory."""
+    changes: dict[str, Any] = {}
+    for key in (field.name for field in dataclasses.fields(section)):
+        value = getattr(section, key)
+        if isinstance(value, Path):
+            changes[key] = value.absolute()
+        elif (
+            dataclasses.is_dataclass(value)
+            and not isinstance(value, type)
+            and (absolute := _with_absolute_paths(value)) != value
+        ):
+            changes[key] = absolute
+    return dataclasses.replace(section, **changes) if changes else section
+
+
+def _resolve_path(values: dict[str, Any], path: tuple[str, ...], folder: Path) -> None:
+    """Make the path at a key relative to the file's folder, where there is one."""
+    *sections, key = path
+    for section in sections:
+        below = values.get(section)
+        if not isinstance(below, dict):
+            return
+        values = below
+    if isinstance(values.get(key), str):
+        values[key] = str(folder / values[key])
+
+
+def _keys_at(section: type, path: KeyPath) -> set[str]:
+    for key in path:
+        if not isinstance(key, int):
+            section = _section_of(typing.get_type_hints(section)[key]) or section
+    return set(typing.get_type_hints(section))
+
+
+def _all_keys(section: type, path: KeyPath) -> Iterator[KeyPath]:
+    for name, annotation in typing.get_type_hints(section).items():
+        yield (*path, name)
+        below = _section_of(annotation)
+        if below is not None:
+            yield from _all_keys(below, (*path, name))
+
+
+def _section_of(annotation: Any) -> type | None:
+    inner = typing.get_args(annotation)
+    if inner:
+        return next(filter(None, map(_section_of, inner)), None)
+    return annotation if isinstance(annotation, type) and dataclasses.is_dataclass(annotation) else None

@@ -1,0 +1,62 @@
+"""The admin socket: operators' tools ask, control answers."""
+
+import asyncio
+import contextlib
+import select
+import socket
+from typing import Any
+
+import msgspec
+import structlog
+
+from appliance.base.withdrawal import awaited
+from appliance.channel import admin
+from appliance.control.administration import Administration
+
+_log = structlog.get_logger()
+_LINE_LIMIT = 16 << 20
+_OPERATOR = "operator"
+
+
+class AdminServer:
+    """Answers requests on the admin socket."""
+
+    def __init__(self, administration: Administration) -> None:
+        self._administration = administration
+        self._decoder = msgspec.json.Decoder(admin.AnyRequest)
+
+    async def start(self, sock: socket.socket) -> asyncio.Server:
+        """Serve the listening socket as long as the server that this returns is held."""
+        return await asyncio.start_unix_server(self._serve, sock=sock, limit=_LINE_LIMIT)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            while line := await reader.readline():
+                with awaited(lambda: _given_up(writer)):
+                    answer = await self._answer(line)
+                writer.write(admin.encode(answer) + b"\n")
+                await writer.drain()
+        except (ValueError, ConnectionError) as error:
+            _log.warning("a tool spoke nonsense on the admin socket", error=str(error))
+        finally:
+            writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+
+    async def _answer(self, line: bytes) -> admin.AdminAnswer[Any]:
+        try:
+            request = self._decoder.decode(line)
+        except msgspec.MsgspecError as error:
+            return admin.AdminAnswer(
+                False, error=f"not a request of this version: {error}", trouble="request"
+            )
+        return await self._administration.carry_out(request, who=_OPERATOR)
+
+
+def _given_up(writer: asyncio.StreamWriter) -> bool:
+    """Whether the client closed the connection, or its direction: so it withdraws what it asked."""
+    if writer.is_closing():
+        return True
+    found = select.poll()
+    found.register(writer.get_extra_info("socket").fileno(), select.POLLRDHUP)
+    return bool(found.poll(0))

@@ -1,0 +1,147 @@
+"""The access tokens of REST: made, listed and revoked here, and nowhere else.
+
+The api is told what it needs to recognise a token (never the secret). Every token that is made or revoked is
+recorded. What operators ask is answered by the method that takes it.
+"""
+
+import time
+from collections.abc import Callable
+from typing import cast
+
+from appliance.channel import admin
+from appliance.channel.answers import tokens as answers
+from appliance.channel.messages.api import TokenKept
+from appliance.store.access_tokens import BadTokenNameError, TokenRow, make_token
+from appliance.store.state_file import StateStore
+from appliance.store.writer_thread import StoreError
+from appliance.telemetry.audit_trail import AuditTrail
+
+FIRST_NAME = "first"
+_UNTOLD = "first token untold"  # the setting that says that nobody may know it yet
+DEFAULT_SECONDS = 90 * 86_400.0
+LONGEST_SECONDS = 3650 * 86_400.0
+_MOST = 1000
+
+
+class TokenRefusedError(Exception):
+    """The token cannot be made or revoked; the text says why."""
+
+
+class Tokens:
+    """All tokens. `changed()` is called when what may be used has changed."""
+
+    def __init__(self, store: StateStore, trail: AuditTrail, changed: Callable[[], None]) -> None:
+        self._store = store
+        self._trail = trail
+        self._rows = {row.id: row for row in store.tokens()}
+        self._untold = bool(store.settings().get(_UNTOLD))
+        self._changed = changed
+
+    async def listed(self, _request: admin.TokenList) -> answers.Tokens:
+        """Every token that was made, the oldest first."""
+        return answers.Tokens([answers.Token(*_fields(row)) for row in self._rows.values()])
+
+    def usable(self) -> list[TokenKept]:
+        """What the api recognises tokens by; it looks at `expires` itself."""
+        now = time.time()
+        return [
+            TokenKept(
+                row.id,
+                row.name,
+                row.role,
+                row.salt,
+                row.hash,
+                row.expires,
+                row.keys.reading if row.keys is not None else b"",
+            )
+            for row in self._rows.values()
+            if row.usable(now)
+        ]
+
+    def usable_row(self, token_id: str) -> TokenRow | None:
+        """The token with this id, if it can be used now."""
+        row = self._rows.get(token_id)
+        return row if row is not None and row.usable(time.time()) else None
+
+    async def first(self) -> str | None:
+        """The text of the first token, if there never was one; of another, if nobody was told that one (`told`)."""
+        if self._rows and not self._untold:
+            return None
+        self._untold = True
+        self._store.save_setting(_UNTOLD, "yes")
+        if self._named(FIRST_NAME, time.time()) is not None:
+            await self.revoke(admin.TokenRevoke(FIRST_NAME))
+        return (await self.add(admin.TokenAdd(FIRST_NAME, "admin", DEFAULT_SECONDS))).token
+
+    def told(self) -> None:
+        """Whoever started the appliance has the first token."""
+        if self._untold:
+            self._untold = False
+            self._store.save_setting(_UNTOLD, "")
+
+    async def add(self, request: admin.TokenAdd) -> answers.NewToken:
+        """Make a token; its text is given here and never again. Raises `TokenRefusedError`, `StoreError`."""
+        name, seconds, now = request.name, request.seconds, time.time()
+        if not 0 < seconds <= LONGEST_SECONDS:
+            raise TokenRefusedError(f"a token ends after at most {LONGEST_SECONDS / 86_400:.0f} days")
+        if self._named(name, now) is not None:
+            raise TokenRefusedError(
+                f"there is a token {name!r} already: revoke it first, or choose another name"
+            )
+        self._require_room(now)
+        try:
+            row, text = make_token(name, request.role, now=now, seconds=seconds)
+        except BadTokenNameError as error:
+            raise TokenRefusedError(str(error)) from error
+        self._keep(row)
+        self._trail.happened(
+            "token added",
+            f"token {row.name} ({row.role}) was made",
+            token=row.name,
+            id=row.id,
+            role=row.role,
+            expires=row.expires,
+        )
+        try:
+            await self._store.settled()
+        except StoreError:  # nobody is told its text: it is not to stand in the way of the next of its name
+            self._end(row)
+            raise
+        return answers.NewToken(*_fields(row), token=text)
+
+    async def revoke(self, request: admin.TokenRevoke) -> answers.Token:
+        """End a token now. Raises `TokenRefusedError`."""
+        name, now = request.name, time.time()
+        row = self._named(name, now)
+        if row is None:
+            known = (
+                ", ".join(sorted(token.name for token in self._rows.values() if token.usable(now))) or "none"
+            )
+            raise TokenRefusedError(f"there is no token {name[:80]!r} that can be used; there are: {known}")
+        revoked = self._end(row)
+        await self._store.settled()
+        return answers.Token(*_fields(revoked))
+
+    def _end(self, row: TokenRow) -> TokenRow:
+        revoked = row._replace(revoked=time.time())
+        self._keep(revoked)
+        self._trail.happened(
+            "token revoked", f"token {row.name} ({row.role}) was revoked", token=row.name, id=row.id
+        )
+        return revoked
+
+    def _named(self, name: str, now: float) -> TokenRow | None:
+        return next((row for row in self._rows.values() if row.name == name and row.usable(now)), None)
+
+    def _require_room(self, now: float) -> None:
+        if sum(row.usable(now) for row in self._rows.values()) >= _MOST:
+            raise TokenRefusedError(f"there are {_MOST} tokens already: revoke some")
+
+    def _keep(self, row: TokenRow) -> None:
+        self._rows[row.id] = row
+        self._store.save_token(row)
+        self._changed()
+
+
+def _fields(row: TokenRow) -> tuple[str, str, answers.TokenRole, float, float, float | None]:
+    return row.name, row.id, cast(answers.TokenRole, row.role), row.created, row.expires, row.revoked

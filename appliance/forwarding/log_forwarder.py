@@ -1,0 +1,181 @@
+"""Reads what the log has committed and sends it on: at least once, in order, from where it was.
+
+Invariants:
+
+1. It reads the database as any reviewer does: the log never waits for it, and loses nothing by it.
+2. Memory is bounded: `_BATCH` records and checkpoints at a time.
+3. The position moves only when the receiver has the batch; a failure is tried again, at growing distances, for ever.
+4. What was removed by retention before it could be sent is counted (`missed`) and told, not passed over.
+5. Of a log that was put back from a copy, what is recorded in the place of what had been sent is sent as well.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import structlog
+
+from appliance.audit.copies import signed_checkpoints
+from appliance.audit.log_database import LogUnreadableError, reading
+from appliance.audit.query import Filter
+from appliance.audit.record import Record, Severity
+from appliance.audit.record_format import Entry
+from appliance.audit.search import search
+from appliance.channel.messages import ForwardingReported
+from appliance.forwarding.position import Position, load_position, save_position
+from appliance.forwarding.receiver import Receiver
+from appliance.forwarding.syslog import Formatter
+
+Chosen = Literal["all", "denials"]
+_BATCH = 256
+_IDLE_SECONDS = 0.5
+_BACK_OFF = (0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+_SAVE_SECONDS = 1.0
+_log = structlog.get_logger()
+
+
+@dataclass(slots=True)
+class Forwarder:
+    """Forwards the log at `log` to `receiver`; the position is kept in the file `kept`. Used by one thread."""
+
+    log: Path
+    kept: Path
+    receiver: Receiver
+    formatter: Formatter
+    chosen: Chosen
+    clock: Callable[[], int] = time.time_ns
+    progress: ForwardingReported = field(default_factory=ForwardingReported)
+    _position: Position | None = None
+    _saved: Position | None = None
+    _saved_at: float = 0.0
+    _failures: int = 0
+
+    def step(self) -> float:
+        """Send the next batch; in how many seconds to come again."""
+        try:
+            position = self._position or self._begin()
+            more = self._forward(position)
+            self._save(_SAVE_SECONDS)
+        except (LogUnreadableError, OSError, ValueError) as error:
+            return self._failed(str(error) or type(error).__name__)
+        if self._failures:
+            _log.warning("the audit log is forwarded again")
+        self._failures = 0
+        return 0.0 if more else _IDLE_SECONDS
+
+    def close(self) -> None:
+        """Keep the position and let go of the receiver."""
+        self.receiver.close()
+        try:
+            self._save(0.0)
+        except OSError as error:
+            _log.error("the position is not kept: some records will be forwarded again", error=str(error))
+
+    def _begin(self) -> Position:
+        first, _last, log_id = _extent(self.log)
+        position = load_position(self.kept)
+        if position is not None and position.log != log_id:
+            _log.warning("another audit log is forwarded from its beginning", log=log_id, before=position.log)
+            position = None
+        self._position = _in_log(self.log, position) if position else Position(log_id, first - 1)
+        return self._position
+
+    def _forward(self, position: Position) -> bool:
+        """Whether there is more."""
+        _first, head, log_id = _extent(self.log)
+        if log_id != position.log or head < position.sequence:
+            self._position = None
+            raise LogUnreadableError(f"{self.log}: another log than before; it is looked at afresh")
+        entries = search(self.log, Filter(), str(position.sequence), _BATCH, newest_first=False).entries
+        checkpoints = signed_checkpoints(self.log, position.checkpoint, _BATCH)
+        missed = entries[0].sequence - position.sequence - 1 if entries else 0
+        if missed:
+            _log.error("retention removed records before they were forwarded", count=missed)
+        through = entries[-1].sequence if entries else position.sequence
+        ready = [checkpoint for checkpoint in checkpoints if checkpoint.sequence <= through or not entries]
+        self._look(head - position.sequence, entries)
+        messages = [self.formatter.record(entry) for entry in entries if self._wanted(entry.record)]
+        messages += [self.formatter.checkpoint(checkpoint) for checkpoint in ready]
+        if messages:
+            self.receiver.send(messages)
+        last = ready[-1].number if ready else position.checkpoint
+        self._position = Position(
+            position.log, through, last, entries[-1].record.id if entries else position.record
+        )
+        self.progress = ForwardingReported(
+            sent=self.progress.sent + len(messages),
+            sequence=through,
+            checkpoint=last,
+            behind=head - through,
+            seconds=self._waited(entries) if head > through else 0.0,
+            missed=self.progress.missed + missed,
+        )
+        return head > through or len(ready) == _BATCH
+
+    def _wanted(self, record: Record) -> bool:
+        return (
+            self.chosen == "all"
+            or record.decision in ("deny", "would deny")
+            or record.severity in (Severity.WARNING, Severity.ALARM)
+        )
+
+    def _look(self, behind: int, entries: list[Entry]) -> None:
+        """What waits, while it is being sent."""
+        seconds = self._waited(entries)
+        self.progress = msgspec.structs.replace(self.progress, behind=behind, seconds=seconds)
+
+    def _waited(self, entries: list[Entry]) -> float:
+        return max(0.0, (self.clock() - entries[0].record.time) / 1e9) if entries else 0.0
+
+    def _failed(self, reason: str) -> float:
+        self.receiver.close()
+        pause = _BACK_OFF[min(self._failures, len(_BACK_OFF) - 1)]
+        if not self._failures:
+            _log.error("the audit log is not forwarded; it is tried again and again", reason=reason)
+        self._failures += 1
+        self.progress = msgspec.structs.replace(self.progress, trouble=reason)
+        return pause
+
+    def _save(self, at_most_every: float) -> None:
+        now = time.monotonic()
+        if self._position is None or self._position == self._saved or now - self._saved_at < at_most_every:
+            return
+        save_position(self.kept, self._position)
+        self._saved, self._saved_at = self._position, now
+
+
+def _extent(path: Path) -> tuple[int, int, str]:
+    """First and last sequence, and the log's id. Raises `LogUnreadableError`."""
+    with reading(path, advice="") as connection:
+        query = "SELECT coalesce(min(sequence), 1), coalesce(max(sequence), 0) FROM record"
+        first, last = connection.execute(query).fetchone()
+        (log_id,) = connection.execute("SELECT id FROM log").fetchone()
+    return int(first), int(last), str(log_id)
+
+
+def _in_log(path: Path, position: Position) -> Position:
+    """The position as far as the log has what it says. Raises `LogUnreadableError`.
+
+    A log that was put back from a copy went on from there: its ids are in order of time, so what is later than the
+    last record that was sent is new, whatever its sequence.
+    """
+    with reading(path, advice="") as connection:
+
+        def ask(query: str, *values: object) -> Any:
+            row = connection.execute(query, values).fetchone()
+            return None if row is None else row[0]
+
+        found = ask("SELECT id FROM record WHERE sequence = ?", position.sequence)
+        head = ask("SELECT coalesce(max(sequence), 0) FROM record")
+        is_there = not position.record or found is None or found == position.record
+        if is_there and position.sequence <= head:
+            return position
+        later = "SELECT min(sequence) - 1 FROM record WHERE id > ?"
+        before = ask(later, position.record) if position.record else None
+        sequence = min(position.sequence, head) if before is None else int(before)
+        number = ask("SELECT coalesce(max(number), 0) FROM checkpoint WHERE sequence <= ?", sequence)
+    _log.warning("the audit log was put back from a copy: it is forwarded from there", sequence=sequence)
+    return Position(position.log, sequence, min(position.checkpoint, int(number)))

@@ -1,0 +1,239 @@
+"""The table of hosts that come through tunnels: names, addresses, certificates. What is kept, no questions to anybody.
+
+Invariants:
+
+1. A name has one virtual address for good; the address of a revoked host is given to no other, nor is one that is
+   kept for an awaited or declared host.
+2. A certificate that is no longer its host's is among the revoked ones, from the same moment on.
+3. `revision` grows with every change that an operator or a host made, over restarts too.
+"""
+
+import datetime
+import ipaddress
+import itertools
+import re
+import time
+
+from appliance.channel.messages import APPLIANCE_NAME, CertificateMade
+from appliance.hosts.hosts_file import Declared
+from appliance.hosts.revoked_certificates import RevokedCertificates
+from appliance.store.host_tables import CertificateRow, HostRow, NextCertificate, PortsRow, RevokedRow
+from appliance.store.state_file import StateStore
+
+_NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
+_REVISION = "hosts.revision"
+MOST_HOSTS = 4096
+LONGEST_DAYS = 398  # of a certificate, as the authority has it
+MOST_MACHINES = 1024
+
+
+class HostRefusedError(Exception):
+    """It is not done; the text says why. `ours`: the appliance cannot do it now."""
+
+    def __init__(self, reason: str, *, ours: bool = False) -> None:
+        super().__init__(reason)
+        self.ours = ours
+
+
+class UnknownHostError(HostRefusedError):
+    """There is no such host."""
+
+
+class HostForbiddenError(HostRefusedError):
+    """Whoever asks may not."""
+
+
+class HostsChangedError(Exception):
+    """A change was meant for another state of the table."""
+
+
+class HostTable:
+    """All hosts that were ever enrolled; `own_address` is the appliance's, the first of the pool."""
+
+    def __init__(self, store: StateStore, pool: ipaddress.IPv4Network, declared: Declared) -> None:
+        self._store = store
+        self._kept = store.hosts
+        self.pool = pool
+        self.declared = declared
+        self.rows = {row.name: row for row in self._kept.hosts()}
+        self.certificates = {row.name: row for row in self._kept.certificates()}
+        self.revoked = RevokedCertificates(self._kept)
+        self.ports = {row.name: row for row in self._kept.ports()}
+        self.revision = int(store.settings().get(_REVISION, "1"))
+
+    @property
+    def own_address(self) -> str:
+        """The appliance's address in the tunnels."""
+        return str(self.pool.network_address + 1)
+
+    def require(self, expected: int | None) -> None:
+        """Raises `HostsChangedError` when a change is meant for another revision."""
+        if expected not in (None, self.revision):
+            raise HostsChangedError(f"the table of hosts has revision {self.revision}, not {expected}")
+
+    def changed(self) -> None:
+        """Somebody has changed something."""
+        self.revision += 1
+        self._store.save_setting(_REVISION, str(self.revision))
+
+    # --- who is in it ---
+
+    def enrolled(self) -> list[HostRow]:
+        """Hosts with a certificate that was not revoked."""
+        return [row for row in self.rows.values() if row.revoked is None]
+
+    def admitted(self) -> list[HostRow]:
+        """Those of them whose tunnel hosts.yaml wants, or does not know."""
+        return [row for row in self.enrolled() if self.declared.wants(row.name)]
+
+    def enrolled_row(self, name: str) -> HostRow:
+        """A host that is enrolled. Raises `UnknownHostError`."""
+        row = self.rows.get(name)
+        if row is None or row.revoked is not None:
+            known = ", ".join(host.name for host in self.enrolled()[:20]) or "none"
+            raise UnknownHostError(f"no host {name[:80]!r} is enrolled; enrolled are: {known}")
+        return row
+
+    def at(self, address: str) -> HostRow | None:
+        """The enrolled host with this virtual address."""
+        return next((row for row in self.enrolled() if row.address == address), None)
+
+    def listed_as_revoked(self) -> list[RevokedRow]:
+        """What is on the list of revoked certificates."""
+        return self.revoked.listed(self._enrolled_names())
+
+    def missing_as_revoked(self) -> int:
+        """How many certificates that enrolled hosts had before are not on it, for it is full."""
+        return self.revoked.missing(self._enrolled_names())
+
+    def require_room(self, name: str) -> None:
+        """Raises `HostRefusedError` when no other certificate of this name could be listed as revoked."""
+        if name not in self.rows:
+            return
+        until = self.revoked.wait_for_room(self._enrolled_names() | {name})
+        if until:
+            moment = datetime.datetime.fromtimestamp(until, datetime.UTC)
+            raise HostRefusedError(
+                "the list of revoked certificates is full (charon takes 64 KiB): no certificate is replaced before"
+                f" {moment:%Y-%m-%d %H:%M}Z, when the next one on it has ended; revoking a host makes room, too"
+            )
+
+    def _enrolled_names(self) -> set[str]:
+        return {row.name for row in self.enrolled()}
+
+    # --- what can be had ---
+
+    def require_name(self, name: str) -> None:
+        """Raises `HostRefusedError` when no host can have this name, or there are too many."""
+        if not _NAME.fullmatch(name) or name.lower() == APPLIANCE_NAME:
+            raise HostRefusedError(
+                f"{name[:80]!r} is no name for a host: letters, digits and . _ -, beginning and ending with a"
+                f" letter or digit, at most 63, and not {APPLIANCE_NAME}"
+            )
+        twin = next((other for other in self.rows if other.lower() == name.lower() and other != name), None)
+        if twin is not None:
+            raise HostRefusedError(
+                f"{name} differs from {twin} only in large and small letters, which IKE ignores"
+            )
+        if name not in self.rows and len(self.rows) >= MOST_HOSTS:
+            raise HostRefusedError(f"there are {MOST_HOSTS} hosts, revoked ones counted: the table is full")
+
+    def address_for(self, name: str, wanted: str | None, awaited: dict[str, str]) -> str:
+        """The address that a host shall have; `awaited` has those promised to others, with their names.
+
+        Raises `HostRefusedError`.
+        """
+        declared = self.declared.hosts.get(name)
+        before = self.rows.get(name)
+        kept = before.address if before else declared.address if declared else None
+        if wanted is None and kept is not None:
+            wanted = kept
+        taken = {row.address: row.name for row in self.rows.values() if row.name != name}
+        taken |= {address: holder for address, holder in awaited.items() if holder != name}
+        if wanted is None:
+            reserved = {host.address for host in self.declared.hosts.values()}
+            for candidate in itertools.islice(self.pool.hosts(), 1, None):
+                if str(candidate) not in taken and str(candidate) not in reserved:
+                    return str(candidate)
+            raise HostRefusedError(f"every address of {self.pool} is a host's: take a larger ipsec.pool")
+        try:
+            address = ipaddress.IPv4Address(wanted)
+        except ValueError:
+            raise HostRefusedError(f"{wanted[:80]!r} is no IPv4 address") from None
+        ends = (self.pool.network_address, self.pool.broadcast_address)
+        if address not in self.pool or address in ends or str(address) == self.own_address:
+            raise HostRefusedError(f"{address} is not an address of a host in {self.pool}")
+        if str(address) in taken:
+            raise HostRefusedError(f"{address} is the address of {taken[str(address)]}")
+        if before is not None and str(address) != before.address:
+            raise HostRefusedError(
+                f"{name} has {before.address} for good: policies and logs mean it by that address"
+            )
+        return str(address)
+
+    # --- changes ---
+
+    def keep(self, name: str, address: str, made: CertificateMade) -> HostRow:
+        """A host has this certificate now, and no other."""
+        before, now = self.rows.get(name), time.time()
+        if before is not None and before.revoked is None:
+            self._revoke_certificates(before)
+        enrolled = before.enrolled if before is not None and before.revoked is None else now
+        row = self._set(HostRow(name, address, made.serial, made.expires, enrolled, None))
+        self._set_certificate(CertificateRow(name, now, made.certificate.decode()))
+        self.changed()
+        return row
+
+    def keep_next(self, name: str, made: CertificateMade) -> None:
+        """A host was given a certificate that is to follow its present one."""
+        row = self.certificates.get(name)
+        before = row.certificate if row is not None else ""
+        since = row.made if row is not None else time.time()
+        if row is not None and row.next is not None:
+            self.revoked.add(name, row.next.serial, row.next.expires)
+        following = NextCertificate(made.serial, made.expires, made.certificate.decode())
+        self._set_certificate(CertificateRow(name, since, before, following))
+        self.changed()
+
+    def take_next(self, name: str) -> HostRow | None:
+        """The certificate that was to follow is the host's now; None when there is none."""
+        row, certificate = self.rows[name], self.certificates.get(name)
+        if certificate is None or certificate.next is None:
+            return None
+        following = certificate.next
+        self.revoked.add(name, row.serial, row.expires)
+        taken = self._set(row._replace(serial=following.serial, expires=following.expires))
+        self._set_certificate(CertificateRow(name, time.time(), following.certificate))
+        self.changed()
+        return taken
+
+    def revoke(self, name: str) -> HostRow:
+        """No certificate of this host is good any more."""
+        row = self.enrolled_row(name)
+        self._revoke_certificates(row)
+        self.changed()
+        return self._set(row._replace(revoked=time.time()))
+
+    def keep_ports(self, row: PortsRow) -> None:
+        """What somebody saw of a machine's ports. Raises `HostRefusedError`."""
+        if row.name not in self.ports and len(self.ports) >= MOST_MACHINES:
+            raise HostRefusedError(f"the ports of {MOST_MACHINES} machines are known: that is the limit")
+        self.ports[row.name] = row
+        self._kept.save_ports(row)
+        self.changed()
+
+    def _set(self, row: HostRow) -> HostRow:
+        self.rows[row.name] = row
+        self._kept.save(row)
+        return row
+
+    def _set_certificate(self, row: CertificateRow) -> None:
+        self.certificates[row.name] = row
+        self._kept.save_certificate(row)
+
+    def _revoke_certificates(self, row: HostRow) -> None:
+        self.revoked.add(row.name, row.serial, row.expires)
+        certificate = self.certificates.get(row.name)
+        if certificate is not None and certificate.next is not None:
+            self.revoked.add(row.name, certificate.next.serial, certificate.next.expires)
+            self._set_certificate(certificate._replace(next=None))

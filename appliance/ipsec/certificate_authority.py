@@ -1,0 +1,244 @@
+"""The certificate authority of one appliance: its key, the certificates of the hosts, and the list of revoked ones.
+
+Invariants:
+
+1. The key (ECDSA on P-384, or Ed25519) is made at the first use in the signer's own directory, mode 0600, encrypted
+   when there is a passphrase, and never leaves the process. A key without its certificate, a certificate of another
+   key, or a key that others may read is an error, never replaced.
+2. Of a request only the public key counts: the names, times and uses in a certificate are this module's.
+   The request must be signed by its own key, and the key must be ECDSA on P-384 or Ed25519.
+3. No certificate lives longer than the authority's own, or than `LONGEST_DAYS`.
+4. With a proof, a request is only good when the key of a certificate in the same name, which this authority made and
+   which has not ended, signed it.
+5. A list of revoked certificates has all that are given each time. Its number only grows, over restarts and with the
+   clock set back, too: charon keeps the list it has when one with a lower number comes.
+"""
+
+import contextlib
+import datetime
+import re
+import secrets
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+from cryptography.hazmat.primitives.serialization import Encoding
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from appliance.base.atomic_files import write_whole
+from appliance.ipsec.authority_key import Kind, load_key, make_key, write_key
+from appliance.ipsec.key_files import SignerKeyError
+from appliance.ipsec.proof_of_possession import RequestRefusedError, require_proof
+
+KEY_FILE = "ca.key"
+CERTIFICATE_FILE = "ca.pem"
+LIST_FILE = "ca.list"  # has the number of the last list of revoked certificates, in decimal
+LONGEST_DAYS = 398
+AUTHORITY_DAYS = 3650
+REVOCATIONS_DAYS = 30
+LONGEST_REQUEST = 16 << 10  # bytes
+
+_NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?")
+_SERIAL_BITS = 70  # random; 160 would be allowed, and the list of revoked ones would be a third longer
+_CLOCKS_DIFFER = datetime.timedelta(hours=1)
+
+
+@dataclass(frozen=True)
+class Issued:
+    """A certificate that was made: PEM, serial number in hexadecimal, end in seconds since the epoch."""
+
+    certificate: bytes
+    serial: str
+    expires: float
+
+
+class Authority:
+    """The authority in `directory`, made with a key of this kind when there is none.
+
+    Raises `SignerKeyError`, `OSError`.
+    """
+
+    def __init__(self, directory: Path, kind: Kind = "ecdsa", passphrase: bytes | None = None) -> None:
+        key_path, certificate_path = directory / KEY_FILE, directory / CERTIFICATE_FILE
+        if not key_path.exists() and not certificate_path.exists():
+            _create(key_path, certificate_path, kind, passphrase)
+        self._key = load_key(key_path, CERTIFICATE_FILE, kind, passphrase)
+        self._hash = None if isinstance(self._key, ed25519.Ed25519PrivateKey) else hashes.SHA384()
+        self._certificate = _load_certificate(certificate_path)
+        if self._certificate.public_key() != self._key.public_key():
+            raise SignerKeyError(
+                f"{certificate_path} is not the certificate of {key_path}: restore both from one backup"
+            )
+        self._list_path = directory / LIST_FILE
+        self._list_number = 0
+        if self._list_path.exists():
+            text = self._list_path.read_bytes()
+            if not text.isdigit():
+                raise SignerKeyError(
+                    f"{self._list_path} is damaged, it has no number: restore it from a backup"
+                )
+            self._list_number = int(text)
+
+    @property
+    def certificate(self) -> bytes:
+        """The authority's own certificate, in PEM."""
+        return self._certificate.public_bytes(Encoding.PEM)
+
+    def issue(
+        self, request: bytes, name: str, days: float, *, proof: bytes = b"", former: bytes = b""
+    ) -> Issued:
+        """A certificate for the key of a signing request (PEM), in this name. Raises `RequestRefusedError`.
+
+        `proof`: the signature over the request by the key of the certificate `former` (PEM).
+        """
+        if not _NAME.fullmatch(name):
+            raise RequestRefusedError(
+                f"{name[:80]!r} is no name for a certificate: letters, digits and . _ -, at most 63"
+            )
+        if not 0 < days <= LONGEST_DAYS:
+            raise RequestRefusedError(f"a certificate is good for at most {LONGEST_DAYS} days")
+        public_key = _key_of(request)
+        now = datetime.datetime.now(datetime.UTC)
+        if proof or former:
+            require_proof(request, proof, former, name=name, authority=self._certificate, now=now)
+        end = min(now + datetime.timedelta(days=days), self._certificate.not_valid_after_utc)
+        certificate = (
+            x509.CertificateBuilder()
+            .subject_name(_subject(name))
+            .issuer_name(self._certificate.subject)
+            .public_key(public_key)
+            .serial_number(secrets.randbits(_SERIAL_BITS) | 1 << _SERIAL_BITS)
+            .not_valid_before(now - _CLOCKS_DIFFER)
+            .not_valid_after(end)
+            .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+            .add_extension(_usage(authority=False), critical=True)
+            .add_extension(
+                x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]),
+                critical=False,
+            )
+            .add_extension(x509.SubjectAlternativeName([x509.DNSName(name)]), critical=False)
+            .add_extension(x509.SubjectKeyIdentifier.from_public_key(public_key), critical=False)
+            .add_extension(self._identifier(), critical=False)
+            .sign(self._key, self._hash)
+        )
+        return Issued(
+            certificate.public_bytes(Encoding.PEM),
+            f"{certificate.serial_number:x}",
+            certificate.not_valid_after_utc.timestamp(),
+        )
+
+    def revocations(self, serials: Iterable[tuple[str, float]]) -> bytes:
+        """The signed list of revoked certificates (PEM): serial number in hexadecimal, and when (epoch)."""
+        now = datetime.datetime.now(datetime.UTC)
+        builder = (
+            x509.CertificateRevocationListBuilder()
+            .issuer_name(self._certificate.subject)
+            .last_update(now - _CLOCKS_DIFFER)
+            .next_update(now + datetime.timedelta(days=REVOCATIONS_DAYS))
+            .add_extension(x509.CRLNumber(self._next_list()), critical=False)
+            .add_extension(self._identifier(), critical=False)
+        )
+        for serial, moment in serials:
+            builder = builder.add_revoked_certificate(
+                x509.RevokedCertificateBuilder()
+                .serial_number(int(serial, 16))
+                .revocation_date(datetime.datetime.fromtimestamp(moment, datetime.UTC))
+                .build()
+            )
+        return builder.sign(self._key, self._hash).public_bytes(Encoding.PEM)
+
+    def _next_list(self) -> int:
+        self._list_number = max(self._list_number + 1, time.time_ns())
+        # A full disk keeps nobody from revoking: this life knows the number.
+        with contextlib.suppress(OSError):
+            write_whole(self._list_path, b"%d" % self._list_number, 0o600)
+        return self._list_number
+
+    def _identifier(self) -> x509.AuthorityKeyIdentifier:
+        return x509.AuthorityKeyIdentifier.from_issuer_public_key(self._key.public_key())
+
+
+def _key_of(request: bytes) -> ec.EllipticCurvePublicKey | ed25519.Ed25519PublicKey:
+    """The public key of a request that proves to hold the private one."""
+    if len(request) > LONGEST_REQUEST:
+        raise RequestRefusedError(f"the signing request is longer than {LONGEST_REQUEST} bytes")
+    try:
+        parsed = x509.load_pem_x509_csr(request)
+        key, signed = parsed.public_key(), parsed.is_signature_valid
+    except (ValueError, TypeError, UnsupportedAlgorithm, InvalidSignature, x509.InvalidVersion) as error:
+        raise RequestRefusedError(f"not a signing request (PKCS #10) in PEM: {error}") from error
+    if not signed:
+        raise RequestRefusedError("the signing request is not signed by the key that is in it")
+    if isinstance(key, ed25519.Ed25519PublicKey):
+        return key
+    if isinstance(key, ec.EllipticCurvePublicKey) and isinstance(key.curve, ec.SECP384R1):
+        return key
+    raise RequestRefusedError(
+        "the key of the signing request is neither ECDSA on P-384 nor Ed25519; make one with "
+        "`openssl ecparam -name secp384r1 -genkey -noout`"
+    )
+
+
+def _create(key_path: Path, certificate_path: Path, kind: Kind, passphrase: bytes | None) -> None:
+    key = make_key(kind)
+    serial = x509.random_serial_number()
+    subject = _subject(f"ROSRV appliance authority {serial % 0x1000000:06x}")
+    now = datetime.datetime.now(datetime.UTC)
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(subject)
+        .public_key(key.public_key())
+        .serial_number(serial)
+        .not_valid_before(now - _CLOCKS_DIFFER)
+        .not_valid_after(now + datetime.timedelta(days=AUTHORITY_DAYS))
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(authority=True), critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        .sign(key, hashes.SHA384() if kind == "ecdsa" else None)
+    )
+    # The certificate first: one without its key (a crash in between) made nothing yet, and says what to do.
+    write_whole(certificate_path, certificate.public_bytes(Encoding.PEM), 0o644)
+    write_key(key_path, key, passphrase)
+
+
+def _load_certificate(path: Path) -> x509.Certificate:
+    try:
+        return x509.load_pem_x509_certificate(path.read_bytes())
+    except FileNotFoundError:
+        raise SignerKeyError(
+            f"{path}: missing, but its key is there; restore it from a backup, or remove {KEY_FILE} to begin"
+            " with a new authority (every host enrols again)"
+        ) from None
+    except ValueError as error:
+        raise SignerKeyError(
+            f"{path}: not a certificate in PEM: {error}; restore it from a backup"
+        ) from error
+
+
+def _subject(name: str) -> x509.Name:
+    return x509.Name(
+        [
+            x509.NameAttribute(NameOID.ORGANIZATION_NAME, "ROSRV"),
+            x509.NameAttribute(NameOID.COMMON_NAME, name),
+        ]
+    )
+
+
+def _usage(*, authority: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not authority,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        key_cert_sign=authority,
+        crl_sign=authority,
+        encipher_only=False,
+        decipher_only=False,
+    )

@@ -1,0 +1,257 @@
+"""The parameter calls. What asks for no large tree is answered by the mirror: a node that starts asks for hundreds.
+
+While ROSMaster is away or not whole, such a question waits as all calls do. Writes go to ROSMaster one after the other,
+in few requests.
+
+`searchParam` finds a parameter for whoever may read it. ROSMaster looks for a relative key in the caller's namespace
+and then upwards. The `caller_id` is a claim, so anybody can look anywhere: whether a parameter is there that the host
+may not read must make no difference to the answer. So a global key is decided before it is looked for, and of a search
+upwards only those places count that may be read. What is told when nothing is found depends on the policy alone.
+"""
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from appliance.master.caller import Answer, Caller
+from appliance.master.calls.call import Attempt
+from appliance.master.calls.parameter_rights import ParameterRights
+from appliance.master.graph.graph import Graph
+from appliance.master.graph.parameter_updates import settled
+from appliance.master.parameter_charges import APPLIANCE, NAME_WEIGHT, LimitReachedError, measure
+from appliance.master.parameter_mirror import ParameterMirror, Reserved
+from appliance.master.reconcile.enactor import Enactor
+from appliance.master.rosmaster import RosMaster, Wanted
+from appliance.policy.model import Address, Decision
+from appliance.rpc.bulk import weigh
+from appliance.rpc.xmlrpc_client import CallFailedError
+from roswire.errors import EncodingError, ProtocolError
+from roswire.names import resolve_parameter
+from roswire.parameter_tree import names_in, standing_at
+from roswire.xmlrpc import Value
+
+_NAMES_AT_ONCE = 500  # some milliseconds
+_TOGETHER_BYTES = 256 << 10  # of values that go to ROSMaster in one request
+
+
+class Write(NamedTuple):
+    """A parameter is set, or deleted (`value` is None), for a caller."""
+
+    caller: Caller
+    key: str
+    value: Value
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterCalls:
+    """Reads and writes parameters; a tree of `large` bytes or more is asked of ROSMaster."""
+
+    rosmaster: RosMaster
+    mirror: ParameterMirror
+    graph: Graph
+    enactor: Enactor
+    rights: ParameterRights
+    large: int
+
+    async def get_param(self, caller: Caller, key: str) -> Answer:
+        """`getParam(caller_id, key)`."""
+        there, _ = standing_at(self.mirror.tree, key)
+        if not self.rosmaster.reachable or (
+            isinstance(there, dict) and weigh(there, self.large) >= self.large
+        ):
+            answer = await self.rosmaster.call("getParam", caller.caller_id, key)
+        elif there is None:
+            answer = [-1, f"Parameter [{key}] is not set", 0]
+        else:
+            answer = [1, f"Parameter [{key}]", settled(there)]
+        hidden = self.rights.hidden(caller, "getParam", key, answer)
+        return answer if hidden is None else [0, hidden, 0]
+
+    async def has_param(self, caller: Caller, key: str) -> Answer:
+        """`hasParam(caller_id, key)`."""
+        if self.rosmaster.reachable:
+            return [1, key, standing_at(self.mirror.tree, key)[0] is not None]
+        return await self.rosmaster.call("hasParam", caller.caller_id, key)
+
+    async def set_param(self, caller: Caller, key: str, value: Value) -> Answer:
+        """`setParam(caller_id, key, value)`."""
+        return await self._write_one(Write(caller, key, value))
+
+    async def delete_param(self, caller: Caller, key: str) -> Answer:
+        """`deleteParam(caller_id, key)`."""
+        return await self._write_one(Write(caller, key, None))
+
+    async def get_param_names(self, caller: Caller) -> Answer:
+        """`getParamNames(caller_id)`: those that the host may read."""
+        if self.rosmaster.reachable and self.mirror.weight < self.large:
+            answer: Answer = [1, "Parameter names", list(names_in(self.mirror.tree))]
+        else:
+            answer = await self.rosmaster.call("getParamNames", caller.caller_id)
+        if answer[0] == 1 and isinstance(answer[2], list) and not caller.own:
+            names, answer[2] = answer[2], (found := [])
+            for begin in range(0, len(names), _NAMES_AT_ONCE):
+                if begin:
+                    await asyncio.sleep(0)  # each is decided: others have their turn meanwhile
+                some = names[begin : begin + _NAMES_AT_ONCE]
+                found += [name for name in some if self.rights.to_find(caller, str(name)).allowed]
+        return answer
+
+    def weight_of_answer(self, attempt: Attempt) -> int:
+        """About how many bytes the answer has that tells a parameter's value; counting ends when that is `large`."""
+        if not attempt.call.tells:
+            return 0
+        return weigh(standing_at(self.mirror.tree, attempt.resource)[0], self.large)
+
+    async def _write_one(self, write: Write) -> Answer:
+        [outcome] = await self.write([write])
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    async def write(self, writes: Sequence[Write]) -> list[Answer | Exception]:
+        """Carry out several writes one after the other, in few requests: the outcome of each.
+
+        A value is checked as if it came alone after those before it; one that fails holds up no other.
+        """
+        outcomes: list[Answer | Exception] = []
+        waiting: list[tuple[Write, Reserved | None]] = []
+        weight = 0
+        for write in writes:
+            try:
+                measured, depth = (0, 0) if write.value is None else measure(write.value)
+                self.mirror.check(write.key, depth)
+                if weight + measured + len(write.key) > _TOGETHER_BYTES:
+                    outcomes += await self._send(waiting)
+                    waiting, weight = [], 0
+                try:
+                    reserved = self._reserved(write, measured)
+                except LimitReachedError:  # those before it may make room
+                    outcomes += await self._send(waiting)
+                    waiting, weight = [], 0
+                    reserved = self._reserved(write, measured)
+            except (ProtocolError, LimitReachedError) as error:
+                outcomes += [*await self._send(waiting), error]
+                waiting, weight = [], 0
+                continue
+            waiting.append((write, reserved))
+            weight += NAME_WEIGHT + len(write.key) + measured
+        return outcomes + await self._send(waiting)
+
+    def _reserved(self, write: Write, weight: int) -> Reserved | None:
+        if write.value is None:
+            return None
+        host: Address = APPLIANCE if write.caller.own else write.caller.peer.host
+        return self.mirror.reserve(write.key, weight, host)
+
+    async def _send(self, waiting: list[tuple[Write, Reserved | None]]) -> list[Answer | Exception]:
+        """Make the calls; mirror, charges and subscribers follow what ROSMaster took."""
+        try:
+            outcomes = await self._make([_wanted(write) for write, _reserved in waiting])
+        finally:
+            for _write, reserved in waiting:
+                if reserved is not None:
+                    reserved.release()
+        with self.mirror.together():
+            for (write, reserved), outcome in zip(waiting, outcomes, strict=True):
+                if not isinstance(outcome, Exception):
+                    self._written(write, reserved, outcome)
+        return outcomes
+
+    def _written(self, write: Write, reserved: Reserved | None, outcome: Answer) -> None:
+        """ROSMaster answered so."""
+        if reserved is not None and _is_set(outcome, write):
+            self.mirror.set(write.key, write.value, reserved)
+            self.enactor.carry_out(self.graph.parameter_set(write.key, write.value, write.caller.caller_id))
+        elif reserved is None and outcome[0] == 1:
+            self.mirror.delete(write.key)
+            self.enactor.carry_out(self.graph.parameter_deleted(write.key))
+
+    async def _make(self, calls: list[Wanted]) -> list[Answer | Exception]:
+        """The outcomes of the calls, made as one if they are several."""
+        if not calls:
+            return []
+        try:
+            if len(calls) == 1:
+                method, params = calls[0]
+                return [await self.rosmaster.call(method, *params)]
+            return list[Answer | Exception](await self.rosmaster.call_in_order(calls))
+        except EncodingError as error:
+            if len(calls) == 1:
+                return [error]
+            return [outcome for call in calls for outcome in await self._make([call])]  # nothing was sent yet
+        except CallFailedError as error:
+            return [error] * len(calls)
+
+
+def _wanted(write: Write) -> Wanted:
+    if write.value is None:
+        return "deleteParam", (write.caller.caller_id, write.key)
+    return "setParam", (write.caller.caller_id, write.key, write.value)
+
+
+def _is_set(answer: Answer, write: Write) -> bool:
+    """Whether ROSMaster has a value now, by its answer to `setParam`.
+
+    It has it before it looks whom to tell, and answers with an error when that fails (a name like `a/b` in a
+    dictionary, and somebody who subscribed to what it looks like). What it does not take is a root that is none.
+    """
+    return answer[0] == 1 or write.key != "/" or isinstance(write.value, dict)
+
+
+_CALL = "searchParam"
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterSearch:
+    """Finds parameters."""
+
+    rosmaster: RosMaster
+    mirror: ParameterMirror
+    rights: ParameterRights
+
+    async def search_param(self, caller: Caller, key: str) -> Answer:
+        """`searchParam(caller_id, key)`: the name that is found is one the host may read."""
+        if caller.own or not caller.caller_id:
+            return await self.rosmaster.call(_CALL, caller.caller_id, key)
+        places = {name: self.rights.to_find(caller, name) for name in _places(key, caller.caller_id)}
+        hidden = [name for name, decision in places.items() if not decision.allowed]
+        if key.startswith("/") and hidden:
+            return [0, self.rights.recorded(caller, _CALL, hidden[0], places[hidden[0]]), ""]
+        answer = await self.rosmaster.call(_CALL, caller.caller_id, key)
+        found = _found(answer)
+        if found in hidden:
+            found = self._next_readable(key, places, found)
+            answer = [1, f"Found [{found}]", found] if found is not None else [-1, "", ""]
+        if found is not None and places[found].would_deny:
+            self.rights.recorded(caller, _CALL, found, places[found])
+        if answer[0] != 1 and hidden:
+            why = self.rights.recorded(caller, _CALL, hidden[0], places[hidden[0]])
+            return [-1, f"Cannot find parameter [{key}] in an upwards search of what may be read: {why}", ""]
+        return answer
+
+    def _next_readable(self, key: str, places: dict[str, Decision], hidden: str) -> str | None:
+        """The name that would have been found if nothing were at those that may not be read."""
+        levels = len([part for part in key.split("/") if part])
+        names = list(places)
+        for name in names[names.index(hidden) + 1 :]:
+            # It is enough that the key's first part is there.
+            first = "/".join(name.split("/")[: -levels + 1 or None])
+            if places[name].allowed and standing_at(self.mirror.tree, first)[0] is not None:
+                return name
+        return None
+
+
+def _places(key: str, caller_id: str) -> list[str]:
+    """The names that ROSMaster may answer with, in its order."""
+    if key.startswith("/"):
+        return [resolve_parameter(key, caller_id)]
+    namespace = [part for part in caller_id.split("/") if part]
+    rest = [part for part in key.split("/") if part]
+    return ["/" + "/".join(namespace[:depth] + rest) for depth in range(len(namespace), -1, -1)]
+
+
+def _found(answer: Answer) -> str | None:
+    if answer[0] != 1 or not isinstance(answer[2], str):
+        return None
+    return "/" + "/".join(part for part in answer[2].split("/") if part)

@@ -1,0 +1,158 @@
+"""Calls from the appliance to nodes that come from a master: each node has a queue of its own, in order.
+
+A node that is slow or gone delays nobody else; ROSMaster's threads are answered before a node is called. Several
+lists of publishers for one topic are all delivered, because roscpp must see a removal before the addition that
+follows it. A call that fails is tried again a few times; then it is dropped, and `troubled` hears of it: the node is
+looked at, and told what it has missed when it answers (`Liveness.missed`).
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import structlog
+
+from appliance.master.endpoints.node_api import NodeApi
+from appliance.master.graph.effects import NodeCall
+from appliance.master.graph.registry import Incarnation
+from appliance.policy.model import Address
+from appliance.quotas.pool import Bounds, Pool, Standing
+from appliance.quotas.table import NODE_CALLS_UNDER_WAY, QUEUED_NODE_CALLS
+from appliance.rpc.fair_queue import Turns
+from appliance.rpc.xmlrpc_client import CallFailedError
+from roswire.xmlrpc import FaultReceived
+
+_log = structlog.get_logger()
+MASTER_NAME = "/master"
+
+
+@dataclass(slots=True)
+class _Queue:
+    """What waits for one node, each call with its weight, and their sum."""
+
+    incarnation: Incarnation
+    calls: deque[tuple[NodeCall, int]] = field(default_factory=deque)
+    weight: int = 0
+
+    def put(self, call: NodeCall, weight: int) -> None:
+        self.calls.append((call, weight))
+        self.weight += weight
+
+    def take(self) -> tuple[NodeCall, int]:
+        call, weight = self.calls.popleft()
+        self.weight -= weight
+        return call, weight
+
+
+class Delivery:
+    """The queues. `troubled(incarnation, call, why)` hears of a call that is lost.
+
+    A queue holds at most `bound` calls, those of a host and all together what `queued` says in bytes: beyond, the
+    oldest go, of the queue that has most: of the host's own, or of the host that has most where all are too much.
+    Hosts take turns at `at_once` calls: nodes of one that answer nothing delay no call to another's.
+    """
+
+    def __init__(
+        self,
+        nodes: NodeApi,
+        *,
+        troubled: Callable[[Incarnation, NodeCall, str], None],
+        standing: Callable[[Address], Standing],
+        bound: int = 10_000,
+        queued: Bounds = QUEUED_NODE_CALLS.bounds,
+        at_once: Bounds = NODE_CALLS_UNDER_WAY.bounds,
+        tries: int = 4,
+    ) -> None:
+        self._nodes = nodes
+        self._troubled = troubled
+        self._bound = bound
+        self._held: Pool[Address] = Pool(
+            "bytes of calls that wait for nodes",
+            queued,
+            lambda _host: Standing.REGISTERED,  # nobody else is told anything
+        )
+        self._turns = Turns(at_once, standing)
+        self._tries = tries
+        self._queues: dict[str, _Queue] = {}
+        self._workers: dict[str, asyncio.Task[None]] = {}
+
+    @property
+    def waiting(self) -> int:
+        """How many calls wait, for all nodes together."""
+        return sum(len(queue.calls) for queue in self._queues.values())
+
+    @property
+    def weight(self) -> int:
+        """About how many bytes they take."""
+        return self._held.total
+
+    def push(self, incarnation: Incarnation, call: NodeCall) -> None:
+        """Queue a call for a node."""
+        queue = self._queues.setdefault(incarnation.key, _Queue(incarnation))
+        weight = call.weight
+        queue.put(call, weight)
+        self._held.charge(incarnation.host, weight)
+        if len(queue.calls) > self._bound:
+            self._lose(queue, f"more than {self._bound} calls wait for it")
+        while why := self._held.refusal(incarnation.host, 0):
+            self._lose(self._heaviest(incarnation.host), why)
+        if incarnation.key not in self._workers:
+            worker = asyncio.get_running_loop().create_task(self._work(incarnation))
+            self._workers[incarnation.key] = worker
+
+    def drop(self, incarnation: Incarnation) -> None:
+        """Forget what waits for a node."""
+        queue = self._queues.pop(incarnation.key, None)
+        if queue is not None:
+            self._held.give_back(incarnation.host, queue.weight)
+
+    def _heaviest(self, host: Address) -> _Queue:
+        """The queue that makes room: of this host when it is beyond its own share, else of the host that has most."""
+        if self._held.held(host) <= self._held.bounds.host:
+            host, _ = max(self._held.holders(), key=lambda holder: holder[1])
+        queues = (queue for queue in self._queues.values() if queue.incarnation.host == host)
+        return max(queues, key=lambda queue: queue.weight)
+
+    def _lose(self, queue: _Queue, why: str) -> None:
+        self._troubled(queue.incarnation, self._take(queue), f"{why}; the oldest was dropped")
+
+    def _take(self, queue: _Queue) -> NodeCall:
+        call, weight = queue.take()
+        self._held.give_back(queue.incarnation.host, weight)
+        return call
+
+    def close(self) -> None:
+        """Stop delivering."""
+        for worker in self._workers.values():
+            worker.cancel()
+
+    async def _work(self, incarnation: Incarnation) -> None:
+        try:
+            while (queue := self._queues.get(incarnation.key)) is not None and queue.calls:
+                await self._deliver(incarnation, self._take(queue))
+            self._queues.pop(incarnation.key, None)
+        finally:
+            self._workers.pop(incarnation.key, None)
+
+    async def _deliver(self, incarnation: Incarnation, call: NodeCall) -> None:
+        pause = 0.1
+        for attempt in range(self._tries):
+            await self._turns.enter(incarnation.host)
+            try:
+                await self._nodes.call(incarnation, call.method, MASTER_NAME, *call.parameters)
+            except CallFailedError as error:
+                failure, heard = str(error), isinstance(error.__cause__, FaultReceived)
+                if call.method == "shutdown":
+                    return  # a node told to shut down often dies before it answers, or was dead: that is success
+            else:
+                return
+            finally:
+                self._turns.leave(incarnation.host)
+            if attempt + 1 < self._tries:
+                await asyncio.sleep(pause)
+                pause *= 3
+        if heard:
+            _log.info("a node refused what it was told", node=incarnation.name, call=call.method, why=failure)
+        else:
+            self._troubled(incarnation, call, failure)

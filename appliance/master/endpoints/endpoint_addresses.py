@@ -1,0 +1,246 @@
+"""Where an incarnation is found: its outer face's port, its relay port, the sockets that listen there, and the address.
+
+Control opens every listening socket and gives the supervisor a duplicate to keep, so that neither control's death
+nor the relay's closes a port; a restarted control gets them back by name.
+
+Ports come from the policy's `[Ports]` range, for each incarnation one and another for every relay process, the longest
+unused first: a subscriber that still knocks at a dead node's port finds nobody, not somebody else. A host gets no more
+once it has `_TIMES_THE_REST` times what is left for all others: one alone has three quarters of the range, and the next
+finds the same part of the rest. Hosts that the policy names as one network count as one, so that nobody gains by many
+addresses.
+"""
+
+import asyncio
+import errno
+import socket as sockets
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterable, Sequence
+
+import structlog
+
+from appliance.master.graph.registry import Incarnation
+from appliance.policy.host_sets import Network
+from appliance.policy.model import Address
+from appliance.quotas.pool import Pool, Standing
+from appliance.quotas.table import NODE_PORTS
+from appliance.rpc.front import plain_address
+from appliance.rpc.server import Peer, listen
+
+_TIMES_THE_REST = 3
+
+
+class NoPortError(Exception):
+    """Every port of the range is in use; the text says what to change."""
+
+
+class Places:
+    """The listening sockets of all incarnations.
+
+    `keep(name, socket)` and `drop(name)` tell the supervisor; `host` is the address RVMaster listens on;
+    `named_as(address)` is by what the policy in force names a host.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        ports: range,
+        *,
+        keep: Callable[[str, sockets.socket], None],
+        drop: Callable[[str], None],
+        named_as: Callable[[Address], Network],
+        relays: int = 1,
+    ) -> None:
+        self._each = 1 + relays
+        self._host = host
+        self._keep = keep
+        self._drop = drop
+        self._range = ports
+        self.unused = deque(ports)
+        self._sockets: dict[str, sockets.socket] = {}
+        self._named_as = named_as
+        self._owners: dict[int, tuple[Address, Network]] = {}  # of each port, and as whose it counts
+        self.taken = self._counted()
+
+    def policy_changed(self, ports: range) -> None:
+        """Take new ports from this range from now on, those in use stay; hosts may be named otherwise, too."""
+        if ports != self._range:
+            self._range = ports
+            used = {socket.getsockname()[1] for socket in self._sockets.values()}
+            self.unused = deque(port for port in ports if port not in used)
+        self.taken = self._counted()
+
+    def _counted(self) -> Pool[Network]:
+        whole = len(self._range)
+        bounds = NODE_PORTS.bounds.sized(whole, whole * _TIMES_THE_REST // (_TIMES_THE_REST + 1))
+        pool: Pool[Network] = Pool("ports", bounds, lambda _named: Standing.REGISTERED)
+        self._owners = {port: (host, self._named_as(host)) for port, (host, _named) in self._owners.items()}
+        for _host, named in self._owners.values():
+            pool.charge(named)
+        return pool
+
+    def _own(self, ports: Iterable[int], host: Address) -> None:
+        named = self._named_as(host)
+        for port in ports:
+            self._owners[port] = host, named
+            self.taken.charge(named)
+
+    def open(self, host: Address) -> tuple[int, ...]:
+        """Reserve ports with listening sockets for a node of this host: (outer, one for each relay).
+
+        Raises `NoPortError`.
+        """
+        named = self._named_as(host)
+        held, left = self.taken.held(named), len(self.unused)
+        if left and held >= _TIMES_THE_REST * left:
+            who = named if named.num_addresses > 1 else host
+            raise NoPortError(
+                f"{who} has {held} ports ({self._each} per node), and {left} are left for all other hosts: a host may"
+                f" have {_TIMES_THE_REST} times as many as are left; widen [Ports] range"
+            )
+        opened = self._open(self._each)
+        self._own(opened, host)
+        return opened
+
+    def _open(self, count: int) -> tuple[int, ...]:
+        opened: list[sockets.socket] = []
+        try:
+            while len(opened) < count:
+                opened.append(self.listen())
+        except NoPortError:
+            for sock in opened:
+                self.unused.append(sock.getsockname()[1])
+                sock.close()
+            raise
+        for sock in opened:
+            name = f"port:{sock.getsockname()[1]}"
+            self._sockets[name] = sock
+            self._keep(name, sock)
+        return tuple(sock.getsockname()[1] for sock in opened)
+
+    def socket(self, port: int) -> sockets.socket:
+        """The listening socket of a port that was opened or adopted."""
+        return self._sockets[f"port:{port}"]
+
+    def adopt(self, name: str, sock: sockets.socket) -> None:
+        """Take a kept socket back after a restart of control."""
+        self._sockets[name] = sock
+        port = sock.getsockname()[1]
+        if port in self.unused:
+            self.unused.remove(port)
+
+    def reopen(self, incarnation: Incarnation) -> bool:
+        """Open the same ports again (after a restart of the appliance); False when another process has one.
+
+        If there are more or fewer relays than then, the incarnation has as many ports afterwards.
+        Raises `NoPortError`.
+        """
+        opened: list[sockets.socket] = []
+        for port in incarnation.ports[: self._each]:
+            if f"port:{port}" in self._sockets:
+                continue
+            try:
+                opened.append(listen(self._host, port))
+            except OSError:
+                for sock in opened:
+                    sock.close()
+                return False
+        for sock in opened:
+            name = f"port:{sock.getsockname()[1]}"
+            self.adopt(name, sock)
+            self._keep(name, sock)
+        known = incarnation.more_relay_ports[: self._each - 2]
+        incarnation.more_relay_ports = known + self._open(self._each - 2 - len(known))
+        self._own(incarnation.ports, incarnation.host)
+        return True
+
+    def close(self, incarnation: Incarnation) -> None:
+        """Close its ports; they go to the end of the line."""
+        for port in incarnation.ports:
+            owner = self._owners.pop(port, None)
+            if owner is not None:
+                self.taken.give_back(owner[1])
+            sock = self._sockets.pop(f"port:{port}", None)
+            if sock is None:
+                continue
+            sock.close()
+            self._drop(f"port:{port}")
+            if port in self._range:
+                self.unused.append(port)
+
+    def close_unclaimed(self, claimed: set[int]) -> None:
+        """Close kept sockets that belong to no known incarnation; the next to be opened come after those claimed."""
+        for name, sock in list(self._sockets.items()):
+            port = sock.getsockname()[1]
+            if port not in claimed:
+                del self._sockets[name]
+                sock.close()
+                self._drop(name)
+                if port in self._range:  # it may be from before the range was another
+                    self.unused.append(port)
+        last = max(claimed, default=0)
+        self.unused = deque(sorted(self.unused, key=lambda port: (port <= last, port)))
+
+    def listen(self) -> sockets.socket:
+        """A socket that listens at the next port that is free."""
+        for _ in range(len(self.unused)):
+            port = self.unused.popleft()
+            try:
+                return listen(self._host, port)
+            except OSError as error:
+                self.unused.append(port)
+                if error.errno not in (errno.EADDRINUSE, errno.EACCES):  # another program has it for now
+                    raise NoPortError(
+                        f"port {port} on {self._host} cannot be opened: {error.strerror}"
+                    ) from error
+        raise NoPortError(
+            f"all ports {self._range.start}-{self._range.stop - 1} are in use"
+            f" ({self._each} per node); widen [Ports] range"
+        )
+
+
+_log = structlog.get_logger()
+_ANSWER_SECONDS = 3.0
+
+
+class Addresses:
+    """Which of the appliance's addresses a host is told.
+
+    It is the one the host reached us at; unless `advertise:` names another for its network, or (in a namespace of its
+    own, behind address translation) the machine's address that the host really used.
+
+    `advertised` are (network, address) pairs; `route_to(host)` asks for a translated address, if that can be.
+
+    `listen` is the address that RVMaster, the faces and the relay listen on.
+    """
+
+    def __init__(
+        self,
+        advertised: Sequence[tuple[Network, Address]],
+        route_to: Callable[[str], Awaitable[str | None]] | None,
+        listen: str,
+    ) -> None:
+        address = plain_address(listen)
+        self.listen = None if address.is_unspecified else str(address)
+        self._advertised = advertised
+        self._route_to = route_to
+        self._routes: dict[Address, str | None] = {}
+
+    def told_to(self, peer: Peer) -> str:
+        """The address this peer is told."""
+        for network, address in self._advertised:
+            if peer.host in network:
+                return str(address)
+        # The appliance's own nodes come to a listener of their own, on loopback, where nothing else may be.
+        return self._routes.get(peer.host) or self.listen or peer.local
+
+    async def learn(self, peer: Peer) -> None:
+        """Find out how this peer reaches us, once; to be awaited before `told_to`."""
+        if self._route_to is None or peer.host in self._routes:
+            return
+        if len(self._routes) > 10_000:
+            self._routes.clear()
+        try:
+            async with asyncio.timeout(_ANSWER_SECONDS):
+                self._routes[peer.host] = await self._route_to(peer.text)
+        except TimeoutError:
+            _log.warning("the supervisor does not say how a host reaches us", host=peer.text)

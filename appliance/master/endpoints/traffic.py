@@ -1,0 +1,264 @@
+"""What the relays carry, as they report it: connections, each with its records, and traffic."""
+
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from itertools import zip_longest
+
+import msgspec
+
+from appliance.audit.record import Severity
+from appliance.channel import messages
+from appliance.channel.answers.graph import Flow
+from appliance.channel.messages import TopicTraffic
+from appliance.master.graph.registry import Kind, Registry
+from appliance.policy.rate_limits import LimitRule
+from appliance.store.state_file import PermissionRow
+from appliance.telemetry.audit_trail import AuditTrail
+
+MOST_RESOURCES = 2000
+OTHERS = "(others)"  # no name of ROS has a bracket
+
+_STILL_SECONDS = 3.0  # without a report: nothing flows
+
+
+@dataclass(slots=True)
+class Traffic:
+    """Counters of one relayed topic or service of one incarnation, since control started."""
+
+    messages: int = 0
+    bytes: int = 0
+    dropped: int = 0
+    seconds: float = 0.0  # monotonic, of the last report
+    messages_per_second: float = 0.0  # between the last two reports
+    bytes_per_second: float = 0.0
+    delays: list[int] = field(default_factory=list)  # as `TopicTraffic` has them
+    delay_seconds: float = 0.0
+    delay: float = 0.0  # of a message, on average, in the last report; seconds
+
+    def add(self, row: TopicTraffic, now: float, over: float) -> None:
+        """Count what the relay reported; it reports once a second, and only what changed, in `over` seconds."""
+        self.messages += row.messages
+        self.bytes += row.bytes
+        self.dropped += row.dropped
+        passed = max(now - self.seconds, 1.0) if self.seconds else max(over, 1.0)
+        self.messages_per_second = row.messages / passed
+        self.bytes_per_second = row.bytes / passed
+        self.seconds = now
+        if row.delays:
+            self.delays = [a + b for a, b in zip_longest(self.delays, row.delays, fillvalue=0)]
+            self.delay_seconds += row.delay_seconds
+        self.delay = row.delay_seconds / sum(row.delays) if row.delays else 0.0
+
+    def include(self, other: "Traffic") -> None:
+        """Count what another has counted, too."""
+        self.messages += other.messages
+        self.bytes += other.bytes
+        self.dropped += other.dropped
+        self.delays = [a + b for a, b in zip_longest(self.delays, other.delays, fillvalue=0)]
+        self.delay_seconds += other.delay_seconds
+
+
+class Carried:
+    """Connections and traffic of all relays, of which there are `relays`."""
+
+    def __init__(self, trail: AuditTrail, registry: Registry, relays: int) -> None:
+        self._trail = trail
+        self._registry = registry
+        self._relays = relays
+        self.connections: dict[tuple[int, int], messages.ConnectionOpened] = {}
+        """By relay and its own number of them; the `number` in each is unique among all relays."""
+        self.traffic: dict[tuple[str, str], Traffic] = {}
+        self.limited_messages: Counter[tuple[str, str]] = Counter()
+        """How many messages limits dropped, by topic and whose limit it was; of at most `MOST_RESOURCES` topics."""
+        self._limited_topics: set[str] = set()
+        self.memory: dict[int, dict[str, int]] = {}
+        """The bytes that each relay holds, by what they are."""
+        self.past: dict[str, Traffic] = {}
+        """What went through topics and services of incarnations that are forgotten: counters never go back.
+
+        Of at most `MOST_RESOURCES`; the rest is under `OTHERS`.
+        """
+
+    def used(self) -> set[PermissionRow]:
+        """The grants that somebody is connected by."""
+        return {
+            PermissionRow(
+                connection.key, connection.kind, connection.resource, connection.host, connection.caller_id
+            )
+            for connection in self.connections.values()
+        }
+
+    @property
+    def total(self) -> Traffic:
+        """What went through everything, forgotten incarnations included."""
+        total = Traffic()
+        for traffic in (*self.past.values(), *self.traffic.values()):
+            total.include(traffic)
+        return total
+
+    def flow(self, key: str, resource: str) -> Flow:
+        """What went and goes through a topic or service of an incarnation."""
+        traffic = self.traffic.get((key, resource), Traffic())
+        flows = time.monotonic() - traffic.seconds < _STILL_SECONDS
+        return Flow(
+            messages=traffic.messages,
+            bytes=traffic.bytes,
+            dropped=traffic.dropped,
+            messages_per_second=round(traffic.messages_per_second, 2) if flows else 0.0,
+            bytes_per_second=round(traffic.bytes_per_second, 1) if flows else 0.0,
+            delay_seconds=round(traffic.delay, 6) if flows else 0.0,
+        )
+
+    def lost(self, relay: int) -> None:
+        """A relay is gone, and its connections and memory with it."""
+        self.memory.pop(relay, None)
+        for number in [connection for connection in self.connections if connection[0] == relay]:
+            del self.connections[number]
+
+    def forgotten(self, key: str) -> None:
+        """An incarnation is gone for good."""
+        for carried in [carried for carried in self.traffic if carried[0] == key]:
+            name = carried[1] if carried[1] in self.past or len(self.past) < MOST_RESOURCES else OTHERS
+            self.past.setdefault(name, Traffic()).include(self.traffic.pop(carried))
+
+    def reported(self, rows: list[TopicTraffic], over: float = 1.0) -> None:
+        """A relay's counters; the last words about a node that is forgotten count for nothing."""
+        now = time.monotonic()
+        for row in rows:
+            if self._registry.by_key(row.key) is not None:
+                self.traffic.setdefault((row.key, row.resource), Traffic()).add(row, now, over)
+
+    def unrecorded(self, connections: int) -> None:
+        """So many connections came and went while a relay had no control."""
+        if connections:
+            self._trail.happened(
+                "records lost",
+                f"{connections} connections through a relay ended unrecorded while it had no control",
+                lost=connections,
+            )
+
+    def opened(self, relay: int, message: messages.ConnectionOpened) -> None:
+        """Somebody is connected."""
+        number = message.number * self._relays + relay
+        self.connections[relay, message.number] = msgspec.structs.replace(message, number=number)
+        name = self._name(message.key)
+        self._trail.happened(
+            "connection opened",
+            f"{message.caller_id} ({message.host}) is connected to {message.resource} of {name}",
+            host=message.host,
+            caller_id=message.caller_id,
+            category=message.kind,
+            resource=message.resource,
+            node=name,
+        )
+
+    def closed(self, relay: int, message: messages.ConnectionClosed) -> None:
+        """A connection has ended."""
+        connection = self.connections.pop((relay, message.number), None)
+        if connection is None:
+            return
+        self._trail.happened(
+            "connection closed",
+            message.reason or "closed in an orderly way",
+            host=connection.host,
+            caller_id=connection.caller_id,
+            category=connection.kind,
+            resource=connection.resource,
+            node=self._name(connection.key),
+        )
+
+    def refused(self, message: messages.ConnectionRefused) -> None:
+        """Somebody was turned away; our own node that comes too late for what it may have attacks nobody."""
+        own = self._is_own(message.host, message.caller_id, message.resource)
+        self._trail.happened(
+            "connection refused",
+            message.reason,
+            severity=Severity.INFO if own else Severity.WARNING,
+            decision=None if own else "deny",
+            host=message.host,
+            caller_id=message.caller_id,
+            category=message.kind or None,
+            resource=message.resource,
+            node=self._name(message.key),
+            count=message.count,
+        )
+
+    def upstream_lost(self, message: messages.UpstreamLost, host: str) -> None:
+        """A publisher at this address is not read any more: recorded if it was cut for what it sent."""
+        if message.violation:
+            self._trail.happened(
+                message.violation,
+                message.reason,
+                severity=Severity.WARNING,
+                decision="deny",
+                host=host,
+                caller_id=self._name(message.key),
+                category="topic",
+                resource=message.topic,
+            )
+
+    def latch_refused(self, message: messages.LatchRefused, host: str) -> None:
+        """A relay does not keep the latched message of a publisher at this address."""
+        self._trail.happened(
+            "limit exceeded",
+            "its latched message is not kept for later subscribers: its host has no memory left for such in the relay",
+            severity=Severity.ALARM,
+            decision="deny",
+            host=host,
+            caller_id=self._name(message.key),
+            category="topic",
+            resource=message.topic,
+            size=message.size,
+        )
+
+    def limited(self, row: messages.LimitedRow, rule: LimitRule | None) -> None:
+        """A relay dropped messages that were beyond a limit of the policy (`rule`, unless that has gone meanwhile)."""
+        topic = row.topic or OTHERS
+        known = topic in self._limited_topics or len(self._limited_topics) < MOST_RESOURCES
+        self._limited_topics.add(name := topic if known else OTHERS)
+        self.limited_messages[name, row.part] += row.messages
+        whose = {
+            "publisher": "the publishers of a host may send",
+            "subscriber": "a subscriber gets",
+            "topic": "all publishers together may send",
+        }[row.part]
+        self._trail.happened(
+            "rate limited",
+            f"messages beyond what {whose} were dropped",
+            severity=Severity.INFO if row.part == "subscriber" else Severity.WARNING,
+            host=row.host or None,
+            caller_id=row.caller_id or None,
+            category="topic",
+            resource=row.topic,
+            rule=rule.rule if rule is not None else None,
+            part=row.part,
+            publisher=self._name(row.key),
+            count=row.messages,
+            bytes=row.bytes,
+        )
+
+    def publication_refused(self, message: messages.PublicationRefused) -> None:
+        """A publisher is not carried."""
+        self._trail.happened(
+            "publication refused",
+            message.reason,
+            decision="deny",
+            caller_id=self._name(message.key),
+            category="monitor",
+            resource=message.resource,
+        )
+
+    def _name(self, key: str) -> str:
+        node = self._registry.by_key(key)
+        return node.name if node is not None else ""
+
+    def _is_own(self, host: str, caller_id: str, topic: str) -> bool:
+        """Whether this is the appliance's own node, which reaches the relay from where it is told to."""
+        holder = self._registry.holder(caller_id)
+        return (
+            holder is not None
+            and holder.own
+            and host in (str(holder.host), holder.told)
+            and (Kind.SUBSCRIPTION, topic) in holder.registrations
+        )

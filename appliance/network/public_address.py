@@ -1,0 +1,74 @@
+"""Where hosts of other networks reach this machine, as far as the machine itself can tell.
+
+What is in front of it (address translation, published ports of a container) it cannot see: whoever shows an address
+found here says why it was taken, so that a person can name another.
+"""
+
+import ipaddress
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from appliance.network import interfaces
+from appliance.network.namespaces import Namespace, NetworkError
+
+_VERSIONS = (4, 6)  # IPv4 first, which every ROS 1 host has
+
+
+@dataclass(frozen=True)
+class Endpoint:
+    """An address at which other hosts reach this machine; `reason`: why it is taken for that."""
+
+    address: str
+    reason: str
+
+
+def outward_address(namespace: Namespace, *, without: Sequence[str]) -> Endpoint:
+    """The address towards the default route; without such a route, the only address.
+
+    Interfaces `without` do not count. Raises: NetworkError when there is no such address, or several.
+    """
+    for version in _VERSIONS:
+        route = interfaces.default_route(namespace, version)
+        if route is None or route.interface in without:
+            continue
+        address = route.source or _first(namespace, route, version)
+        if address is not None and _counts(address):
+            return Endpoint(address, "this machine's address towards its default route")
+    return only_address(namespace, without=without)
+
+
+def only_address(namespace: Namespace, *, without: Sequence[str]) -> Endpoint:
+    """The only IPv4 address of all interfaces but those `without`; if there is none, the only IPv6 address.
+
+    Raises: NetworkError when there is none at all, or there are several.
+    """
+    held = interfaces.addresses_by_interface(namespace)
+    own = [text.partition("/")[0] for name, texts in held.items() if name not in without for text in texts]
+    found = sorted(
+        {ipaddress.ip_address(text) for text in own if _counts(text)},
+        key=lambda address: (address.version, address),
+    )
+    for version in _VERSIONS:
+        of_it = [str(address) for address in found if address.version == version]
+        if len(of_it) == 1:
+            return Endpoint(of_it[0], "the only address here")
+        if of_it:
+            raise NetworkError(f"there are several addresses here ({', '.join(of_it)})")
+    raise NetworkError("there is no address here but loopback and link-local ones")
+
+
+def _first(namespace: Namespace, route: interfaces.DefaultRoute, version: int) -> str | None:
+    """The address that packets to the gateway leave with; without a gateway (a modem), the interface's first one."""
+    if route.gateway is not None:
+        return interfaces.source_address_for(namespace, route.gateway)
+    held = interfaces.addresses_by_interface(namespace).get(route.interface, [])
+    own = [text.partition("/")[0] for text in held]
+    return next(
+        (address for address in own if ipaddress.ip_address(address).version == version and _counts(address)),
+        None,
+    )
+
+
+def _counts(text: str) -> bool:
+    address = ipaddress.ip_address(text)
+    return not (address.is_loopback or address.is_link_local)

@@ -1,0 +1,101 @@
+"""Read INI text and keep the place of every word.
+
+Sections `[Name]`, entries `key = value`, comments from `#` or `;` to the end of the line, nothing else: no
+continuation lines, no interpolation, no quotes. What a section or a key means is not known here. (The readers
+at hand, configparser among them, keep no columns, and a policy is refused with the place of each error.)
+"""
+
+import re
+from dataclasses import dataclass, field
+
+from appliance.policy.policy_findings import Findings, quoted
+
+MAXIMUM_CHARACTERS = 2 * 1024 * 1024
+"""The longest policy that is read; one of 10,000 rules has about 600,000 characters."""
+
+_WORD = re.compile(r"[^\s,]+", re.ASCII)
+_COMMENT = re.compile(r"[#;]")
+_FOREIGN = re.compile(r"[^\t\x20-\x7e]")
+
+
+@dataclass(frozen=True, slots=True)
+class Word:
+    """A piece of text and where it begins (line and column count from 1)."""
+
+    text: str
+    line: int
+    column: int
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One line `key = value value …`; the words of the value were separated by blanks or commas."""
+
+    key: Word
+    values: tuple[Word, ...]
+
+
+@dataclass(slots=True)
+class SectionText:
+    """One `[Name]` and the entries below it."""
+
+    name: Word
+    entries: list[Entry] = field(default_factory=list)
+
+
+def read(text: str, findings: Findings) -> list[SectionText]:
+    """The sections in the order of the file; what cannot be read is noted in `findings` and left out."""
+    if len(text) > MAXIMUM_CHARACTERS:
+        findings.error(1, 1, f"the file has {len(text)} characters; the limit is {MAXIMUM_CHARACTERS}")
+        return []
+    sections: list[SectionText] = []
+    for number, raw in enumerate(text.removeprefix("\ufeff").split("\n"), start=1):
+        line = _without_comment(raw.removesuffix("\r"))
+        if not line.strip():
+            continue
+        if foreign := _FOREIGN.search(line):
+            shown = quoted(foreign.group())
+            findings.error(
+                number, foreign.start() + 1, f"unexpected character {shown}: rules are plain ASCII"
+            )
+        elif line.lstrip().startswith("["):
+            _begin_section(line, number, sections, findings)
+        else:
+            _add_entry(line, number, sections, findings)
+        if findings.full:
+            break
+    return sections
+
+
+def _without_comment(line: str) -> str:
+    comment = _COMMENT.search(line)
+    return line[: comment.start()] if comment else line
+
+
+def _begin_section(line: str, number: int, sections: list[SectionText], findings: Findings) -> None:
+    start = line.index("[")
+    inside, bracket, rest = line[start + 1 :].partition("]")
+    name = inside.strip()
+    if not bracket:
+        findings.error(number, start + 1, f'the section {quoted(line.strip())} is not closed: add "]"')
+    elif rest.strip():
+        column = start + 1 + len(inside) + 1 + len(rest) - len(rest.lstrip()) + 1
+        findings.error(number, column, f"unexpected text after the section: {quoted(rest.strip())}")
+    # The section counts even so: its entries are then judged in the right place, not as strays.
+    sections.append(SectionText(Word(name, number, start + 1)))
+
+
+def _add_entry(line: str, number: int, sections: list[SectionText], findings: Findings) -> None:
+    left, equals, right = line.partition("=")
+    column = len(left) - len(left.lstrip()) + 1
+    key = " ".join(left.split())
+    if not equals:
+        findings.error(number, column, f"expected key = value, found {quoted(key)}")
+    elif not key:
+        findings.error(number, column, 'expected a key before "="')
+    elif not sections:
+        findings.error(number, column, f"{quoted(key)} stands before the first section: add one, as [Groups]")
+    else:
+        words = _WORD.finditer(right)
+        values = tuple(Word(m.group(), number, len(left) + 1 + m.start() + 1) for m in words)
+        sections[-1].entries.append(Entry(Word(key, number, column), values))

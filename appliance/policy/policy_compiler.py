@@ -1,0 +1,98 @@
+"""Text in, `Policy` out: reads the file, checks every word, compiles the rules.
+
+All errors are reported at once. A section or value that is wrong is left out and the rest is still checked,
+so that what follows is judged as it would be once the error is mended.
+"""
+
+from collections.abc import Collection, Mapping
+
+from appliance.base.validation_messages import meant, nearest
+from appliance.policy import sections
+from appliance.policy.groups import Groups
+from appliance.policy.host_sets import HostTable, Network
+from appliance.policy.ini_reader import SectionText, read
+from appliance.policy.model import Address, Category
+from appliance.policy.policy import Policy
+from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.policy_lint import lint
+from appliance.policy.rate_limits import read_limits
+from appliance.policy.rules import RuleCompiler
+from appliance.policy.settings import read_monitor, read_options, read_ports
+
+
+def compile_policy(
+    text: str,
+    *,
+    file: str,
+    hosts: Mapping[str, Address] | None = None,
+    robot: Collection[Address | Network] = (),
+) -> Policy:
+    """The policy that `text` says, or `PolicyError` with every error in it.
+
+    `file` names the text in findings and rules. `hosts` maps the names of enrolled hosts to their addresses
+    (`host:NAME`); a name that is not there means no host, and is a warning. `robot` is what the predefined
+    group `robot` holds.
+    """
+    findings = Findings(file)
+    written = _by_name(read(text, findings), findings)
+    table = HostTable()
+    groups = Groups(table, findings, hosts or {}, robot)
+    groups.define(written.get(sections.GROUPS))
+    options = read_options(written.get(sections.OPTIONS), findings)
+    ports = read_ports(written.get(sections.PORTS), findings)
+    monitor = read_monitor(written.get(sections.MONITOR), findings)
+    limits = read_limits(written.get(sections.LIMITS), file, groups, findings)
+    compiler = RuleCompiler(file, groups, findings)
+    present: set[Category] = set()
+    for decider in sections.DECIDERS:
+        section = written.get(decider.name)
+        if section is not None:
+            compiler.add_section(decider, section)
+            present.update(decider.categories)
+        for category in decider.categories:
+            compiler.tables[category].audit_only = decider.name in options.audit_only
+    findings.raise_errors()
+    lint(compiler.tables, present, written, groups=groups, hosts=table, findings=findings)
+    named = {atom for rules in compiler.tables.values() for rule in rules.rules for atom in rule.atoms}
+    return Policy(
+        text=text,
+        file=file,
+        warnings=tuple(sorted(findings.warnings)),
+        hosts=table,
+        named=frozenset(named),
+        tables=compiler.tables,
+        present=frozenset(present),
+        ports=ports,
+        monitored_topics=monitor.topics,
+        monitored_services=monitor.services,
+        limits=limits,
+        takeover=options.takeover,
+        tell=options.tell,
+        enrolled=dict(hosts or {}),
+        robot=groups.robot,
+    )
+
+
+def _by_name(found: list[SectionText], findings: Findings) -> dict[str, SectionText]:
+    """Sections by the name in the documentation; unknown and repeated ones are errors."""
+    by_fold = {name.casefold(): name for name in sections.NAMES}
+    there = {section.name.text.casefold() for section in found}
+    by_name: dict[str, SectionText] = {}
+    for section in found:
+        place = section.name
+        name = by_fold.get(place.text.casefold())
+        if name is None:
+            guess = meant(place.text, sections.NAMES)
+            known = "" if guess else f"; sections are {', '.join(sections.NAMES)}"
+            findings.error(place.line, place.column, f"unknown section {quoted(place.text)}{guess}{known}")
+            name = nearest(place.text, sections.NAMES)
+            if name is not None and name.casefold() not in there:
+                by_name.setdefault(name, section)  # read as what was meant, so that one slip is one error
+        elif name in by_name:
+            first = by_name[name]
+            text = f"the section [{name}] stands already at line {first.name.line}: put its lines there"
+            findings.error(place.line, place.column, text)
+            first.entries.extend(section.entries)
+        else:
+            by_name[name] = section
+    return by_name

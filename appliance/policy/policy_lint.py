@@ -1,0 +1,127 @@
+"""What is allowed in a policy and still most likely not meant: warnings, never silent, never refusing."""
+
+import bisect
+import ipaddress
+from collections.abc import Mapping
+
+from appliance.policy import sections
+from appliance.policy.commands import STARTING_COMMANDS
+from appliance.policy.groups import Groups
+from appliance.policy.host_sets import EVERYONE, Atom, HostTable, Network
+from appliance.policy.ini_reader import SectionText
+from appliance.policy.model import Category
+from appliance.policy.policy import CompiledRule, RuleTable
+from appliance.policy.policy_findings import Findings, quoted
+
+Tables = Mapping[Category, RuleTable]
+_NODE_CATEGORIES = (Category.PUBLISH, Category.SUBSCRIBE, Category.OFFER)
+
+
+def lint(
+    tables: Tables,
+    present: set[Category],
+    written: Mapping[str, SectionText],
+    *,
+    groups: Groups,
+    hosts: HostTable,
+    findings: Findings,
+) -> None:
+    """Note every warning about a policy without errors."""
+    _shadowed_defaults(tables, findings)
+    _dead_rules(tables, hosts, findings)
+    _nodes_that_cannot_start(tables, present, written, findings)
+    _unused_groups(groups, findings)
+    _missing_sections(present, findings)
+
+
+def _shadowed_defaults(tables: Tables, findings: Findings) -> None:
+    for table in tables.values():
+        everything = [r for r in table.rules if r.key and r.key.text == "/**"]
+        if everything and table.default:
+            line = everything[0].rule.line
+            text = f"never decides: {everything[0].rule.key} at line {line} matches every name before it"
+            findings.warn(table.default.rule.line, table.default.column, text)
+
+
+def _dead_rules(tables: Tables, table: HostTable, findings: Findings) -> None:
+    """Rules that let a host publish, subscribe or offer although it may not use any node name."""
+    named = {atom for rule in tables[Category.NODE].rules for atom in rule.atoms}
+    if EVERYONE in named:
+        return
+    nameless = _nameless(named, table)
+    seen: dict[Network, tuple[CompiledRule, int]] = {}
+    for rule in (rule for category in _NODE_CATEGORIES for rule in tables[category].rules):
+        for host in {nameless[atom] for atom in rule.atoms if atom in nameless}:
+            first, count = seen.get(host, (rule, 0))
+            seen[host] = (first, count + 1)
+    for host, (rule, count) in seen.items():
+        shown = str(host).removesuffix("/32").removesuffix("/128")
+        more = f" ({count} rules)" if count > 1 else ""
+        text = f"{shown} may use no node name ([Nodes]), so what {rule.rule.key} grants it is dead{more}"
+        findings.warn(rule.rule.line, rule.column, text)
+
+
+def _nameless(named: set[Atom], table: HostTable) -> dict[Atom, Network]:
+    """For each atom that holds a network without any overlap with `[Nodes]`: one such network."""
+    networks = table.networks()
+    nodes = [network for network, atom in networks.items() if not named.isdisjoint(table.above([atom]))]
+    overlap = _Overlap(nodes)
+    nameless: dict[Atom, Network] = {}
+    for network, atom in networks.items():
+        if not overlap.any(network):
+            waiting = [atom]
+            while waiting:
+                holder = waiting.pop()
+                if holder not in nameless:
+                    nameless[holder] = network
+                    waiting.extend(table.parents(holder))
+    return nameless
+
+
+class _Overlap:
+    """Answers whether a network shares an address with any of a set of networks."""
+
+    def __init__(self, networks: list[Network]) -> None:
+        self._starts: dict[int, list[int]] = {}
+        self._ends: dict[int, list[int]] = {}
+        v4 = [network for network in networks if isinstance(network, ipaddress.IPv4Network)]
+        v6 = [network for network in networks if isinstance(network, ipaddress.IPv6Network)]
+        whole: list[Network] = [*ipaddress.collapse_addresses(v4), *ipaddress.collapse_addresses(v6)]
+        for network in whole:
+            self._starts.setdefault(network.version, []).append(int(network.network_address))
+            self._ends.setdefault(network.version, []).append(int(network.broadcast_address))
+
+    def any(self, network: Network) -> bool:
+        """Whether an address of the network is in the set."""
+        starts = self._starts.get(network.version, [])
+        before = bisect.bisect_right(starts, int(network.broadcast_address)) - 1
+        return before >= 0 and self._ends[network.version][before] >= int(network.network_address)
+
+
+def _nodes_that_cannot_start(
+    tables: Tables, present: set[Category], written: Mapping[str, SectionText], findings: Findings
+) -> None:
+    """Commands that every node needs and nobody is granted."""
+    if Category.COMMAND not in present:
+        return
+    table = tables[Category.COMMAND]
+    place = written["Commands"].name
+    for command in STARTING_COMMANDS:
+        rule = table.tree.find(command) or table.default
+        if rule is None or not rule.atoms:
+            line, column = (rule.rule.line, rule.column) if rule else (place.line, place.column)
+            text = f"{command} is granted to nobody, and a node needs it: {STARTING_COMMANDS[command]}"
+            findings.warn(line, column, text)
+
+
+def _unused_groups(groups: Groups, findings: Findings) -> None:
+    for name, group in groups.groups.items():
+        if not group.used and group.word is not None:
+            findings.warn(group.word.line, group.word.column, f"the group {quoted(name)} is used nowhere")
+
+
+def _missing_sections(present: set[Category], findings: Findings) -> None:
+    """Missing sections that make the whole policy grant nothing a node can use."""
+    for decider in sections.DECIDERS:
+        if not decider.extension and decider.categories[0] not in present:
+            findings.warn(1, 1, f"there is no [{decider.name}] section: what it would grant is denied to all")

@@ -1,0 +1,243 @@
+"""`[Limits]`: how many messages, and how many bytes, may pass in a second.
+
+    /camera/** = publisher 30 Hz 10 MB/s, subscriber tablet 5 Hz
+    /scan      = publisher guests 20 Hz, topic 100 Hz 2 MB/s
+
+`publisher` limits the publishers of the topic on each host together, `subscriber` each subscriber, `topic` all
+publishers together, which share it fairly by host. Hosts may follow the first two words: then only nodes there are
+limited. As in every section the most specific key speaks
+alone; of its clauses that mean a host the strictest counts. A limit says how much of what is allowed may pass; it
+decides no request.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+
+from appliance.base.validation_messages import meant
+from appliance.policy.groups import Groups
+from appliance.policy.host_sets import Atom
+from appliance.policy.ini_reader import Entry, SectionText, Word
+from appliance.policy.keys import BadKeyError, Key, parse_key
+from appliance.policy.model import Rule
+from appliance.policy.name_tree import KeyTree
+from appliance.policy.policy_findings import Findings, quoted
+from appliance.policy.sections import DEFAULT, LIMITS
+
+
+class Part(StrEnum):
+    """Whose messages a limit counts together."""
+
+    PUBLISHER = "publisher"
+    SUBSCRIBER = "subscriber"
+    TOPIC = "topic"
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """What may pass in a second; 0 is without a limit."""
+
+    messages: float = 0.0
+    bytes: float = 0.0
+
+    def __bool__(self) -> bool:
+        return self.messages > 0 or self.bytes > 0
+
+    def __str__(self) -> str:
+        """`30 Hz, 10 MB/s`; `no limit`."""
+        parts = [f"{self.messages:g} Hz"] if self.messages else []
+        if self.bytes:
+            unit = next(unit for unit in reversed(_BYTES) if self.bytes >= _BYTES[unit] or unit == "B/s")
+            parts.append(f"{self.bytes / _BYTES[unit]:g} {unit}")
+        return ", ".join(parts) or "no limit"
+
+    def strictest(self, other: "Rate") -> "Rate":
+        """The lower of each."""
+        return Rate(_lower(self.messages, other.messages), _lower(self.bytes, other.bytes))
+
+
+NO_LIMIT = Rate()
+_PARTS = frozenset(part.value for part in Part)
+_BYTES = {"B/s": 1.0, "kB/s": 1e3, "MB/s": 1e6, "GB/s": 1e9}
+_UNITS = {"Hz": 1.0, **_BYTES}
+_FOLDED = {unit.casefold(): unit for unit in _UNITS}
+_NUMBER = re.compile(r"([0-9]+(?:\.[0-9]+)?)([A-Za-z/]*)", re.ASCII)
+_LEAST, _MOST = 1e-3, 1e12
+_LINES = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Clause:
+    """One limit of a line: of the nodes on hosts with one of these atoms (None: on every host)."""
+
+    part: Part
+    atoms: frozenset[Atom] | None
+    rate: Rate
+
+
+@dataclass(frozen=True, slots=True)
+class LimitRule:
+    """One line of `[Limits]`; `key` is None for `default`."""
+
+    rule: Rule
+    key: Key | None
+    clauses: tuple[Clause, ...]
+
+    def rate(self, part: Part, atoms: frozenset[Atom]) -> Rate:
+        """The strictest of the clauses that mean this part of a host with these atoms."""
+        rate = NO_LIMIT
+        for clause in self.clauses:
+            if clause.part is part and (clause.atoms is None or not clause.atoms.isdisjoint(atoms)):
+                rate = rate.strictest(clause.rate)
+        return rate
+
+
+class LimitTable:
+    """The lines of `[Limits]`."""
+
+    def __init__(self) -> None:
+        self.rules: list[LimitRule] = []
+        self._tree: KeyTree[LimitRule] = KeyTree()
+        self._default: LimitRule | None = None
+
+    def add(self, rule: LimitRule) -> None:
+        """Put a line in."""
+        self.rules.append(rule)
+        if rule.key is None:
+            self._default = rule
+        else:
+            self._tree.add(rule.key, rule)
+
+    def find(self, topic: str) -> LimitRule | None:
+        """The line that speaks of a topic."""
+        return (self._tree.find(topic) or self._default) if self.rules else None
+
+
+def read_limits(section: SectionText | None, file: str, groups: Groups, findings: Findings) -> LimitTable:
+    """The lines of the section; what is wrong with them is noted in `findings` and left out."""
+    table = LimitTable()
+    first_lines: dict[str, int] = {}
+    patterns: list[tuple[Key, int]] = []
+    for entry in section.entries if section is not None else ():
+        if findings.full:
+            break
+        word = entry.key
+        if len(first_lines) >= _LINES:
+            findings.error(word.line, word.column, f"more than {_LINES} limits: use patterns, as /camera/**")
+            break
+        first = first_lines.setdefault(word.text, word.line)
+        if first != word.line:
+            text = f"the key {quoted(word.text)} stands already at line {first}: put its limits there"
+            findings.error(word.line, word.column, text)
+            continue
+        key = _key(word, patterns, findings)
+        clauses = tuple(_clauses(entry, groups, findings))
+        if clauses and (key is not None or word.text == DEFAULT):
+            table.add(LimitRule(Rule(LIMITS, word.text, file, word.line), key, clauses))
+    _warn_of_shadowed_default(table, first_lines, findings)
+    return table
+
+
+def _key(word: Word, patterns: list[tuple[Key, int]], findings: Findings) -> Key | None:
+    """The parsed key; None for `default` and (with an error noted) for a bad one."""
+    if word.text == DEFAULT:
+        return None
+    try:
+        key = parse_key(word.text, parameter=False)
+    except BadKeyError as fault:
+        findings.error(word.line, word.column, f"{quoted(word.text)}: {fault}")
+        return None
+    if not key.exact:
+        for other, line in patterns:
+            if key.ties_with(other):
+                text = f"{quoted(word.text)} and {quoted(other.text)} (line {line}) are equally specific and match the"
+                findings.error(word.line, word.column, f"{text} same names: change one of them")
+                return None
+        patterns.append((key, word.line))
+    return key
+
+
+def _clauses(entry: Entry, groups: Groups, findings: Findings) -> Iterator[Clause]:
+    """The clauses of a line: each begins with the word for its part."""
+    parts: list[tuple[Word, list[Word]]] = []
+    for word in entry.values:
+        if word.text in _PARTS:
+            parts.append((word, []))
+        elif parts:
+            parts[-1][1].append(word)
+        else:
+            guess = meant(word.text, _PARTS) or ", as publisher 30 Hz 10 MB/s"
+            text = f"a limit begins with publisher, subscriber or topic, not {quoted(word.text)}{guess}"
+            findings.error(word.line, word.column, text)
+            return
+    if not parts:
+        findings.error(entry.key.line, entry.key.column, "say whose limit it is, as publisher 30 Hz 10 MB/s")
+    for word, words in parts:
+        clause = _clause(word, words, groups, findings)
+        if clause is not None:
+            yield clause
+
+
+def _clause(part: Word, words: list[Word], groups: Groups, findings: Findings) -> Clause | None:
+    hosts = []
+    while words and not _NUMBER.fullmatch(words[0].text):
+        hosts.append(words.pop(0))
+    rate = _rate(part, words, findings)
+    if rate is None:
+        return None
+    if hosts and part.text == Part.TOPIC:
+        text = "topic limits all publishers together: name no hosts, or limit each publisher there"
+        findings.error(hosts[0].line, hosts[0].column, text)
+        return None
+    atoms = frozenset(atom for _, atom in groups.read(hosts)) if hosts else None
+    return Clause(Part(part.text), atoms, rate)
+
+
+def _rate(part: Word, words: list[Word], findings: Findings) -> Rate | None:
+    """Numbers with their units, in one word or in two; None with an error noted."""
+    found: dict[str, float] = {}
+    words = list(words)
+    while words:
+        word = words.pop(0)
+        number = _NUMBER.fullmatch(word.text)
+        if number is None:
+            findings.error(word.line, word.column, f"{quoted(word.text)}: hosts stand before the numbers")
+            return None
+        unit = number[2] or (words.pop(0).text if words else "")
+        fault = _fault(float(number[1]), _FOLDED.get(unit.casefold()), unit, found)
+        if fault:
+            findings.error(word.line, word.column, fault)
+            return None
+        kind = "Hz" if unit.casefold() == "hz" else "B/s"
+        found[kind] = float(number[1]) * _UNITS[_FOLDED[unit.casefold()]]
+    if not found:
+        text = f"how much may pass for each {part.text}? as {part.text} 30 Hz 10 MB/s"
+        findings.error(part.line, part.column, text)
+        return None
+    return Rate(found.get("Hz", 0.0), found.get("B/s", 0.0))
+
+
+def _fault(number: float, known: str | None, unit: str, found: dict[str, float]) -> str:
+    if known is None:
+        guess = meant(unit, list(_UNITS)) if unit else ""
+        return (
+            f"{number:g} {unit}".strip()
+            + f" has no unit of a limit{guess or ': Hz, B/s, kB/s, MB/s or GB/s'}"
+        )
+    if not _LEAST <= number * _UNITS[known] <= _MOST:
+        return f"{number:g} {known} is no limit that can be kept; who may send nothing is left out of [Publishers]"
+    if ("Hz" if known == "Hz" else "B/s") in found:
+        return f"{number:g} {known}: this is limited already; give one number of messages and one of bytes"
+    return ""
+
+
+def _lower(one: float, other: float) -> float:
+    return min(one, other) if one and other else one or other
+
+
+def _warn_of_shadowed_default(table: LimitTable, lines: dict[str, int], findings: Findings) -> None:
+    everything = next((rule for rule in table.rules if rule.key is not None and rule.key.text == "/**"), None)
+    if everything is not None and DEFAULT in lines:
+        text = f"never limits: /** at line {everything.rule.line} matches every name before it"
+        findings.warn(lines[DEFAULT], 1, text)

@@ -1,0 +1,56 @@
+"""Who has waited longest, by what is known of his host: the order in which room is made in a pool."""
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator
+from typing import Generic, TypeVar
+
+from appliance.quotas.pool import Standing
+
+Holder = TypeVar("Holder", bound=Hashable)
+Member = TypeVar("Member")
+_MOST_MOVED = 64  # members whose hosts' standing has changed that one search files anew
+
+
+class Queue(Generic[Holder, Member]):
+    """Members of hosts, in the order in which they were put in. `standing` says what is known of a host now."""
+
+    def __init__(self, standing: Callable[[Holder], Standing]) -> None:
+        self._standing = standing
+        self._lines = {level: OrderedDict[Member, tuple[Holder, float]]() for level in Standing}
+        self._line_of: dict[Member, OrderedDict[Member, tuple[Holder, float]]] = {}
+
+    def put(self, member: Member, host: Holder, since: float) -> None:
+        """The member waits since now, as the last one."""
+        self._file(member, host, since, self._standing(host))
+
+    def remove(self, member: Member) -> bool:
+        """The member waits no longer; whether it did."""
+        line = self._line_of.pop(member, None)
+        if line is None:
+            return False
+        del line[member]
+        return True
+
+    def longest(self, standing: Standing) -> tuple[Member, Holder, float] | None:
+        """Who has waited longest of the hosts that have this standing now, his host, and since when."""
+        for _ in range(_MOST_MOVED):
+            found = next(iter(self._lines[standing].items()), None)
+            if found is None:
+                break
+            member, (host, since) = found
+            now = self._standing(host)
+            if now is standing:
+                return member, host, since
+            self._file(member, host, since, now)
+        return None
+
+    def __iter__(self) -> Iterator[Member]:
+        return iter(list(self._line_of))
+
+    def _file(self, member: Member, host: Holder, since: float, standing: Standing) -> None:
+        before = self._line_of.get(member)
+        if before is not None:
+            del before[member]
+        line = self._lines[standing]
+        line[member] = host, since
+        self._line_of[member] = line

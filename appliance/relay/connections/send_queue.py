@@ -1,0 +1,165 @@
+"""What waits for one slow subscriber: bounded, oldest dropped first, never a torn frame.
+
+The outbox exists only while the socket does not take everything; a subscriber that keeps up never fills it.
+It holds batches on frame boundaries, shared with the other subscribers' outboxes (one copy per batch, not per
+subscriber), and apart from them the rest of a frame whose first bytes have been sent.
+
+Invariants:
+- Bytes leave in the order they came; a frame whose first byte was sent is sent whole.
+- What is left of that frame is counted, and the memory that is held for it is less than `LITTLE` times as much.
+- After `trim`, at most `queue_messages` frames and `queue_bytes` wait besides the one being sent.
+"""
+
+from collections import deque
+from math import ceil
+
+from appliance.relay.bounds import Limits
+from appliance.relay.connections.frames import LITTLE, boundary_at, equal_frames
+from appliance.relay.connections.memory import HostShare
+
+_VECTORS = 64
+_BEHIND = 1 << 20
+
+
+class Outbox:
+    """Frames on their way to one subscriber."""
+
+    def __init__(self, limits: Limits, share: HostShare) -> None:
+        self._limit_messages = limits.queue_messages
+        self._limit_size = limits.queue_bytes
+        self._share = share
+        self._started: memoryview | None = None
+        self._waiting: deque[tuple[memoryview, int]] = deque()
+        self._messages = 0
+        self._size = 0
+
+    def __bool__(self) -> bool:
+        return self._started is not None or bool(self._waiting)
+
+    @property
+    def messages(self) -> int:
+        """Frames that wait and have not been started."""
+        return self._messages
+
+    @property
+    def size(self) -> int:
+        """Their bytes."""
+        return self._size
+
+    @property
+    def behind(self) -> bool:
+        """Whether so much waits that it is worth letting the subscriber catch up, if that holds up nobody."""
+        return self._size >= _BEHIND or self.full
+
+    @property
+    def begun(self) -> int:
+        """The bytes that are left of a message in the middle of being sent."""
+        return 0 if self._started is None else len(self._started)
+
+    @property
+    def short(self) -> bool:
+        """Whether it holds memory, and its host has no more of it."""
+        return bool(self) and self._share.exhausted
+
+    @property
+    def full(self) -> bool:
+        """Whether another message would be one too many, for this queue or for the host."""
+        return (
+            self._messages >= self._limit_messages
+            or self._size >= self._limit_size
+            or (self._messages > 0 and self._share.exhausted)
+        )
+
+    def append(self, view: memoryview, messages: int, sent: int = 0, rest: memoryview | None = None) -> None:
+        """Queue a batch of which the first `sent` bytes are sent already. It stays as it is, or its `rest` does."""
+        if sent:
+            rest = view[sent:] if rest is None else rest
+            gone, end = boundary_at(view, sent)
+            if end > sent:
+                self.begin(rest[: end - sent])
+                gone += 1
+            view, messages = rest[end - sent :], messages - gone
+        if messages:
+            self._waiting.append((view, messages))
+            self._count(messages, len(view))
+
+    def begin(self, rest: memoryview) -> None:
+        """Something has been sent in part (a frame, or the connection header): `rest` goes before all
+        else."""
+        self._started = _apart(rest)
+        self._share.add(len(rest))
+
+    def vectors(self) -> list[memoryview]:
+        """What to send next, in order."""
+        views = [] if self._started is None else [self._started]
+        for index, (view, _messages) in enumerate(self._waiting):
+            if index == _VECTORS:
+                break
+            views.append(view)
+        return views
+
+    def advance(self, sent: int) -> None:
+        """The socket took the first `sent` bytes of `vectors()`."""
+        if self._started is not None:
+            taken = min(sent, len(self._started))
+            self._share.add(-taken)
+            sent -= taken
+            rest = self._started[taken:]
+            self._started = _apart(rest) if len(rest) else None
+        while sent:
+            view, messages = self._waiting.popleft()
+            self._count(-messages, -len(view))
+            if sent >= len(view):
+                sent -= len(view)
+                continue
+            gone, end = boundary_at(view, sent)
+            if end > sent:
+                self.begin(view[sent:end])
+                gone += 1
+            if messages > gone:
+                self._waiting.appendleft((view[end:], messages - gone))
+                self._count(messages - gone, len(view) - end)
+            sent = 0
+
+    def trim(self) -> int:
+        """Drop the oldest frames beyond the bounds, or all when the host has no memory left; how many."""
+        before = self._messages
+        limit_messages, limit_size = self._limit_messages, self._limit_size
+        if self._share.exhausted:
+            limit_messages = limit_size = 0
+        while self._messages > limit_messages or self._size > limit_size:
+            view, messages = self._waiting.popleft()
+            self._count(-messages, -len(view))
+            dropped = end = 0
+            stride, count = equal_frames(view, len(view))
+            if stride and count == messages:
+                dropped = max(self._messages + messages - limit_messages, 0)
+                dropped = min(messages, max(dropped, ceil((self._size + len(view) - limit_size) / stride)))
+                end = dropped * stride
+            while dropped < messages and (
+                self._messages + messages - dropped > limit_messages
+                or self._size + len(view) - end > limit_size
+            ):
+                end += int.from_bytes(view[end : end + 4], "little") + 4
+                dropped += 1
+            if dropped < messages:
+                self._waiting.appendleft((view[end:], messages - dropped))
+                self._count(messages - dropped, len(view) - end)
+        return before - self._messages
+
+    def clear(self) -> None:
+        """Forget everything; the subscriber is gone."""
+        self._share.add(-self._size - (0 if self._started is None else len(self._started)))
+        self._started = None
+        self._waiting.clear()
+        self._messages = self._size = 0
+
+    def _count(self, messages: int, size: int) -> None:
+        self._messages += messages
+        self._size += size
+        self._share.add(size)
+
+
+def _apart(rest: memoryview) -> memoryview:
+    """The bytes; in memory of their own if they are little of what they stand in."""
+    return memoryview(bytes(rest)) if LITTLE * len(rest) <= memoryview(rest.obj).nbytes else rest

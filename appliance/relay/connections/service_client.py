@@ -1,0 +1,318 @@
+"""A service client's connection and the one made for it to the service.
+
+The client's header has been checked against the grants; the service is connected to, gets the client's header
+written afresh (`persistent`, `probe` and `md5sum=*` included, a session's own fields left out), and its answer goes
+back the same way (`headers`). Then requests and replies alternate (`exchange`).
+
+A service that never answers holds this client and nobody else. One that cannot be reached, or dies before its
+header, is answered with an error header, as rospy and roscpp expect; one that dies later ends the client's
+connection, as it would without the appliance.
+"""
+
+import errno
+import socket
+from collections.abc import Callable, Mapping
+
+from appliance.channel.messages import PublicationRefused, TopicTraffic
+from appliance.relay.connections.exchange import ServiceExchange
+from appliance.relay.connections.frames import SMALL
+from appliance.relay.connections.headers import size_of, switched_on, to_client, to_service
+from appliance.relay.connections.memory import Stall, Weight
+from appliance.relay.connections.own_service import OwnServer, OwnService
+from appliance.relay.connections.sockets import Stream, begin_connect
+from appliance.relay.context import RelayContext
+from appliance.relay.granted import Service
+from appliance.relay.loop import Timer
+from appliance.relay.monitors.interceptor import Judged
+from appliance.relay.monitors.observation_points import Place
+from roswire.errors import PeerError
+from roswire.tcpros import HeaderParser, encode_header
+
+_PATIENT = 1 << 20  # so much may wait for ever, as long as its host has memory
+
+
+class ServiceTraffic:
+    """What went through one service since the last report, and how many are connected."""
+
+    def __init__(self) -> None:
+        self.messages = 0
+        self.bytes = 0
+        self.clients = 0
+        self.changed = False
+
+    def count(self, size: int) -> None:
+        """A request or reply of so many bytes goes through."""
+        self.messages += 1
+        self.bytes += size
+        self.changed = True
+
+    def connected(self, change: int) -> None:
+        """Count so many clients more."""
+        self.clients += change
+        self.changed = True
+
+    def row(self, key: str, service: str) -> TopicTraffic | None:
+        """The counters since the last call; None when nothing has changed."""
+        if not self.changed:
+            return None
+        row = TopicTraffic(key, service, self.messages, self.bytes, 0, self.clients)
+        self.messages = self.bytes = 0
+        self.changed = False
+        return row
+
+
+class ServiceClient:
+    """One client of one service; `caller_id` is the name it is bound to. `own`: the appliance itself offers it.
+
+    Either `ended()` is called once, when both connections are closed, or `refuse(sock, reason)`, which takes
+    the client's socket over.
+    """
+
+    def __init__(
+        self,
+        context: RelayContext,
+        sock: socket.socket,
+        service: Service,
+        host: str,
+        fields: Mapping[str, str],
+        *,
+        caller_id: str,
+        traffic: ServiceTraffic,
+        refuse: Callable[[socket.socket, str], None],
+        ended: Callable[[], None],
+        own: OwnService | None = None,
+    ) -> None:
+        self.service = service
+        self.host = host
+        self.caller_id = caller_id
+        self._context = context
+        self.fields = fields
+        self._traffic = traffic
+        self._refuse = refuse
+        self._ended = ended
+        self._own = own
+        self._number = 0
+        self._live = True
+        memory = context.memory
+        self._weights = (
+            Weight(memory.frames.of(host)),
+            Weight(memory.frames.of(service.host)),
+            Weight(memory.queues.of(host)),
+        )
+        self._stall = Stall(context.limits.stall_seconds)
+        self._server: Stream | OwnServer | None = None
+        self._timer: Timer | None = None
+        self._parser = HeaderParser(context.limits.header_bytes)
+        self._greeted = False
+        self._header: dict[str, str] = {}
+        self._exchange = ServiceExchange(
+            context.limits.message_bytes,
+            persistent=switched_on(fields, "persistent"),
+            to_service=self._to_service,
+            to_client=self._to_client,
+            count=traffic.count,
+            judge=self._judge,
+        )
+        self._client = Stream(
+            context.loop,
+            sock,
+            self._client_received,
+            self.cut,
+            payer=context.payer(host),
+            drained=self._advance,
+        )
+        self._client.read(False)
+
+    def start(self, rest: bytes) -> None:
+        """Connect to the service; `rest` is what the client has sent after its header."""
+        try:
+            self._exchange.from_client(rest)
+            self._server = self._reach()
+        except (OSError, OverflowError) as error:
+            self._turn_away(f"cannot connect to the service: {_why(error)}")
+            return
+        except PeerError as error:
+            self._turn_away(str(error))
+            return
+        self._patience(self._context.limits.connect_seconds)
+        self._weigh()
+
+    def _reach(self) -> Stream | OwnServer:
+        """What leads to the service. Raises `OSError` and `OverflowError`."""
+        loop, service = self._context.loop, self.service
+        if self._own is not None:
+            called = service.service, self.host, self.caller_id
+            received, opened = self._server_received, self._connected
+            return OwnServer(self._own, loop, called=called, received=received, opened=opened)
+        sock = begin_connect(service.host, service.port)
+        received, broken = self._server_received, self._server_broken
+        return Stream(
+            loop, sock, received, broken, payer=self._context.payer(self.host), opened=self._connected
+        )
+
+    def judge_again(self) -> None:
+        """Other specifications are in force: a service that does not fit them is carried no longer."""
+        if self._greeted:
+            objection = self._context.middle.service_objection(self.service.service, self._header)
+            if objection:
+                self.cut(objection)
+
+    def look(self) -> None:
+        """A second is over: one that keeps memory for a message that nothing comes of, or is not taken, is cut."""
+        held = (
+            self._exchange.unfinished + self._client.backlog + (self._server.backlog if self._server else 0)
+        )
+        patience = SMALL if any(weight.share.exhausted for weight in self._weights) else _PATIENT
+        if self._stall.seen(held if held > patience else 0, self._context.loop.clock()):
+            seconds = self._context.limits.stall_seconds
+            self.cut(f"{held} bytes of a message wait, and nothing of it has come or gone for {seconds:g} s")
+
+    def cut(self, reason: str) -> None:
+        """Close both connections; empty for the client's own end."""
+        if self._live:
+            self._release()
+            self._client.close()
+            self._context.reporter.closed(self._number, reason)
+            self._ended()
+
+    def _patience(self, seconds: float) -> None:
+        """From now on the service has so long."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._context.loop.after(
+            seconds, lambda: self._turn_away(f"the service does not answer within {seconds:g} s")
+        )
+
+    def _connected(self) -> None:
+        self._patience(self._context.limits.service_seconds)
+        self._to_service(encode_header(to_service(self.fields, self.caller_id)))
+
+    def _server_received(self, data: bytes) -> None:
+        if not data:
+            self._server_ended("the service closed the connection")
+        elif self._greeted:
+            self._guard(self._exchange.from_service, data)
+        else:
+            self._header_received(data)
+
+    def _header_received(self, data: bytes) -> None:
+        try:
+            header = self._parser.feed(data)
+        except PeerError as error:
+            self._turn_away(f"the service's header cannot be read: {error}")
+            return
+        if header is None:
+            return
+        if "error" in header:
+            self._turn_away(header["error"])
+            return
+        objection = self._context.middle.service_objection(self.service.service, header)
+        if objection:
+            self._context.reporter.send(PublicationRefused(self.service.key, self.service.service, objection))
+            self._turn_away(objection)
+            return
+        self._greeted = True
+        self._header = header
+        if self._timer is not None:
+            self._timer.cancel()
+        self._number = self._context.reporter.opened(
+            self.service.key, self.service.service, "service", self.host, self.caller_id
+        )
+        self._traffic.connected(1)
+        self._to_client(encode_header(to_client(header, self.service.node)))
+        self._guard(self._exchange.from_service, self._parser.rest)
+
+    def _judge(self, part: str, body: bytes) -> Judged:
+        """What the monitors make of a request or a reply. They may be others than when the client came."""
+        middle, service = self._context.middle, self.service
+        if part == "request":
+            return middle.request(Place(service.key, service.service, self.host, self.caller_id), body)
+        return middle.response(Place(service.key, service.service, service.host, service.node), body)
+
+    def _client_received(self, data: bytes) -> None:
+        if not data:
+            self.cut("")
+        else:
+            self._guard(self._exchange.from_client, data)
+
+    def _guard(self, feed: Callable[[bytes], None], data: bytes) -> None:
+        """Feed the exchange; a peer that breaks the protocol loses its connection."""
+        try:
+            feed(data)
+        except PeerError as error:
+            self.cut(str(error))
+            return
+        self._advance()
+
+    def _advance(self) -> None:
+        """Go on as far as the client has taken what was written to it."""
+        if not self._live or not self._greeted:
+            return
+        while self._live and not self._client.backlog:
+            if self._exchange.done or self._server is None:
+                self.cut("")
+                return
+            if not self._exchange.ready:
+                break
+            self._exchange.advance()
+        if self._live:
+            self._client.read(self._exchange.may_read and not self._client.backlog)
+            self._weigh()
+
+    def _weigh(self) -> None:
+        """Count what this connection holds in memory; too much for a host ends it."""
+        waiting = self._client.backlog + (self._server.backlog if self._server else 0)
+        of_service = self._exchange.held_replies + size_of(self._header)
+        parts = (self._exchange.held, of_service, waiting)
+        for weight, size in zip(self._weights, parts, strict=True):
+            weight.set(size)
+            if size > SMALL and weight.share.exhausted:
+                self.cut("the relay has no memory left for messages of this host")
+                return
+
+    def _to_service(self, data: bytes) -> None:
+        if self._server is not None:
+            self._server.send(data)
+
+    def _to_client(self, data: bytes) -> None:
+        self._client.send(data)
+
+    def _server_broken(self, reason: str) -> None:
+        if self._greeted:
+            self._server_ended(f"the connection to the service broke: {reason}")
+        else:
+            self._turn_away(f"no connection to the service: {reason}")
+
+    def _server_ended(self, reason: str) -> None:
+        if not self._greeted:
+            self._turn_away(reason)
+            return
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+        if self._client.backlog:
+            self._client.read(False)
+        else:
+            self.cut("" if self._exchange.may_read or self._exchange.done else reason)
+
+    def _turn_away(self, reason: str) -> None:
+        """The client gets the reason in a header of its own."""
+        if self._live:
+            self._release()
+            self._refuse(self._client.take(), reason)
+
+    def _release(self) -> None:
+        self._live = False
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._server is not None:
+            self._server.close()
+        for weight in self._weights:
+            weight.set(0)
+        if self._greeted:
+            self._traffic.connected(-1)
+
+
+def _why(error: Exception) -> str:
+    """The error without the address of the service's node, which is not the client's to know."""
+    return errno.errorcode.get(getattr(error, "errno", None) or 0, "it has no address that can be called")

@@ -1,0 +1,84 @@
+"""Looks into topics: a few messages, read for a person as subscribers get them, and told to control.
+
+A message is read here, where strangers' bytes are, by the definition in its publisher's header; what goes to control
+is bounded: `ros/message_view.py` cuts long values, and a look has at most `MOST_MESSAGES`. The definition is read once
+for a look and a publisher. A topic that nobody looks into costs nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from appliance.base import lazy_imports
+from appliance.channel.messages import LookWanted, Message, MessageSeen
+from appliance.relay.connections.frames import Batch
+from appliance.relay.connections.relayed_topic import RelayedTopic
+
+if TYPE_CHECKING:
+    from roswire.message_view import PublisherReader
+
+MOST_LOOKS = 8
+MOST_MESSAGES = 20
+
+Tap = Callable[[Batch], None]
+
+
+class Looks:
+    """Which topics operators look into. `tell(message)` reaches control."""
+
+    def __init__(self, tell: Callable[[Message], None]) -> None:
+        self._tell = tell
+        self._open: dict[int, list[tuple[RelayedTopic, Tap]]] = {}
+        self._left: dict[int, int] = {}
+
+    def begin(self, wanted: LookWanted, topics: Iterable[RelayedTopic]) -> None:
+        """Look into a topic, of all its publishers; beyond `MOST_LOOKS` nothing is seen."""
+        if len(self._open) >= MOST_LOOKS:
+            return
+        taps = self._open[wanted.number] = []
+        self._left[wanted.number] = min(wanted.messages, MOST_MESSAGES)
+        for topic in topics:
+            tap = partial(self._see, wanted.number, topic, _Reader(topic))
+            taps.append((topic, tap))
+            topic.look(tap, latched=wanted.latched)
+
+    def end(self, number: int) -> None:
+        """Look away."""
+        for topic, tap in self._open.pop(number, ()):
+            topic.look_away(tap)
+        self._left.pop(number, None)
+
+    def end_all(self) -> None:
+        """There is no control to tell."""
+        for number in list(self._open):
+            self.end(number)
+
+    def _see(self, number: int, topic: RelayedTopic, reader: _Reader, batch: Batch) -> None:
+        position = 0
+        while position < len(batch.view) and self._left.get(number, 0) > 0:
+            self._left[number] -= 1
+            end = position + 4 + int.from_bytes(batch.view[position : position + 4], "little")
+            data = bytes(batch.view[position + 4 : end])
+            kind, fields, why = reader.read(data)
+            self._tell(MessageSeen(number, topic.key, time.time_ns(), kind[:200], len(data), fields, why))
+            position = end
+
+
+class _Reader:
+    """Reads the messages of one publisher by the definition in the header that it has at the time."""
+
+    def __init__(self, topic: RelayedTopic) -> None:
+        self._topic = topic
+        self._header: Mapping[str, str] | None = None
+        self._view = lazy_imports.load("roswire.message_view")
+        self._reader: PublisherReader = self._view.PublisherReader({})
+
+    def read(self, data: bytes) -> tuple[str, dict[str, Any], str]:
+        """The type, the fields, and why there are none but the first bytes."""
+        header = self._topic.header or {}
+        if header is not self._header:
+            self._header, self._reader = header, self._view.PublisherReader(header)
+        return self._reader.type, *self._reader.read(data)

@@ -1,0 +1,1 @@
+"""Keys and signatures: signed requests, site keys, signed statements, fingerprints."""

@@ -1,0 +1,199 @@
+"""Files of specifications: read from the folder, checked as a whole, named by what is in them.
+
+What was compiled for the check is what relays run.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from appliance.base import lazy_imports
+from appliance.base.input_files import read_given_text
+from appliance.channel import messages
+from appliance.signing.site_keys import UnsignedError, read_signature, signer
+from roswire.definitions import Definitions
+from roswire.errors import DefinitionError
+from roswire.message_view import read_fields
+
+_MOST_FILES = 1000
+_LONGEST_FILE = 1 << 20
+_LONGEST = (
+    3 << 20
+)  # characters of all, with definitions: the compiler has a minute, and takes 14 s for each MiB
+
+
+class SpecificationsRefusedError(Exception):
+    """Specifications were not taken; `findings` has every reason, as `file:line:column: error: text`."""
+
+    def __init__(self, findings: list[str]) -> None:
+        super().__init__("\n".join(findings))
+        self.findings = findings
+
+
+class Sources(msgspec.Struct, frozen=True):
+    """Texts of specifications by file name, and of message definitions by `package/Type.msg` (or `.srv`).
+
+    `signatures` are the site's, by the same names.
+    """
+
+    files: dict[str, str] = {}
+    definitions: dict[str, str] = {}
+    signatures: dict[str, str] = {}
+
+    def with_files(self, new: "Sources") -> "Sources":
+        """These, with others added or in the place of those of the same name; in the order of names."""
+        fresh = new.files.keys() | new.definitions.keys()
+        signatures = {name: text for name, text in self.signatures.items() if name not in fresh}
+        signatures |= {name: text for name, text in new.signatures.items() if text and name in fresh}
+        return Sources(
+            dict(sorted((self.files | new.files).items())),
+            dict(sorted((self.definitions | new.definitions).items())),
+            signatures,
+        )
+
+    def without(self, files: set[str]) -> "Sources":
+        """These without some files; definitions stay."""
+        left, signatures = (
+            {name: text for name, text in texts.items() if name not in files}
+            for texts in (self.files, self.signatures)
+        )
+        return Sources(left, self.definitions, signatures)
+
+    def signers(self, site_keys: Sequence[str]) -> list[str]:
+        """The keys that signed these; none where there are no keys.
+
+        Raises `SpecificationsRefusedError` with every file and definition that none of them signed.
+        """
+        found: set[str] = set()
+        findings = []
+        for name, text in (self.files | self.definitions).items() if site_keys else ():
+            try:
+                found.add(signer(site_keys, text, self.signatures.get(name, "")))
+            except UnsignedError as error:
+                place = name if name in self.files else f"msg/{name}"
+                findings.append(f"{place}:1:1: error: {error}")
+        if findings:
+            raise SpecificationsRefusedError(findings)
+        return sorted(found)
+
+    def difference(self, before: "Sources") -> tuple[list[str], list[str], list[str]]:
+        """The names of files that these add, change and remove; definitions as `msg/package/Type.msg`."""
+        old, new = before.named(), self.named()
+        return (
+            [name for name in new if name not in old],
+            [name for name in new if name in old and old[name] != new[name]],
+            [name for name in old if name not in new],
+        )
+
+    def named(self) -> dict[str, str]:
+        """All texts by their names below the folder: those of definitions begin with `msg/`."""
+        return self.files | {f"msg/{name}": text for name, text in self.definitions.items()}
+
+
+class Checked(messages.Contents, frozen=True):
+    """Specifications that may come into force; `signed_by` are the keys of the site that signed them."""
+
+    signed_by: list[str] = []  # noqa: RUF012  each struct gets one of its own
+
+    def fields(self, topic: str, data: bytes) -> dict[str, Any] | None:
+        """A message of a topic (its first bytes) as fields and values; None if its type is not known."""
+        name = self.types.get(topic)
+        definitions = _definitions(name, self.texts.get(name, "")) if name is not None else None
+        return read_fields(definitions, name, data) if name is not None and definitions is not None else None
+
+    def of_topic(self, topic: str) -> bool:
+        """Whether a monitor has an event on a topic."""
+        return any(topic in topics for topics in self.topics.values())
+
+    def of_service(self, service: str) -> bool:
+        """Whether a monitor has an event on a service."""
+        return any(service in services for services in self.services.values())
+
+
+@lru_cache(maxsize=1000)
+def _definitions(name: str, text: str) -> Definitions | None:
+    try:
+        return Definitions.from_full_text(name, text)
+    except DefinitionError:
+        return None
+
+
+def check(sources: Sources, site_keys: Sequence[str]) -> Checked:
+    """Compile everything here. Raises `SpecificationsRefusedError` with all that is wrong; takes a moment.
+
+    Where there are `site_keys`, each text must be signed with one of them.
+    """
+    if not sources.files:
+        return Checked()
+    require_bounded(sources)
+    # The compiler, half a second of a small machine: not where there is nothing to compile.
+    checking = lazy_imports.load("appliance.specifications.checking")
+    return checked(checking.contents(sources.files, sources.definitions), sources, site_keys)
+
+
+def checked(contents: messages.Contents, sources: Sources, site_keys: Sequence[str]) -> Checked:
+    """What the compiler found in these, once they are signed. Raises `SpecificationsRefusedError`."""
+    return Checked(**msgspec.structs.asdict(contents), signed_by=sources.signers(site_keys))
+
+
+def require_bounded(sources: Sources) -> None:
+    """Raises `SpecificationsRefusedError` where they are too many, or too long."""
+    if len(sources.files) > _MOST_FILES:
+        raise SpecificationsRefusedError(
+            [f"{len(sources.files)} files of specifications; {_MOST_FILES} at most"]
+        )
+    if sum(map(len, [*sources.files.values(), *sources.definitions.values()])) > _LONGEST:
+        raise SpecificationsRefusedError(
+            [f"specifications and definitions are longer than {_LONGEST} characters"]
+        )
+    for name, text in sources.files.items():
+        if len(text) > _LONGEST_FILE:
+            raise SpecificationsRefusedError([f"{name}: longer than {_LONGEST_FILE} characters"])
+
+
+def read_folder(folder: Path) -> Sources:
+    """The `.rv` files of a folder and the definitions in its `msg/`, with their signatures.
+
+    Raises `SpecificationsRefusedError`.
+    """
+    try:
+        return _read_folder(folder)
+    except OSError as error:
+        place = error.filename or folder
+        text = f"{place}: the specifications cannot be read: {error.strerror}"
+        raise SpecificationsRefusedError([text]) from error
+
+
+def _read_folder(folder: Path) -> Sources:
+    if not folder.is_dir():
+        raise SpecificationsRefusedError([f"{folder}: there is no such folder of specifications"])
+    paths = {path.name: path for path in sorted(folder.glob("*.rv"))}
+    files = {name: _read(path) for name, path in paths.items()}
+    definitions: dict[str, str] = {}
+    for path in sorted((folder / "msg").rglob("*")):
+        if path.suffix in {".msg", ".srv"} and path.is_file():
+            package = path.parent.parent if path.parent.name in {"msg", "srv"} else path.parent
+            if package in {folder, folder / "msg"}:
+                place = f"{folder}/msg/package/{path.name}"
+                raise SpecificationsRefusedError(
+                    [f"{path}: a definition belongs into the folder of its package: {place}"]
+                )
+            name = f"{package.name}/{path.name}"
+            definitions[name], paths[name] = _read(path), path
+    return Sources(files, definitions, signatures_of(paths))
+
+
+def signatures_of(paths: Mapping[str, Path]) -> dict[str, str]:
+    """The signatures beside these files, by the same names; of those that have one."""
+    found = {name: read_signature(path) for name, path in paths.items()}
+    return {name: text for name, text in found.items() if text}
+
+
+def _read(path: Path) -> str:
+    try:
+        return read_given_text(path, "utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise SpecificationsRefusedError([f"{path}: is not UTF-8 text: {error.reason}"]) from error

@@ -1,0 +1,687 @@
+"""The specifications in force: loading, switching, going back, and what operators are answered.
+
+Larger than most files because each order is a few lines, and all of them change the same few things, one at a time.
+
+Invariants:
+
+1. The folder is the baseline and only read; what is loaded, replaced or removed while the robot runs is a revision in
+   the store (`revisions.py`) and survives a restart, as the switches (`switches.py`) do.
+2. New specifications are compiled before anything changes, by the process that `check` asks; bad ones change nothing
+   and say everything that is wrong with them. The relays are given what was compiled, and have the last word.
+3. What is loaded joins monitors in shadow mode that it shares variables with; no load and no switch takes a monitor
+   that is in force along.
+4. A reload takes what the folder has, and leaves what the folder does not have in force unless it is told to remove
+   that: nobody's protection ends because a file is not where it was.
+5. Every change can be made on trial (`store/revisions.py`), and every revision is kept with the switches that it had
+   last: a rollback to it brings its monitors back as they were.
+6. What operators have seen has a tag, which is another after every revision, switch and resumption, and never comes
+   back: a change that is meant for another tag than the present one is refused.
+"""
+
+import asyncio
+import contextlib
+import datetime
+import json
+import time
+from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import structlog
+
+from appliance.audit.record import Severity
+from appliance.base.withdrawal import WithdrawnError, require_awaited, take_effect
+from appliance.channel import admin, messages
+from appliance.channel.answers import monitors as answers
+from appliance.channel.answers.monitors import Replaced, Switched
+from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
+from appliance.specifications.allocation import Allocation
+from appliance.specifications.folder import SpecificationFolder
+from appliance.specifications.live_topics import Published, judge_topics
+from appliance.specifications.records import MonitorRecords
+from appliance.specifications.relay_needs import Relays
+from appliance.specifications.returns import LONGEST, Returns
+from appliance.specifications.rollout import TRIAL, Parts, Revision, Rollout, Switch
+from appliance.specifications.specification_files import Checked, Sources, SpecificationsRefusedError
+from appliance.specifications.specification_revisions import (
+    DISK,
+    NOTHING,
+    Check,
+    Kept,
+    check_kept,
+    described,
+    kept_in,
+    sources_of,
+    text_of,
+)
+from appliance.specifications.switches import Switches, require_whole
+from appliance.store.revisions import Trial, UnknownRevisionError, wanted
+from appliance.store.state_file import MonitorRevisionRow, StateStore
+from appliance.telemetry.audit_trail import AuditTrail
+
+_log = structlog.get_logger()
+_SWITCHES = "monitor switches"
+_ACTS = "monitor acts"
+ALLOCATION = "relays"
+_NO_FOLDER = (
+    "no folder of specifications is configured, so there is nothing to reload, and nothing was changed: start with"
+    " --monitors DIR (monitors: DIR in appliance.yaml), or load files: rosrv monitor load FILE"
+)
+
+
+_EVENTS: dict[Switch, str] = {
+    True: "monitor enabled",
+    False: "monitor disabled",
+    TRIAL: "monitor on trial",
+}
+_WORDS: dict[Switch, str] = {True: "enabled", False: "disabled", TRIAL: "in shadow mode"}
+
+
+class UnknownMonitorError(Exception):
+    """There is no monitor or file of a name, or no such revision; the text says which there are."""
+
+
+class DryRunUnderWayError(Exception):
+    """A client has a dry run under way, and may have no second one."""
+
+
+class MonitorsChangedError(Exception):
+    """The monitors are not as they were when a change to them was thought of; `tag` is the present one."""
+
+    def __init__(self, expected: str, tag: str) -> None:
+        super().__init__(
+            f"the monitors were loaded, switched or resumed meanwhile (they are at {tag}, not at {expected}):"
+            " look at them first"
+        )
+        self.tag = tag
+
+
+class Monitors:
+    """Keeps specifications and switches. What operators ask of them is answered by the method that takes the request.
+
+    `published()` is called when monitors may publish other topics; each of `told` hears of every event that a relay
+    reports. Where there are `site_keys`, whatever comes into force is signed with one of them. Changes are made one at
+    a time.
+    """
+
+    def __init__(
+        self,
+        folder: Path | None,
+        enable: str,
+        store: StateStore,
+        trail: AuditTrail,
+        *,
+        on_fault: Literal["drop", "pass"],
+        slices: int,
+        allocation: Allocation,
+        relays: Relays,
+        published: Callable[[], None],
+        told: Collection[Callable[[messages.MonitorEvent], None]],
+        site_keys: Sequence[str],
+        check: Check,
+        try_out: Check,
+        parts: Parts,
+        live: Callable[[], Published],
+    ) -> None:
+        """`check` compiles for an order, `try_out` for a dry run; `live()` is what nodes publish now."""
+        self.folder = folder
+        self._folder = SpecificationFolder(folder)
+        self.site_keys = site_keys
+        self._check = check
+        self._try_out = try_out
+        self._live = live
+        self._store = store
+        self._trail = trail
+        self.switches = Switches(enable)
+        self.rollout = Rollout(
+            allocation, trail, on_fault, self.switches.states_of, relays, slices=slices, parts=parts
+        )
+        self._acts = 0  # switches and resumptions, ever
+        self._one_change = asyncio.Lock()
+        self._attempting: set[str] = set()  # who has a dry run under way
+        self._trial = Trial(store, "confirm monitors", self._go_back, (SpecificationsRefusedError,))
+        self.returns = Returns(store, self._come_back)
+        self.in_force = NOTHING  # until `start`
+        self.sources = Sources()
+        self.checked = Checked()
+        self.records = MonitorRecords(trail, lambda topic, data: self.checked.fields(topic, data), told)  # noqa: PLW0108 - of whatever is in force then
+        self._published = published
+
+    # --- start ---
+
+    async def start(self, *, restarted: bool) -> None:
+        """Bring specifications into force at start. Raises `SpecificationsRefusedError`.
+
+        As with the policy: after a crash of control those that were in force; at the appliance's start the folder's,
+        unless an operator's own revision was in force when it stopped.
+        """
+        settings = self._store.settings()
+        self.switches.said = json.loads(settings.get(_SWITCHES, "{}"))
+        self._acts = int(settings.get(_ACTS, "0"))
+        last = self._store.monitor_revision()
+        if last is not None:
+            self.in_force = last
+        if last is not None and (restarted or last.who != DISK):
+            self._enforce(sources_of(last), await check_kept(self._check, last, self.site_keys), last)
+            self._trial.resume()
+        else:
+            sources = self._folder.read()
+            checked = await self._check(sources, self.site_keys)
+            if last is not None and sources_of(last) == sources:
+                self._enforce(sources, checked, last)
+                self._trial.resume()
+            else:
+                self._trial.end()
+                if sources.files or last is not None:
+                    self._keep(sources, checked, who=DISK, note="read at start")
+        now = self._revision(self.revision, self.sources, self.checked)
+        await self.rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
+        self.returns.start(self._disabled())
+        unknown = sorted(self.switches.named - self.checked.monitors.keys())
+        if unknown and self.in_force.who == DISK and not restarted:
+            raise SpecificationsRefusedError([f"--enable: {self._unknown(unknown)}"])
+        if unknown:  # it was removed while the robot ran
+            _log.warning("--enable names monitors that are not loaded", monitors=unknown)
+
+    # --- looking ---
+
+    @property
+    def tag(self) -> str:
+        """Names what a change is meant for: `expected` of the changes below."""
+        return f"{self.revision}.{self._acts}"
+
+    @property
+    def revision(self) -> int:
+        """The number of what is in force; 0 for nothing."""
+        return self.in_force.revision
+
+    @property
+    def differs_from_folder(self) -> bool:
+        """Whether what is in force is something else than the folder has now; not where there is no folder."""
+        return self.folder is not None and self._folder.looked_at() != self.sources
+
+    @property
+    def confirm_by(self) -> float | None:
+        """When what is in force goes back by itself unless confirmed, in seconds since the epoch."""
+        return self._trial.confirm_by
+
+    def names(self) -> list[str]:
+        """All monitors, in the order in which they see messages."""
+        return list(self.checked.monitors)
+
+    def file_of(self, name: str) -> str:
+        """The file of this name, or the file that this monitor stands in. Raises `UnknownMonitorError`."""
+        if name in self.sources.files:
+            return name
+        if name not in self.checked.monitors:
+            raise UnknownMonitorError(self._unknown([name]))
+        return self.checked.monitors[name]
+
+    async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
+        """All kept revisions, the newest first."""
+        rows = await self._kept_rows()
+        return answers.MonitorRevisionList(
+            [answers.MonitorRevision(**described(row, self.revision)) for row in rows]
+        )
+
+    async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
+        """A revision with its texts. Raises `UnknownMonitorError`."""
+        for row in await self._kept_rows():
+            if row.revision == request.revision:
+                return answers.RevisionTexts(
+                    **described(row, self.revision), **msgspec.structs.asdict(sources_of(row))
+                )
+        raise UnknownMonitorError(f"there is no revision {request.revision} of the specifications")
+
+    def statement(self, relay: int) -> messages.SpecificationsStated:
+        """What a relay is told before anything else."""
+        return self.rollout.statement(relay)
+
+    # --- changing ---
+
+    @contextlib.asynccontextmanager
+    async def _changing(self, expected: str | None) -> AsyncIterator[None]:
+        """Around a change that is meant for this tag. Raises `MonitorsChangedError`."""
+        async with self._one_change:
+            require_awaited()
+            if expected is not None and expected != self.tag:
+                raise MonitorsChangedError(expected, self.tag)
+            yield
+
+    async def load(self, request: admin.MonitorLoad, who: str) -> Replaced:
+        """Add these files, or replace those of the same name. Raises `SpecificationsRefusedError`.
+
+        This and every change of the specifications goes back by itself after `confirm_within` seconds unless confirmed.
+        """
+        async with self._changing(request.expected):
+            new = Sources(request.files, request.definitions, request.signatures)
+            sources = self.sources.with_files(new)
+            shadow = frozenset(new.files) if request.shadow else frozenset()
+            if self.in_force.who != DISK and sources == self.sources and not shadow:
+                return self._replaced(self.revision, ([], [], []))  # the same texts twice are one revision
+            note, within = request.note or "loaded", request.confirm_within
+            return await self._change(sources, who, who, note, within, shadow=shadow, forced=request.force)
+
+    async def attempt(self, request: admin.MonitorTry, who: str) -> answers.Tried:
+        """Return what a load would do. Raises as `load`, and `DryRunUnderWayError`."""
+        if who in self._attempting:
+            raise DryRunUnderWayError("you have a dry run under way: wait for its answer, then try again")
+        if request.expected not in (None, self.tag):
+            raise MonitorsChangedError(request.expected or "", self.tag)
+        self._attempting.add(who)
+        try:
+            present, revision, tag = self.sources, self.revision, self.tag
+            following = present.with_files(Sources(request.files, request.definitions, request.signatures))
+            checked = await self._try_out(following, self.site_keys)
+        finally:
+            self._attempting.discard(who)
+        shadow = self._in_shadow(checked, request.files if request.shadow else ())
+        warnings = self._judged(checked, shadow, forced=request.force)
+        files = following.difference(present)
+        return answers.Tried(revision, tag, *files, [*checked.warnings, *warnings], [*checked.monitors])
+
+    async def replace(self, request: admin.MonitorReplace, who: str) -> Replaced:
+        """Put a text in the place of a monitor's file. Raises `UnknownMonitorError`, and as `load`."""
+        file = self.file_of(request.name)
+        load = admin.MonitorLoad(
+            {file: request.text},
+            request.definitions,
+            request.note,
+            request.expected,
+            request.confirm_within,
+            {**request.signatures, file: request.signature},
+            request.force,
+            request.shadow,
+        )
+        return await self.load(load, who)
+
+    async def reload(self, request: admin.MonitorReload, who: str) -> Replaced:
+        """Take what the folder has now; what it does not have stays, unless `prune`.
+
+        Raises `SpecificationsRefusedError`, also when there is no folder.
+        """
+        async with self._changing(request.expected):
+            if self.folder is None:
+                raise SpecificationsRefusedError([_NO_FOLDER])
+            sources = await asyncio.to_thread(self._folder.read)
+            kept = [] if request.prune else sorted(self.sources.files.keys() - sources.files.keys())
+            if kept:
+                sources = self.sources.with_files(sources)
+            keeper = who if kept else DISK  # else the next start would read the folder, and nothing else
+            added, changed, _removed = sources.difference(self.sources)
+            shadow = frozenset([*added, *changed]) if request.shadow else frozenset()
+            within, note = request.confirm_within, "reloaded from disk"
+            return await self._change(
+                sources, keeper, who, note, within, kept=kept, shadow=shadow, forced=request.force
+            )
+
+    async def remove(self, request: admin.MonitorRemove, who: str) -> Replaced:
+        """Remove files, by their names or those of their monitors.
+
+        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` where others use their variables, or a file has
+        other monitors as well.
+        """
+        async with self._changing(request.expected):
+            names, owners = request.names, self.checked.monitors
+            known = set(self.sources.files) | set(owners)
+            unknown = [name for name in names if name not in known]
+            if unknown:
+                raise UnknownMonitorError(self._unknown(unknown))
+            files = {owners.get(name, name) for name in names}
+            left = sorted(
+                monitor
+                for monitor, file in owners.items()
+                if file in files and not {monitor, file} & set(names)
+            )
+            if left:
+                text = f"{', '.join(left)} would go, too: they are in the same file; name the file, or load it without"
+                raise SpecificationsRefusedError([text])
+            sources, note = self.sources.without(files), f"removed {', '.join(sorted(files))}"
+            return await self._change(sources, who, who, note, request.confirm_within)
+
+    async def roll_back(self, request: admin.MonitorRollback, who: str) -> Replaced:
+        """Bring a kept revision into force again (None: the one before this; 0: nothing).
+
+        A monitor that comes back is switched as it was when it went. Raises `SpecificationsRefusedError`.
+        """
+        async with self._changing(request.expected):
+            row = NOTHING
+            if request.revision != 0:
+                try:
+                    row = wanted(await self._kept_rows(), request.revision, self.revision)
+                except UnknownRevisionError as error:
+                    raise SpecificationsRefusedError([str(error)]) from error
+            note, switches = f"rolled back to revision {row.revision}", kept_in(row).switches
+            return await self._change(sources_of(row), who, who, note, switches=switches, forced=True)
+
+    async def confirm(self, request: admin.MonitorConfirm, who: str) -> answers.MonitorsConfirmed:
+        """Keep an unconfirmed change, if there is one."""
+        async with self._changing(request.expected):
+            waited = self.confirm_by is not None
+            if waited:
+                self._trial.end()
+                self._trail.happened(
+                    "specifications confirmed",
+                    f"revision {self.revision} of the specifications was confirmed",
+                    category="monitor",
+                    resource="",
+                    who=who,
+                )
+                await self._store.settled()
+            return answers.MonitorsConfirmed(waited, self.revision, self.tag)
+
+    async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
+        """Enable or disable monitors, for `for_seconds` or until further notice; return those that were not so already.
+
+        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for a monitor that is to be enabled but is in
+        shadow mode, or shares variables with one that is.
+        """
+        async with self._changing(request.expected):
+            self._all_known(request.names)
+            seconds = request.for_seconds
+            if seconds is not None and (request.enabled or not 0 < seconds <= LONGEST):
+                text = f"a monitor may be disabled for up to {LONGEST / 86_400:g} days; it is not enabled for a time"
+                raise SpecificationsRefusedError([text])
+            tried = [name for name in request.names if request.enabled and self.switches.on_trial(name)]
+            if tried:
+                text = f"{', '.join(tried)} is in shadow mode: rosrv monitor promote brings it into force"
+                raise SpecificationsRefusedError([text])
+            return self._switched(await self._switch(request.names, request.enabled, who, seconds))
+
+    async def shadow(self, request: admin.MonitorShadow, who: str) -> Switched:
+        """Put monitors into shadow mode, or from there into force; return those that were not so already.
+
+        Raises as `switch`, for a disabled monitor that is to be brought into force, and for one that would cut a topic.
+        """
+        async with self._changing(request.expected):
+            self._all_known(request.names)
+            disabled = [name for name in request.names if self.switches.states[name] is False]
+            if disabled and not request.shadow:
+                text = f"{', '.join(disabled)} is disabled, not in shadow mode: rosrv monitor enable"
+                raise SpecificationsRefusedError([text])
+            if not request.shadow:
+                others = set(self.switches.tried()) - set(request.names)
+                self._judged(self.checked, others, forced=request.force, promoted=request.names)
+            names = await self._switch(request.names, TRIAL if request.shadow else True, who)
+            return self._switched(names, self.rollout.began(names))
+
+    async def trial(self, request: admin.MonitorTrial, who: str) -> Switched:
+        """Do as `shadow`: the request under its name of earlier versions."""
+        return await self.shadow(admin.MonitorShadow(request.names, request.trial, request.expected), who)
+
+    async def _come_back(self, back: Mapping[str, Switch]) -> None:
+        """Switch monitors back whose time off is over. Raises `SpecificationsRefusedError`."""
+        async with self._one_change:
+            for to in (True, TRIAL):
+                names = [name for name in self._disabled() if back.get(name) == to]
+                await self._switch(names, to, "its time off is over")
+
+    def _disabled(self) -> list[str]:
+        return [name for name, state in self.switches.states.items() if state is False]
+
+    def _switched(self, names: list[str], began: Sequence[str] = ()) -> Switched:
+        return Switched(names, self.revision, self.tag, [*began])
+
+    async def _switch(
+        self, names: Sequence[str], to: Switch, who: str, seconds: float | None = None
+    ) -> list[str]:
+        switches = self.switches
+        changed = [
+            name
+            for name in dict.fromkeys(names)
+            if switches.states[name] != to or (to is False and (seconds is not None or name in self.returns))
+        ]
+        if not changed:
+            return changed
+        before, others = switches.said, dict.fromkeys(changed, to)
+        require_whole(switches.states | others, self.checked)
+        retried = to == TRIAL or any(map(switches.on_trial, changed))
+        if not retried:
+            take_effect()  # else the rollout says when
+        await self._count()
+        switches.said = before | others
+        if retried:
+            try:
+                await self.rollout.take(self._revision(self.revision, self.sources, self.checked))
+            except (SpecificationsRefusedError, WithdrawnError):
+                switches.said = before
+                raise
+        if seconds is None:
+            self.returns.end(changed)
+        else:
+            self.returns.begin({name: switches.states[name] or True for name in changed}, seconds)
+        for name in changed:
+            switches.states[name] = to
+            if not retried:
+                self.rollout.tell(name, messages.MonitorSwitched(name, to is True))
+            self._say_switched(name, to, who)
+        self._store.save_setting(_SWITCHES, json.dumps(switches.said))
+        await self._store.settled()
+        await self.rollout.carried_out()
+        return changed
+
+    def _say_switched(self, name: str, to: Switch, who: str, why: str = "") -> None:
+        until = self.returns.until(name)
+        end = "" if until is None else f" until {_moment(until)}"
+        self._trail.happened(
+            _EVENTS[to],
+            f"{name} is {_WORDS[to]}{end}{why}",
+            severity=Severity.NOTICE,
+            category="monitor",
+            resource=name,
+            who=who,
+            more=None if until is None else {"until": _moment(until)},
+        )
+
+    async def resume(self, request: admin.MonitorResume, who: str) -> Switched:
+        """Let the topics of held monitors go on; which were held.
+
+        Raises `UnknownMonitorError`, and `SpecificationsRefusedError` for those whose relay process is away: the one
+        that comes will hold them.
+        """
+        async with self._changing(request.expected):
+            self._all_known(request.names)
+            held = [name for name in dict.fromkeys(request.names) if name in self.rollout.held]
+            take_effect()
+            if held:
+                await self._count()
+            away = []
+            for name in held:
+                if not self.rollout.tell(name, messages.MonitorResumed(name)):
+                    away.append(name)
+                    continue
+                self.rollout.resumed(name)
+                self._trail.happened(
+                    "monitor resumed",
+                    f"the topics of {name} go on",
+                    category="monitor",
+                    resource=name,
+                    who=who,
+                )
+            if away:
+                text = (
+                    f"{', '.join(away)} not resumed: the relay process is away; resume when it is there again"
+                )
+                raise SpecificationsRefusedError([text])
+            await self.rollout.carried_out()
+            return self._switched(held)
+
+    # --- what the relay says ---
+
+    def received(self, message: messages.Message, relay: int = 0) -> None:
+        """A message of a relay about monitors."""
+        if isinstance(message, messages.MonitorsReported):
+            self.records.reported(message.events, message.lost)
+        else:
+            self.rollout.received(message, relay)
+
+    def relay_lost(self, relay: int) -> None:
+        """A relay is gone."""
+        self.rollout.lost(relay)
+
+    # --- inside ---
+
+    def _revision(self, number: int, sources: Sources, checked: Checked) -> Revision:
+        """These, switched as they are now."""
+        states = self.switches.states_of(checked)
+        trials = frozenset(name for name, state in states.items() if state == TRIAL)
+        return Revision(number, sources, checked, trials)
+
+    async def _kept_rows(self) -> list[MonitorRevisionRow]:
+        await self._store.settled()
+        return await asyncio.to_thread(self._store.monitor_revisions)
+
+    def _unknown(self, names: list[str]) -> str:
+        known = ", ".join(self.checked.monitors) or "none is loaded"
+        return f"no monitor is named {', '.join(names)}; there are: {known}"
+
+    def _all_known(self, names: list[str]) -> None:
+        unknown = [name for name in names if name not in self.checked.monitors]
+        if unknown:
+            raise UnknownMonitorError(self._unknown(unknown))
+
+    async def _count(self) -> None:
+        """The tag is another when this returns; kept before anybody sees it, so that no crash brings one back."""
+        self._store.save_setting(_ACTS, str(self._acts + 1))
+        await self._store.settled()
+        self._acts += 1
+
+    async def _go_back(self, revision: int) -> None:
+        await self.roll_back(admin.MonitorRollback(revision), "not confirmed in time")
+
+    async def _change(
+        self,
+        sources: Sources,
+        keeper: str,
+        who: str,
+        note: str,
+        confirm_within: float | None = None,
+        *,
+        kept: Sequence[str] = (),
+        switches: Mapping[str, Switch] = {},
+        shadow: Collection[str] = (),
+        forced: bool = False,
+    ) -> Replaced:
+        """`switches` are for monitors that are not in force yet; those of the files `shadow` come in shadow mode.
+
+        `forced`: topics are cut whose publishers have another type.
+        """
+        before, previous, switched = self.revision, self.sources, self.switches.said
+        self.switches.said = {
+            **{monitor: to for monitor, to in switches.items() if monitor not in self.checked.monitors},
+            **switched,
+        }
+        try:
+            checked = await self._check(sources, self.site_keys)
+            put = {name: TRIAL for name, file in checked.monitors.items() if file in shadow}
+            in_force = {name: True for name in checked.monitors if self.switches.enabled(name)} | put
+            self.switches.said |= put
+            warnings = self._judged(checked, self._in_shadow(checked), forced=forced)
+            require_whole(self.switches.states_of(checked) | in_force, checked)
+            moved = await self.rollout.take(self._revision(before + 1, sources, checked))
+        except WithdrawnError:
+            self.switches.said = switched
+            raise
+        except SpecificationsRefusedError as error:
+            self.switches.said = switched
+            hint = [f"not of the folder, and kept: {', '.join(kept)} (prune removes them)"] if kept else []
+            findings = error.findings + hint
+            self._trail.happened(
+                "specifications refused",
+                f"revision {self.revision} stays in force: {error.findings[0]}",
+                findings=findings[:100],
+                who=who,
+            )
+            raise SpecificationsRefusedError(findings) from error
+        began = self.rollout.began(checked.monitors)
+        self._trial.announce(before, confirm_within)
+        self._keep(sources, checked, who=keeper, note=note, by=who, began=began, warnings=warnings)
+        for name in put:
+            self._say_switched(name, TRIAL, who, ", as it was loaded")
+        self._trial.changed(before, confirm_within)
+        await self._store.settled()
+        await self.rollout.all_taken()
+        self._published()
+        began = self.rollout.began(checked.monitors)  # by those that have it only now, too
+        done = self._replaced(before, sources.difference(previous), moved, began, kept)
+        return msgspec.structs.replace(done, warnings=[*done.warnings, *warnings])
+
+    def _in_shadow(self, checked: Checked, files: Collection[str] = ()) -> set[str]:
+        """Return which of these monitors are, or would be, in shadow mode: also those of the `files`."""
+        states = self.switches.states_of(checked)
+        return {name for name, file in checked.monitors.items() if states[name] == TRIAL or file in files}
+
+    def _judged(
+        self, coming: Checked, shadow: Collection[str], *, forced: bool, promoted: Collection[str] = ()
+    ) -> list[str]:
+        """Return warnings about topics. Raises `SpecificationsRefusedError` where one would be cut."""
+        found = judge_topics(
+            coming, self.checked, self._live(), shadow=shadow, forced=forced, promoted=promoted
+        )
+        if found.conflicts:
+            raise SpecificationsRefusedError([*found.conflicts, *found.warnings])
+        return found.warnings
+
+    def _replaced(
+        self,
+        before: int,
+        files: tuple[list[str], list[str], list[str]],
+        moved: Sequence[str] = (),
+        began: Sequence[str] = (),
+        kept: Sequence[str] = (),
+    ) -> Replaced:
+        """Describe a change; `files` are those added, changed and removed."""
+        warnings = list(self.checked.warnings)
+        return Replaced(
+            self.revision, self.tag, before, *files, warnings, [*moved], [*began], [*kept], self.confirm_by
+        )
+
+    def _keep(
+        self,
+        sources: Sources,
+        checked: Checked,
+        *,
+        who: str,
+        note: str,
+        by: str | None = None,
+        began: Sequence[str] = (),
+        warnings: Sequence[str] = (),
+    ) -> None:
+        last, before = self.in_force, sources_of(self.in_force)
+        if last.revision:
+            ended = Kept(before.files, before.definitions, before.signatures, self.switches.said)
+            self._store.save_monitor_revision(last._replace(sources=text_of(ended)))
+        row = MonitorRevisionRow(last.revision + 1, text_of(sources), time.time(), who, note)
+        self._store.save_monitor_revision(row)
+        self._enforce(sources, checked, row)
+        added, changed, removed = sources.difference(before)
+        self._trail.happened(
+            "specifications loaded",
+            f"revision {row.revision} of the specifications is in force: {note}",
+            category="monitor",
+            resource="",
+            who=by or who,
+            revision_of_specifications=row.revision,
+            sha256=fingerprint_of_all(sources.named()),
+            compiled_sha256=fingerprint(checked.compiled),
+            monitors=list(checked.monitors),
+            added=added,
+            changed=changed,
+            removed=removed,
+            began=list(began),
+            signed_by=checked.signed_by,
+            certificates=checked.certificates,
+            warnings=[*checked.warnings, *warnings][:100],
+        )
+
+    def _enforce(self, sources: Sources, checked: Checked, row: MonitorRevisionRow) -> None:
+        self.sources, self.checked, self.in_force = sources, checked, row
+        for name in self.switches.enforce(checked):
+            self._say_switched(name, TRIAL, row.who, ": it shares variables with one that is")
+        self.returns.keep(self._disabled())
+        self._store.save_setting(_SWITCHES, json.dumps(self.switches.said))
+
+
+def _moment(seconds: float) -> str:
+    return datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat(timespec="seconds")

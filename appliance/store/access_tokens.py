@@ -1,0 +1,80 @@
+"""Access tokens of REST: how one is made, what is kept of it, and how a given one is recognised. No I/O.
+
+A token is `rosrv_<id>_<secret>`: the id (48 bits) finds the row, the secret (256 random bits) proves it. Invariants:
+
+1. The secret is never kept: only its scrypt hash with a salt of its own is, and what the keys that are derived from
+   it are recognised by (`order_proof.py`).
+2. The comparison takes the same time wherever the difference is.
+"""
+
+import hashlib
+import hmac
+import re
+import secrets
+from typing import NamedTuple
+
+from appliance.signing.request_signing import TokenKeys, keys_of
+
+_FORM = re.compile(r"rosrv_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,62}")
+# Who else may stand in a revision's or a record's `who`.
+_RESERVED = frozenset({"disk", "operator"})
+# 2**14 * 8 * 128 bytes = 16 MiB and some 40 ms for one check.
+_COST, _BLOCK, _PARALLEL, _LENGTH = 1 << 14, 8, 1, 32
+
+
+class BadTokenNameError(ValueError):
+    """A name no token can have; the text says which can."""
+
+
+class TokenRow(NamedTuple):
+    """A token as it is kept; times are seconds since the epoch, `revoked` None while it is not."""
+
+    id: str
+    name: str
+    role: str
+    salt: bytes
+    hash: bytes
+    created: float
+    expires: float
+    revoked: float | None
+    keys: TokenKeys | None = None  # None: made by a version that did not derive any
+
+    def usable(self, now: float) -> bool:
+        """Whether it opens anything at this time."""
+        return self.revoked is None and now < self.expires
+
+
+def make_token(name: str, role: str, *, now: float, seconds: float) -> tuple[TokenRow, str]:
+    """A new token that ends after `seconds`: its row, and its text, which exists nowhere else.
+
+    Raises `BadTokenNameError`.
+    """
+    if not _NAME.fullmatch(name) or name in _RESERVED:
+        raise BadTokenNameError(
+            f"{name[:80]!r} is no name for a token: letters, digits and . _ @ -, beginning with a letter or digit, "
+            f"at most 63, and not {' or '.join(sorted(_RESERVED))}"
+        )
+    token_id, salt = secrets.token_hex(6), secrets.token_bytes(16)
+    secret = secrets.token_urlsafe(32)
+    text = f"rosrv_{token_id}_{secret}"
+    kept = hash_secret(secret, salt)
+    return TokenRow(token_id, name, role, salt, kept, now, now + seconds, None, keys_of(text)), text
+
+
+def parse_token(text: str) -> tuple[str, str] | None:
+    """The id and the secret of a token's text; None when it is none."""
+    found = _FORM.fullmatch(text)
+    return None if found is None else (found[1], found[2])
+
+
+def hash_secret(secret: str, salt: bytes) -> bytes:
+    """What is kept of a secret."""
+    return hashlib.scrypt(
+        secret.encode("ascii"), salt=salt, n=_COST, r=_BLOCK, p=_PARALLEL, dklen=_LENGTH, maxmem=64 << 20
+    )
+
+
+def is_secret(secret: str, salt: bytes, kept: bytes) -> bool:
+    """Whether `kept` was made from this secret."""
+    return hmac.compare_digest(hash_secret(secret, salt), kept)

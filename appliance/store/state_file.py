@@ -1,0 +1,289 @@
+"""The tables of control's state file: registry, parameters, policy revisions, tokens, hosts, settings."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from appliance.signing.request_signing import TokenKeys
+from appliance.store import host_tables
+from appliance.store.access_tokens import TokenRow
+from appliance.store.writer_thread import Database
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS incarnation (
+    key TEXT PRIMARY KEY, name TEXT NOT NULL, host TEXT NOT NULL, api TEXT NOT NULL, told TEXT NOT NULL,
+    outer_port INTEGER NOT NULL, relay_port INTEGER NOT NULL, own INTEGER NOT NULL,
+    life TEXT NOT NULL, changed REAL NOT NULL
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS relay_port (
+    key TEXT NOT NULL, relay INTEGER NOT NULL, port INTEGER NOT NULL, PRIMARY KEY (key, relay)
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS registration (
+    key TEXT NOT NULL, kind TEXT NOT NULL, resource TEXT NOT NULL, detail TEXT NOT NULL,
+    ordinal INTEGER NOT NULL, PRIMARY KEY (key, kind, resource)
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS permission (
+    key TEXT NOT NULL, kind TEXT NOT NULL, resource TEXT NOT NULL, host TEXT NOT NULL, caller_id TEXT NOT NULL,
+    PRIMARY KEY (key, kind, resource, host, caller_id)
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS parameters (id INTEGER PRIMARY KEY CHECK (id = 1), tree BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS parameter_change (number INTEGER PRIMARY KEY, key TEXT NOT NULL, value BLOB);
+CREATE TABLE IF NOT EXISTS parameter_owner (key TEXT PRIMARY KEY, host TEXT NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS policy_revision (
+    revision INTEGER PRIMARY KEY, text TEXT NOT NULL, file TEXT NOT NULL, loaded REAL NOT NULL,
+    who TEXT NOT NULL, note TEXT NOT NULL
+);
+CREATE TABLE IF NOT EXISTS policy_signature (revision INTEGER PRIMARY KEY, signature TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS monitor_revision (
+    revision INTEGER PRIMARY KEY, sources TEXT NOT NULL, loaded REAL NOT NULL, who TEXT NOT NULL, note TEXT NOT NULL
+);
+CREATE TABLE IF NOT EXISTS token (
+    id TEXT PRIMARY KEY, name TEXT NOT NULL, role TEXT NOT NULL, salt BLOB NOT NULL, hash BLOB NOT NULL,
+    created REAL NOT NULL, expires REAL NOT NULL, revoked REAL
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS token_keys (
+    id TEXT PRIMARY KEY, reading BLOB NOT NULL, verifying BLOB NOT NULL
+) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS setting (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
+"""
+
+
+LARGEST_CHANGE = 64 << 10  # bytes of one parameter that is kept at once
+
+
+class IncarnationRow(NamedTuple):
+    """One incarnation as it is kept; `changed` is monotonic seconds, for the order only.
+
+    `relay_port` is its port on the first relay process, `more_relay_ports` are those on the others.
+    """
+
+    key: str
+    name: str
+    host: str
+    api: str
+    told: str
+    outer_port: int
+    relay_port: int
+    own: bool
+    life: str
+    changed: float
+    more_relay_ports: tuple[int, ...] = ()
+
+
+class RegistrationRow(NamedTuple):
+    """One registration as it is kept; `ordinal` is its place in the order they were made."""
+
+    key: str
+    kind: str
+    resource: str
+    detail: str
+    ordinal: int
+
+
+class PermissionRow(NamedTuple):
+    """One grant of the relay (`kind` "topic" or "service")."""
+
+    key: str
+    kind: str
+    resource: str
+    host: str
+    caller_id: str
+
+
+class RevisionRow(NamedTuple):
+    """One policy that was in force; `loaded` is seconds since the epoch, `who` loaded it from where.
+
+    `signature` is the site's, or empty.
+    """
+
+    revision: int
+    text: str
+    file: str
+    loaded: float
+    who: str
+    note: str
+    signature: str = ""
+
+
+class MonitorRevisionRow(NamedTuple):
+    """Specifications that were in force (`sources` is JSON); `loaded` is seconds since the epoch."""
+
+    revision: int
+    sources: str
+    loaded: float
+    who: str
+    note: str
+
+
+class StateStore:
+    """Control's durable state, in `directory/state.db`. Raises `StoreError` when it cannot be opened."""
+
+    def __init__(self, directory: Path, *, failed: Callable[[str], None]) -> None:
+        self.database = Database(directory / "state.db", _SCHEMA + host_tables.SCHEMA, failed=failed)
+        self.hosts = host_tables.HostTables(self.database)
+        self._parameter_changes = 0  # the number of the last one
+
+    async def settled(self) -> None:
+        """Wait until everything saved so far is on the disk. Raises `StoreError` when it cannot be written."""
+        await self.database.settled()
+
+    def close(self, seconds: float | None = None) -> None:
+        """Write what is left, within so many seconds (None: however long it takes), and close."""
+        self.database.close(seconds)
+
+    # --- registry ---
+
+    def save_incarnation(self, row: IncarnationRow) -> None:
+        """Keep an incarnation, or its new `life`."""
+        with self.database.together():
+            self.database.put("incarnation", *row[:-1])
+            self.database.delete("relay_port", key=row.key)
+            for relay, port in enumerate(row.more_relay_ports, start=1):
+                self.database.put("relay_port", row.key, relay, port)
+
+    def forget_incarnation(self, key: str) -> None:
+        """Drop an incarnation and its registrations."""
+        with self.database.together():
+            for table in ("incarnation", "relay_port", "registration", "permission"):
+                self.database.delete(table, key=key)
+
+    def save_registration(self, row: RegistrationRow) -> None:
+        """Keep a registration."""
+        self.database.put("registration", *row)
+
+    def remove_registration(self, key: str, kind: str, resource: str) -> None:
+        """Drop a registration."""
+        self.database.delete("registration", key=key, kind=kind, resource=resource)
+
+    def load_registry(self) -> tuple[list[IncarnationRow], list[RegistrationRow]]:
+        """Everything that is kept, registrations in order."""
+        query = self.database.query
+        ports: dict[str, tuple[int, ...]] = {}
+        for key, port in query("SELECT key, port FROM relay_port ORDER BY key, relay"):
+            ports[key] = (*ports.get(key, ()), port)
+        incarnations = [
+            IncarnationRow._make((*row, ports.get(row[0], ())))._replace(own=bool(row[7]))
+            for row in query("SELECT * FROM incarnation ORDER BY changed")
+        ]
+        return incarnations, [
+            RegistrationRow(*row) for row in query("SELECT * FROM registration ORDER BY ordinal")
+        ]
+
+    # --- grants ---
+
+    def save_permission(self, row: PermissionRow) -> None:
+        """Keep a grant."""
+        self.database.put("permission", *row)
+
+    def remove_permission(self, row: PermissionRow) -> None:
+        """Drop a grant."""
+        self.database.delete("permission", **row._asdict())
+
+    def permissions(self) -> list[PermissionRow]:
+        """All grants that are kept."""
+        return [PermissionRow(*row) for row in self.database.query("SELECT * FROM permission")]
+
+    # --- parameters ---
+
+    def save_parameters(self, tree: dict[str, Any]) -> None:
+        """Keep the whole parameter tree, in the place of the changes before it."""
+        self.database.put("parameters", 1, msgspec.msgpack.encode(tree), ahead=False)
+        # Changes that stay though the tree has them (after a crash) are made once more, in order: the tree is the same.
+        self.database.submit(
+            "DELETE FROM parameter_change WHERE number <= ?", (self._parameter_changes,), ahead=False
+        )
+
+    def note_parameter(self, key: str, value: Any) -> None:
+        """Keep one change until the tree is kept: a parameter has this value, or None: it is gone.
+
+        When this returns the change outlasts the process. A large value does not: it is kept with the tree.
+        """
+        data = None if value is None else msgspec.msgpack.encode(value)
+        if data is not None and len(data) > LARGEST_CHANGE:
+            return
+        self._parameter_changes += 1
+        self.database.put("parameter_change", self._parameter_changes, key, data)
+
+    def parameter_changes(self) -> list[tuple[str, Any]]:
+        """The changes since the tree was kept, in order; None for a parameter that is gone."""
+        query = "SELECT number, key, value FROM parameter_change ORDER BY number"
+        rows = self.database.query(query)
+        self._parameter_changes = rows[-1][0] if rows else 0
+        return [(key, None if data is None else msgspec.msgpack.decode(data)) for _number, key, data in rows]
+
+    def parameter_owned(self, key: str, host: str) -> None:
+        """From this key on the parameters are this host's."""
+        self.database.put("parameter_owner", key, host)
+
+    def parameters_disowned(self, key: str) -> None:
+        """This key and those below it have no owner of their own any more."""
+        above = key.rstrip("/")  # '0' follows '/'
+        self.database.submit(
+            "DELETE FROM parameter_owner WHERE key = ? OR (key > ? AND key < ?)",
+            (key, f"{above}/", f"{above}0"),
+        )
+
+    def parameter_owners(self) -> list[tuple[str, str]]:
+        """The keys from which on parameters are another host's, and the host."""
+        return [(key, host) for key, host in self.database.query("SELECT key, host FROM parameter_owner")]
+
+    def load_parameters(self) -> dict[str, Any]:
+        """The kept parameter tree; empty when there is none."""
+        rows = self.database.query("SELECT tree FROM parameters WHERE id = 1")
+        return msgspec.msgpack.decode(rows[0][0], type=dict[str, Any]) if rows else {}
+
+    # --- revisions of the policy and of the specifications ---
+
+    def save_revision(self, row: RevisionRow) -> None:
+        """Keep a policy that comes into force."""
+        # First: a revision without its signature would be refused by a start in between.
+        self.database.put("policy_signature", row.revision, row.signature)
+        self.database.put("policy_revision", *row[:-1])
+
+    def revisions(self) -> list[RevisionRow]:
+        """All kept revisions, the newest first."""
+        rows = self.database.query(
+            "SELECT policy_revision.*, coalesce(signature, '') FROM policy_revision"
+            " LEFT JOIN policy_signature USING (revision) ORDER BY revision DESC"
+        )
+        return [RevisionRow(*row) for row in rows]
+
+    def save_monitor_revision(self, row: MonitorRevisionRow) -> None:
+        """Keep specifications that come into force."""
+        self.database.put("monitor_revision", *row)
+
+    def monitor_revisions(self) -> list[MonitorRevisionRow]:
+        """All kept revisions of the specifications, the newest first."""
+        rows = self.database.query("SELECT * FROM monitor_revision ORDER BY revision DESC")
+        return [MonitorRevisionRow(*row) for row in rows]
+
+    def monitor_revision(self) -> MonitorRevisionRow | None:
+        """The last that came into force; None when there never was one."""
+        rows = self.database.query("SELECT * FROM monitor_revision ORDER BY revision DESC LIMIT 1")
+        return MonitorRevisionRow(*rows[0]) if rows else None
+
+    # --- tokens ---
+
+    def save_token(self, row: TokenRow) -> None:
+        """Keep a token, or that it is revoked."""
+        self.database.put("token", *row[:-1])
+        if row.keys is not None:
+            self.database.put("token_keys", row.id, *row.keys)
+
+    def tokens(self) -> list[TokenRow]:
+        """All tokens that were ever made, the oldest first."""
+        kept = {token: TokenKeys(*keys) for token, *keys in self.database.query("SELECT * FROM token_keys")}
+        rows = self.database.query("SELECT * FROM token ORDER BY created")
+        return [TokenRow._make((*row, kept.get(row[0]))) for row in rows]
+
+    # --- settings ---
+
+    def save_setting(self, name: str, value: str) -> None:
+        """Keep a named value."""
+        self.database.put("setting", name, value)
+
+    def settings(self) -> dict[str, str]:
+        """All named values."""
+        return dict(self.database.query("SELECT name, value FROM setting"))

@@ -1,0 +1,90 @@
+"""Whether a port is free, and who has it when it is not."""
+
+import errno
+import socket
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from appliance.network.listening_sockets import listening_inodes
+from appliance.supervisor.errors import StartError
+
+
+def free_port() -> int:
+    """A loopback port that nobody listens on now."""
+    with socket.socket() as sock:
+        sock.bind(("127.0.0.1", 0))
+        port: int = sock.getsockname()[1]
+        return port
+
+
+def first_free(ports: range) -> int:
+    """The first of these loopback ports that nobody has, and that no connection of an earlier owner keeps.
+
+    Raises `OSError` when there is none.
+    """
+    for port in ports:
+        with socket.socket() as sock:
+            try:
+                sock.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port
+    raise OSError(errno.EADDRINUSE, f"none of the ports {ports.start} to {ports.stop - 1} is free")
+
+
+def spare_ports(count: int, taken: Sequence[range], within: range) -> range:
+    """That many neighbouring ports `within`, the highest that overlap none `taken`. Raises `StartError`."""
+    stop = within.stop
+    while stop - count >= within.start:
+        wanted = range(stop - count, stop)
+        in_the_way = [span for span in taken if span.start < wanted.stop and wanted.start < span.stop]
+        if not in_the_way:
+            return wanted
+        stop = min(span.start for span in in_the_way)
+    raise StartError(
+        f"no {count} neighbouring ports between {within.start} and {within.stop - 1} are left for the appliance's own "
+        "node: make [Ports] range in the policy smaller"
+    )
+
+
+def require_free(host: str, port: int) -> None:
+    """Raise `StartError` when nobody could listen on this address, and say who does where that is known."""
+    if port == 0:
+        return
+    try:
+        family, kind, protocol, _name, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    except socket.gaierror as error:
+        raise StartError(f"{host!r} is not an address of this machine: {error.strerror}") from error
+    with socket.socket(family, kind, protocol) as sock:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            sock.bind(address)
+            sock.listen()
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise StartError(f"cannot listen on {host}:{port}: {error.strerror}") from error
+            raise StartError(
+                f"port {port} ({host}) is in use{_by_whom(port)}: stop that or choose another port"
+            ) from error
+
+
+def _by_whom(port: int) -> str:
+    inodes = {f"socket:[{inode}]" for inode in listening_inodes(port)}
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit() and inodes & _socket_inodes(process):
+            title = ""
+            with suppress(OSError):
+                words = (process / "cmdline").read_bytes().replace(b"\0", b" ")
+                title = words.decode("utf-8", "replace").strip()
+            return f" by process {process.name} ({title[:120]})"
+    return ""
+
+
+def _socket_inodes(process: Path) -> set[str]:
+    found = set()
+    with suppress(OSError):
+        for descriptor in (process / "fd").iterdir():
+            with suppress(OSError):
+                found.add(str(descriptor.readlink()))
+    return found

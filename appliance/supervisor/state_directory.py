@@ -1,0 +1,179 @@
+"""The state directory: whose part is whose, who may look, and that only one appliance uses it at a time.
+
+A directory that is there already is taken, and closed to others, only where it is empty or an appliance's:
+`--state /tmp` would close /tmp to everybody.
+
+state/            0711  root: others may pass through, not look around
+state/lock        0600  held while an appliance runs; names its process id
+state/admin.sock  0600  where the other verbs of `rosrv` find the running appliance
+state/monitors/   0700  root: what relays keep of the state of monitors (`monitor_memory.py`)
+state/run/        0755  the resolved configuration for the children
+state/relay/      0700  rosrv-relay    and so on, one folder for each role, for its user only
+state/control/    2710  rosrv:rosrv-api  as root: new files get the group, which may read those that say so (audit log)
+"""
+
+import contextlib
+import fcntl
+import os
+import socket
+import stat
+from collections.abc import Collection
+from pathlib import Path
+
+from appliance.base.atomic_files import remove_unfinished, write_whole
+from appliance.supervisor.errors import StartError
+from appliance.supervisor.roles import Role
+from appliance.supervisor.users import account_of
+
+ADMIN_SOCKET = "admin.sock"
+_LOCK = "lock"
+_RESTORED = Path("control", "state.db")  # a backup has no lock
+_OF_THE_DISK = "lost+found"
+_SHOWN = 3
+
+
+def foreign(path: Path) -> str | None:
+    """Why the directory at `path` is not taken for an appliance's state; None: it is one, is empty, or is not there.
+
+    Raises `OSError` where that cannot be seen.
+    """
+    if not path.is_dir():
+        return None
+    found = sorted(entry.name for entry in path.iterdir() if entry.name != _OF_THE_DISK)
+    if not found or _has_lock(path) or (path / _RESTORED).is_file():
+        return None
+    more = " …" if len(found) > _SHOWN else ""
+    return f"{path} is no state directory of an appliance: it has {', '.join(found[:_SHOWN])}{more} in it"
+
+
+def _has_lock(path: Path) -> bool:
+    """Where everybody may write, anybody may make a file of that name."""
+    try:
+        lock = (path / _LOCK).lstat()
+    except FileNotFoundError:
+        return False
+    return stat.S_ISREG(lock.st_mode) and lock.st_uid in {os.geteuid(), path.stat().st_uid}
+
+
+class StateDirectory:
+    """The state directory of one running appliance; holds its lock until `close`."""
+
+    def __init__(self, path: Path) -> None:
+        """Make the directory where needed and take its lock. Raises `StartError`."""
+        self.path = path.absolute()
+        try:
+            if (reason := foreign(self.path)) is not None:
+                raise StartError(f"{reason}; name another, empty or to be made, with --state DIR")
+            self.path.mkdir(mode=0o711, parents=True, exist_ok=True)
+            self.path.chmod(0o711)
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+            self._lock = os.open(self.path / _LOCK, flags, 0o600)
+        except OSError as error:
+            raise StartError(
+                f"state directory {self.path} cannot be used: {error.strerror}; name another with --state DIR"
+            ) from error
+        self._take_lock()
+
+    @property
+    def config(self) -> Path:
+        """Where the children find the resolved configuration."""
+        return self.path / "run" / "config.json"
+
+    def prepare(self, roles: Collection[Role]) -> None:
+        """Give each role its part, without what an earlier life was killed over.
+
+        Raises `StartError` where a part is somebody else's, or cannot be given away.
+        """
+        try:
+            self._give_parts(roles)
+        except PermissionError as error:
+            raise StartError(
+                f"the parts of the state directory {self.path} cannot be given to the users of the processes: {error}; "
+                "a container needs CAP_CHOWN for that (cap_add in compose.yaml)"
+            ) from error
+        # The lock is held and no process is started: nobody writes there.
+        place, mine = os.open(self.path, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC), os.geteuid()
+        for user, part in {(mine, "run"), *((account_of(role.user).uid, role.part) for role in roles)}:
+            with contextlib.suppress(
+                PermissionError
+            ):  # without CAP_SETUID no process starts, and that is told
+                os.seteuid(user)  # root may not look into what is others', in a container
+                remove_unfinished(part, place)
+                os.seteuid(mine)
+        os.close(place)
+
+    def _give_parts(self, roles: Collection[Role]) -> None:
+        self._folder("run", os.geteuid(), os.getegid(), 0o755)
+        for role in roles:
+            account = account_of(role.user)
+            if role.readable_by is None or os.geteuid() != 0:
+                self._folder(role.part, account.uid, account.gid, 0o700)
+            else:
+                self._folder(role.part, account.uid, account_of(role.readable_by).gid, 0o2710)
+
+    def write_config(self, text: str) -> None:
+        """Write what the children read."""
+        write_whole(self.config, text.encode(), 0o644)
+
+    def open_admin_socket(self) -> socket.socket:
+        """The listening socket that the other verbs connect to; one left by an earlier life is replaced."""
+        path = self.path / ADMIN_SOCKET
+        path.unlink(missing_ok=True)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        mask = os.umask(0o177)
+        try:
+            listener.bind(str(path))
+        except OSError as error:
+            listener.close()
+            raise StartError(
+                f"{path} cannot be made: {error}; name a shorter path with --state DIR"
+            ) from error
+        finally:
+            os.umask(mask)
+        listener.listen(64)
+        return listener
+
+    def close(self) -> None:
+        """Remove what only a running appliance has, and let the lock go."""
+        (self.path / ADMIN_SOCKET).unlink(missing_ok=True)
+        self.config.unlink(missing_ok=True)
+        os.ftruncate(self._lock, 0)
+        os.close(self._lock)
+        self._lock = -1
+
+    def _take_lock(self) -> None:
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            owner = os.pread(self._lock, 20, 0).decode("ascii", "replace").strip() or "unknown"
+            os.close(self._lock)
+            self._lock = -1
+            raise StartError(
+                f"an appliance uses the state directory {self.path} already (process {owner}): "
+                f"stop it, or name another directory with --state DIR"
+            ) from error
+        os.ftruncate(self._lock, 0)
+        os.pwrite(self._lock, f"{os.getpid()}\n".encode(), 0)
+
+    def _folder(self, name: str, uid: int, gid: int, mode: int) -> None:
+        path = self.path / name
+        try:
+            path.mkdir(mode=0o700)
+            _hand_over(path, uid, gid, mode)
+        except FileExistsError:
+            found = path.lstat()
+            # Ours: an earlier start was killed before it gave the folder away.
+            if not stat.S_ISDIR(found.st_mode) or found.st_uid not in (uid, os.geteuid()):
+                raise StartError(
+                    f"{path} is not a folder of user id {uid} (another user ran an appliance here): "
+                    f"run it as that user, `chown -R {uid}:{gid} {path}`, or name another --state DIR"
+                ) from None
+            if (stat.S_IMODE(found.st_mode), found.st_uid, found.st_gid) != (mode, uid, gid):
+                _hand_over(path, uid, gid, mode)
+
+
+def _hand_over(path: Path, uid: int, gid: int, mode: int) -> None:
+    """Give a folder to a user and group. Ours first: in a group of others the kernel drops the set-group-id bit."""
+    os.chown(path, os.geteuid(), os.getegid())
+    path.chmod(mode)
+    os.chown(path, uid, gid)

@@ -1,0 +1,1 @@
+"""Audit records and metrics of the control process."""

@@ -1,0 +1,193 @@
+"""What is measured: every metric by name, and the counters that RVMaster keeps.
+
+`METRICS` is the one list that `/metrics` is made from and docs/metrics.md is generated from
+(`python -m appliance.telemetry.metrics`). Counting is a few additions for each request; nothing is formatted there.
+Labels have few values: names of calls, categories and roles are ours; topics and services are those that are carried,
+and only so many of them by name (`appliance.control.measurements`).
+"""
+
+import bisect
+import sys
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+from appliance.channel.messages import DELAY_BOUNDS
+
+BOUNDS = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)  # seconds
+
+
+class Metric(NamedTuple):
+    """One metric; `name` as Prometheus shows it."""
+
+    name: str
+    kind: Literal["counter", "gauge", "histogram"]
+    labels: tuple[str, ...]
+    help: str
+    bounds: tuple[float, ...] = BOUNDS
+    """Of a histogram, in seconds."""
+
+
+def _counter(name: str, help: str, *labels: str) -> Metric:  # noqa: A002  as Prometheus's own client calls it
+    return Metric(name, "counter", labels, help)
+
+
+def _gauge(name: str, help: str, *labels: str) -> Metric:  # noqa: A002  as above
+    return Metric(name, "gauge", labels, help)
+
+
+def _histogram(name: str, help: str, *labels: str, bounds: tuple[float, ...] = BOUNDS) -> Metric:  # noqa: A002  as above
+    return Metric(name, "histogram", labels, help, bounds)
+
+
+METRICS = (
+    _gauge("rosrv_info", "1, with the version that runs", "version"),
+    _gauge("rosrv_start_time_seconds", "when RVMaster started, seconds since the epoch"),
+    _counter("rosrv_decisions_total", "decisions: allow, deny or would deny", "category", "outcome"),
+    _histogram("rosrv_decision_seconds", "from a request's arrival to its decision"),
+    _histogram("rosrv_master_call_seconds", "from a request's arrival to its answer", "call"),
+    _gauge("rosrv_probe_failed", "1 while the hidden ROS Master can be reached past the appliance"),
+    _gauge("rosrv_relay_connected", "1 while every relay process is there"),
+    _gauge("rosrv_relay_connections", "subscribers (topic) and clients (service) connected", "kind"),
+    _counter("rosrv_relay_messages_total", "messages relayed, by topic or service", "resource"),
+    _counter("rosrv_relay_bytes_total", "bytes relayed, by topic or service", "resource"),
+    _counter("rosrv_relay_dropped_total", "messages that slow subscribers did not get", "resource"),
+    _counter(
+        "rosrv_relay_limited_total",
+        "messages that limits of the policy dropped: of a publisher, a subscriber, a topic",
+        "resource",
+        "part",
+    ),
+    _gauge(
+        "rosrv_relay_memory_bytes",
+        "bytes that hosts hold in the relays: frames (unfinished), queues, latched, headers",
+        "what",
+    ),
+    _histogram(
+        "rosrv_relay_delay_seconds",
+        "messages by the delay the relay and its monitors added, by topic",
+        "resource",
+        bounds=DELAY_BOUNDS,
+    ),
+    _counter("rosrv_monitor_dropped_total", "messages that monitors dropped", "resource"),
+    _counter("rosrv_monitor_changed_total", "messages that monitors changed", "resource"),
+    _counter(
+        "rosrv_monitor_events_total",
+        "what monitors did: verdict, drop, change, fault, log, publish; what several changed counts for each;"
+        " `trial drop`, … of those on trial",
+        "kind",
+        "monitor",
+    ),
+    _gauge(
+        "rosrv_monitor_margin",
+        "how close a comparison of numbers at this line and column came today (UTC) while it was true, and while not",
+        "monitor",
+        "place",
+        "holds",
+    ),
+    _gauge("rosrv_monitor_slices", "slices that a parametric specification has now", "monitor"),
+    _gauge("rosrv_monitor_slice_limit", "slices that it may have at a time", "monitor"),
+    _gauge("rosrv_monitors", "monitors: enabled, trial (shadow mode), disabled, holding, failing", "state"),
+    _gauge(
+        "rosrv_switched_off",
+        "monitors disabled or in shadow mode by an order, sections of the policy audit-only: forgotten, or not yet",
+        "about",
+        "state",
+    ),
+    _gauge("rosrv_nodes", "nodes: live, or lost and awaited", "state"),
+    _gauge("rosrv_registrations", "registrations of live nodes", "kind"),
+    _gauge("rosrv_rosmaster_reachable", "1 while the real ROS Master answers"),
+    _gauge("rosrv_delivery_queue", "calls that wait to be made to nodes"),
+    _gauge("rosrv_tunnel_up", "1 while the tunnel of an enrolled host stands", "host"),
+    _gauge("rosrv_tunnel_age_seconds", "age of the SA; 0 while there is none", "host"),
+    _gauge("rosrv_tunnel_bytes", "bytes of the present SA: in (from the host), out", "host", "direction"),
+    _gauge(
+        "rosrv_host_certificate_expiry_seconds",
+        "until a host's certificate ends, negative once it has",
+        "host",
+    ),
+    _gauge(
+        "rosrv_host_ports_open",
+        "1 if a check from outside found ROS ports open, 0 if closed, -1 not known",
+        "host",
+    ),
+    _gauge("rosrv_hosts", "hosts by state, as `rosrv host list` shows it", "state"),
+    _gauge("rosrv_ipsec_troubles", "what `rosrv status` says is wrong with IPsec, in number"),
+    _gauge("rosrv_audit_queue", "audit records that wait to be on disk"),
+    _gauge("rosrv_audit_lag_seconds", "how long the oldest of them has waited"),
+    _gauge("rosrv_audit_failed", "1 while the audit log cannot be written"),
+    _gauge(
+        "rosrv_audit_degraded",
+        "1 while checkpoints, the full-text index or retention are behind, or its disk is nearly full",
+    ),
+    _gauge("rosrv_syslog_up", "1 while the audit log is forwarded; absent when it is not to be"),
+    _counter("rosrv_syslog_sent_total", "messages the receiver has, since the forwarder started"),
+    _gauge("rosrv_syslog_lag_records", "audit records that wait to be forwarded"),
+    _gauge("rosrv_syslog_lag_seconds", "how long the oldest of them has waited"),
+    _counter("rosrv_syslog_missed_total", "records that retention removed before they were forwarded"),
+    _gauge(
+        "rosrv_clock_synchronised",
+        "1 while a time service keeps the machine's clock, 0 while none does, -1 not known",
+    ),
+    _gauge("rosrv_clock_behind_seconds", "the clock was set back: it stands so long before the last record"),
+    _gauge("rosrv_recorder_up", "1 while the flight recorder runs; absent when nothing is recorded"),
+    _gauge("rosrv_recordings", "recordings that are kept"),
+    _gauge("rosrv_recordings_bytes", "bytes of them"),
+    _gauge("rosrv_policy_revision", "revision of the policy in force"),
+    _gauge("rosrv_policy_differs_from_file", "1 while the policy in force is not the file's"),
+    _counter("rosrv_process_restarts_total", "times a process was started again", "role"),
+    _gauge("rosrv_process_resident_bytes", "memory of a process", "role"),
+    _counter("rosrv_rest_calls_total", "REST calls since the api started", "method", "status"),
+)
+
+
+@dataclass(slots=True)
+class Histogram:
+    """How many were at most so long; `counts` has one more place than `BOUNDS`, for those beyond."""
+
+    counts: list[int] = field(default_factory=lambda: [0] * (len(BOUNDS) + 1))
+    sum: float = 0.0
+
+    def observe(self, seconds: float) -> None:
+        """Count one."""
+        self.counts[bisect.bisect_left(BOUNDS, seconds)] += 1
+        self.sum += seconds
+
+    def values(self) -> tuple[list[int], float]:
+        """The counts and the sum."""
+        return self.counts, self.sum
+
+
+class Meter:
+    """The counters of RVMaster, since it started."""
+
+    def __init__(self) -> None:
+        self.decisions: Counter[tuple[str, str]] = Counter()
+        self.decision_seconds = Histogram()
+        self.calls: dict[str, Histogram] = {}
+
+    def decided(self, category: str, outcome: str, seconds: float) -> None:
+        """A decision was made."""
+        self.decisions[category, outcome] += 1
+        self.decision_seconds.observe(seconds)
+
+    def called(self, call: str, seconds: float) -> None:
+        """A call of the table was answered (`call` must not be a stranger's text)."""
+        histogram = self.calls.get(call)
+        if histogram is None:
+            histogram = self.calls[call] = Histogram()
+        histogram.observe(seconds)
+
+
+def markdown() -> str:
+    """The generated part of the page on metrics."""
+    lines = ["| metric | kind | labels | meaning |", "|---|---|---|---|"]
+    lines += [
+        f"| `{row.name}` | {row.kind} | {', '.join(f'`{label}`' for label in row.labels) or '-'} | {row.help} |"
+        for row in METRICS
+    ]
+    return "\n".join([*lines, ""])
+
+
+if __name__ == "__main__":
+    sys.stdout.write(markdown())

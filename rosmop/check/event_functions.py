@@ -1,0 +1,282 @@
+"""Events as functions: match a message against the pattern, run the action, write back what was assigned.
+
+`e(m)` takes the message (None for a timer) and returns whether the event happened. Only fields that the action,
+the `when` or a constant of the pattern look at are decoded; only fields that were assigned are written.
+"""
+
+import math
+from dataclasses import replace
+
+from rosmop.check.assignables import Variable
+from rosmop.check.conversion import condition, refusal
+from rosmop.check.locate import type_of_path
+from rosmop.check.message_fields import Bound, check_overlaps, read_fields, writes
+from rosmop.check.scope import Scope, Shared, SpecificationNames
+from rosmop.check.slicing import acts, binds, creates
+from rosmop.check.statements import check_topic, write
+from rosmop.form import nodes
+from rosmop.form.compiled import EventCode
+from rosmop.form.positions import Finding
+from rosmop.form.sites import Site
+from rosmop.runtime.numbers import f32
+from rosmop.text import tree
+from rosmop.text.errors import SpecificationError
+from rosmop.types import value_types
+from rosmop.types.messages import UnknownNameError, nearest, shown
+from rosmop.types.resolve import resolve
+from rosmop.types.value_types import Type
+from roswire.errors import DefinitionError
+
+
+def compile_event(
+    shared: Shared, names: SpecificationNames, specification: tree.Specification, event: tree.Event
+) -> EventCode:
+    """Write the function of an event."""
+    function = shared.symbols.fresh("e")
+    if isinstance(event.trigger, tree.TimerTrigger):
+        return replace(_timer(shared, names, event, function), creates=creates(specification, event))
+    trigger = event.trigger
+    check_topic(trigger.topic, trigger.position)
+    kind = _message_type(shared, trigger)
+    scope = Scope(shared, names, "action")
+    scope.message_type = kind
+    scope.lines.site = scope.site(event)
+    bound = _bind(scope, event, trigger, kind)
+    happens = _assemble(scope, event, bound, *_body(scope, event, trigger))
+    whole = scope.function(function, ("m",), happens=happens)
+    shared.define(whole)
+    service = trigger.type if trigger.part is not None else None
+    return EventCode(
+        event.name,
+        function,
+        event.position,
+        trigger.topic,
+        kind,
+        trigger.part,
+        service,
+        binds=binds(names, event),
+        key=_key(shared, names, event, trigger, kind) if names.parameters else "",
+        creates=creates(specification, event),
+        plain=not event.action.statements and trigger.when is None,
+        acts=acts(whole, shared),
+    )
+
+
+def _key(
+    shared: Shared, names: SpecificationNames, event: tree.Event, trigger: tree.MessageTrigger, kind: str
+) -> str:
+    """Write the function for what an event binds: False where the message is none of its; else a list of True and
+    the values, or True alone.
+    """
+    scope = Scope(shared, names, "action")
+    scope.message_type = kind
+    # No slice has its turn: there are no values to tell.
+    site = scope.lines.site = scope.symbols.site(Site(event.position))
+    bound = _bind(scope, event, trigger, kind)
+    found = {field.variable.name: field.variable for field in bound if field.variable is not None}
+    values = [found[name] for name in names.parameters if name in found]
+    for variable in values:
+        variable.used = True
+    read_fields(scope, bound)
+    scope.add(
+        nodes.Return(site, nodes.Literal(value_types.BOOL, True), tuple(variable.code for variable in values))
+    )
+    function = shared.symbols.fresh("k")
+    shared.define(scope.function(function, ("m",), happens=len(scope.lines.found)))
+    return function
+
+
+def _timer(shared: Shared, names: SpecificationNames, event: tree.Event, function: str) -> EventCode:
+    assert isinstance(event.trigger, tree.TimerTrigger)  # the caller has looked
+    if event.parameters:
+        raise SpecificationError.at(
+            event.parameters[0].position, "a timer has no message, so it takes no parameters"
+        )
+    scope = Scope(shared, names, "timer")
+    scope.drop_refused = "a timer has no message to drop"
+    scope.lines.site = scope.site(event)
+    write(scope, event.action)
+    scope.add(nodes.Leave(scope.lines.site, True))
+    whole = scope.function(function, ("m",))
+    shared.define(whole)
+    return EventCode(
+        event.name, function, event.position, period_ns=event.trigger.period_ns, acts=acts(whole, shared)
+    )
+
+
+def _message_type(shared: Shared, trigger: tree.MessageTrigger) -> str:
+    kind = trigger.type
+    if trigger.part is not None:
+        try:
+            service = shared.messages.definitions.service(kind)
+        except DefinitionError:
+            known = shared.messages.definitions.service_types
+            raise SpecificationError.at(
+                trigger.type_position,
+                f"there is no service type {shown(kind)}{nearest(kind, known)}; others need a .srv file (--msg DIR)",
+            ) from None
+        kind = (service.request if trigger.part == "request" else service.response).name
+    try:
+        shared.messages.definition(kind)
+    except UnknownNameError as error:
+        raise SpecificationError.at(trigger.type_position, str(error)) from None
+    return kind
+
+
+# The pattern
+
+
+def _bind(scope: Scope, event: tree.Event, trigger: tree.MessageTrigger, kind: str) -> list[Bound]:
+    parameters = {}
+    for parameter in event.parameters:
+        if parameter.name in parameters:
+            raise SpecificationError.at(
+                parameter.position, f"the parameter {shown(parameter.name)} occurs twice"
+            )
+        parameters[parameter.name] = parameter
+    bound = []
+    named = {binding.variable for binding in trigger.pattern}
+    unbound = parameters.keys() - named
+    for binding in trigger.pattern:
+        try:
+            if (
+                binding.variable is not None
+                and not unbound
+                and _binds_nothing(scope, binding, parameters, kind)
+            ):
+                continue
+            bound.append(_bind_one(scope, binding, parameters, kind))
+        except SpecificationError as error:
+            scope.shared.findings += error.findings
+            scope.misdeclared.add(binding.variable or "")
+    for parameter in event.parameters:
+        if parameter.name not in named:
+            raise SpecificationError.at(
+                parameter.position,
+                f"the parameter {shown(parameter.name)} is bound to no field; write `field:{parameter.name}`",
+            )
+    return bound
+
+
+def _binds_nothing(
+    scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Parameter], kind: str
+) -> bool:
+    """Whether a variable of a pattern is no parameter of the event; ROSMOP accepts that, and so does this, warning.
+
+    Raises SpecificationError where its field is none.
+    """
+    name = binding.variable or ""
+    if name in parameters or name in scope.names.parameters:
+        return False
+    type_of_path(scope.messages, kind, binding.path)
+    text = f"{shown(name)} is not a parameter of the event, so it binds nothing; leave it out"
+    scope.shared.findings.append(Finding(binding.value_position, "warning", text))
+    return True
+
+
+def _bind_one(scope: Scope, binding: tree.Binding, parameters: dict[str, tree.Parameter], kind: str) -> Bound:
+    field = type_of_path(scope.messages, kind, binding.path)
+    if binding.constant is not None:
+        return Bound(binding, field, constant=_constant(scope, binding, field))
+    assert binding.variable is not None  # a binding has one of the two
+    parameter = parameters.get(binding.variable)
+    if parameter is None:
+        raise SpecificationError.at(
+            binding.value_position,
+            f"there is no parameter {shown(binding.variable)}{nearest(binding.variable, parameters)}",
+        )
+    target = field if parameter.type.name == ("auto",) else resolve(parameter.type, scope.messages)
+    if not value_types.convertible(field, target):
+        name = ".".join(step.name for step in binding.path)
+        raise SpecificationError.at(
+            parameter.position,
+            f"`{name}` is {field} and cannot be bound to {target}: {refusal(field, target)}",
+        )
+    if isinstance(target, value_types.Vector) and isinstance(field, value_types.Vector):
+        target = value_types.Vector(target.element, field.length)
+    sliced = scope.names.parameters.get(parameter.name)
+    if sliced is not None and sliced.type != target:
+        text = (
+            f"the parameter {shown(parameter.name)} of the specification is {sliced.type}, and {target} here"
+        )
+        raise SpecificationError.at(parameter.position, text)
+    variable = Variable(parameter.name, target, scope.symbols.fresh("v"), parameter.position)
+    variable.constant = parameter.type.constant
+    variable.flag = scope.symbols.fresh("f")
+    scope.declare(variable)
+    return Bound(binding, field, variable)
+
+
+def _constant(scope: Scope, binding: tree.Binding, field: Type) -> bool | int | float | bytes:
+    assert binding.constant is not None  # the caller has looked
+    constant = scope.value_of(binding.constant).constant
+    held = None if constant is None else _held(constant, field)
+    if held is None:
+        shown_as = repr(constant.decode("utf-8", "replace")) if isinstance(constant, bytes) else constant
+        raise SpecificationError.at(binding.value_position, f"a field of type {field} cannot hold {shown_as}")
+    return held
+
+
+def _held(constant: bool | int | float | bytes, field: Type) -> bool | int | float | bytes | None:
+    """The constant as the field holds it; None if it cannot."""
+    if isinstance(field, value_types.String):
+        return constant if isinstance(constant, bytes) else None
+    if isinstance(constant, bytes) or not value_types.is_number(field):
+        return None
+    if isinstance(field, value_types.Floating):
+        held = f32(float(constant)) if field.bits == 32 else float(constant)
+        return None if math.isinf(held) and not math.isinf(float(constant)) else held
+    if isinstance(constant, float) and (constant - constant != 0 or constant != int(constant)):
+        return None
+    if isinstance(field, value_types.Bool):
+        return bool(constant) if constant in (0, 1) else None
+    assert isinstance(field, value_types.Integer)  # numbers are one of the three
+    return int(constant) if field.least <= constant <= field.most else None
+
+
+# The body
+
+
+def _body(
+    scope: Scope, event: tree.Event, trigger: tree.MessageTrigger
+) -> tuple[list[nodes.Statement], list[nodes.Statement]]:
+    """The `when` and the action. They come first, because they say which fields are needed."""
+    when = trigger.when
+    with scope.nested() as conditions:
+        if when is not None:
+            with scope.at(when), scope.looking():
+                try:
+                    test = condition(scope.value_of(when))
+                    scope.add(nodes.Require(scope.lines.site, test))
+                except SpecificationError as error:
+                    scope.shared.findings += error.findings
+            if scope.changes_anything():
+                raise SpecificationError.at(when.position, "`when` only looks; assign in the action")
+    with scope.nested() as action:
+        write(scope, event.action)
+    return conditions, action
+
+
+def _assemble(
+    scope: Scope,
+    event: tree.Event,
+    bound: list[Bound],
+    conditions: list[nodes.Statement],
+    action: list[nodes.Statement],
+) -> int:
+    """Write all statements of the function; returns how many stand before the action."""
+    site = scope.lines.site = scope.site(event)
+    read_fields(scope, bound)
+    written = [field for field in bound if field.variable is not None and field.variable.assigned]
+    check_overlaps(bound, written)
+    fields = writes(scope, written)
+    for field in fields:
+        scope.evaluate(nodes.Assign(value_types.BOOL, field.flag, nodes.Literal(value_types.BOOL, False)))
+    if scope.pending is not None:
+        scope.add(nodes.Pending(site, scope.pending, fields))
+    scope.lines.found += conditions
+    before = len(scope.lines.found)
+    scope.lines.found += action
+    scope.add(nodes.WriteBack(site, fields, scope.temporary("w")))
+    scope.add(nodes.Leave(site, True))
+    return before

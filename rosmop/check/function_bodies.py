@@ -1,0 +1,283 @@
+"""Helper functions, `init`, first values and handlers."""
+
+from collections.abc import Iterable, Mapping, Set
+
+from rosmop.check.assignables import Value, Variable
+from rosmop.check.conversion import convert
+from rosmop.check.loops import charge
+from rosmop.check.scope import HelperFunction, Scope, Shared, SpecificationNames
+from rosmop.check.slicing import check_own
+from rosmop.check.statements import initial, known, write
+from rosmop.form import nodes
+from rosmop.text import tree
+from rosmop.text.errors import SpecificationError
+from rosmop.types import value_types
+from rosmop.types.messages import shown
+from rosmop.types.resolve import resolve
+
+_TAKEN = frozenset({"MESSAGE", "PUBLISH", "DROP", "init"})
+
+
+def declare_variables(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
+    """Give the shared variables of a specification their names and types."""
+    for declaration in specification.declarations:
+        for declarator in declaration.declarators:
+            try:
+                variable = _shared_variable(shared, names, declaration, declarator)
+                check_own(names, variable)
+            except SpecificationError as error:
+                shared.findings += error.findings
+                names.misdeclared.add(declarator.name)
+                continue
+            shared.declare(names, variable)
+
+
+def _shared_variable(
+    shared: Shared, names: SpecificationNames, declaration: tree.Declaration, declarator: tree.Declarator
+) -> Variable:
+    if declarator.name in names.variables or declarator.name in _TAKEN:
+        raise SpecificationError.at(declarator.position, f"{shown(declarator.name)} is declared twice")
+    scope = Scope(shared, names, "init")
+    scope.lines.site = scope.site(declaration)
+    automatic = declaration.type.name == ("auto",)
+    if automatic and _constant(scope, declarator) is None:
+        raise SpecificationError.at(
+            declaration.position,
+            "a shared variable needs a type; `auto` is for local ones, and for constants that are written down",
+        )
+    value = declarator.value if automatic or (declarator.is_array and declarator.size is None) else None
+    if declarator.is_array and value is None and isinstance(declarator.value, tree.Elements):
+        value = tree.Elements(declarator.value.position, ())
+    kind, _ = initial(scope, declaration.type, tree.Declarator(
+        declarator.position, declarator.name, size=declarator.size, is_array=declarator.is_array, value=value,
+    ))  # fmt: skip
+    return Variable(
+        declarator.name,
+        kind,
+        shared.symbols.fresh("g"),
+        declarator.position,
+        shared=True,
+        constant=declaration.type.constant,
+        known=_known(scope, declaration, declarator, kind),
+        sliced=bool(names.parameters) and not (declaration.type.static or declaration.type.constant),
+    )
+
+
+def _known(
+    scope: Scope, declaration: tree.Declaration, declarator: tree.Declarator, kind: value_types.Type
+) -> bool | int | float | None:
+    """The value of a constant, if it can be told now; what is wrong with it is found when it is compiled."""
+    try:
+        return known(scope, declaration.type, declarator, kind)
+    except SpecificationError:
+        return None
+
+
+def compile_start(
+    shared: Shared, names: SpecificationNames, specification: tree.Specification
+) -> tuple[str, ...]:
+    """Write the functions by which a specification begins: constants and zeros, first values, `init`.
+
+    Each is called for all specifications before the next one, because one may read another's variables.
+    """
+    scopes = [
+        _constants(shared, names, specification),
+        _first_values(shared, names, specification),
+        _start_scope(shared, names),
+    ]
+    for init in specification.inits:
+        write(scopes[-1], init.body)
+    if len(specification.inits) > 1:
+        raise SpecificationError.at(specification.inits[1].position, "`init` occurs twice")
+    functions = tuple(shared.symbols.fresh("i") for _ in scopes)
+    for scope, function in zip(scopes, functions, strict=True):
+        shared.define(scope.function(function, ()))
+    return functions
+
+
+def _start_scope(shared: Shared, names: SpecificationNames) -> Scope:
+    scope = Scope(shared, names, "init")
+    scope.drop_refused = "there is no message yet"
+    return scope
+
+
+def _constants(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> Scope:
+    """What C++ calls static initialisation: the constants that are written down, zero for the rest."""
+    scope = _start_scope(shared, names)
+    for parameter in names.parameters.values():
+        scope.written.add(parameter.code)
+        scope.evaluate(nodes.Assign(parameter.type, parameter.code, nodes.Zero(parameter.type)))
+    for declaration in specification.declarations:
+        for declarator in declaration.declarators:
+            variable = names.variables.get(declarator.name)
+            if variable is not None:
+                scope.written.add(variable.code)
+                value = _constant(scope, declarator)
+                first: nodes.Expression = nodes.Zero(variable.type)
+                if value is not None and value_types.convertible(value.type, variable.type):
+                    first = convert(scope, value, variable.type)
+                scope.evaluate(nodes.Assign(variable.type, variable.code, first))
+    return scope
+
+
+def _constant(scope: Scope, declarator: tree.Declarator) -> Value | None:
+    """A constant first value; what is wrong with one is found when it is compiled as a first value."""
+    if declarator.is_array or declarator.value is None or isinstance(declarator.value, tree.Elements):
+        return None
+    try:
+        value = scope.value_of(declarator.value)
+    except SpecificationError:
+        return None
+    return value if value.constant is not None else None
+
+
+def _first_values(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> Scope:
+    scope = _start_scope(shared, names)
+    scope.below = set(names.variables)
+    for declaration in specification.declarations:
+        for declarator in declaration.declarators:
+            variable = names.variables.get(declarator.name)
+            scope.below.discard(declarator.name)
+            if variable is None:
+                continue
+            try:
+                _first_value(scope, declaration, declarator, variable)
+            except SpecificationError as error:
+                shared.findings += error.findings
+    return scope
+
+
+def _first_value(
+    scope: Scope, declaration: tree.Declaration, declarator: tree.Declarator, variable: Variable
+) -> None:
+    with scope.at(declarator):
+        _, value = initial(scope, declaration.type, declarator)
+        scope.written.add(variable.code)
+        scope.evaluate(nodes.Assign(variable.type, variable.code, value))
+
+
+def declare_functions(shared: Shared, names: SpecificationNames, specification: tree.Specification) -> None:
+    """Give the helper functions of a specification their names and types."""
+    for node in specification.functions:
+        try:
+            names.functions[node.name] = _signature(shared, names, node)
+        except SpecificationError as error:
+            shared.findings += error.findings
+            names.misdeclared.add(node.name)
+    called = _calls(names)
+    for name, function in names.functions.items():
+        reached = _reached(called[name], called)
+        function.recursive = name in reached
+        if function.references:
+            function.names = frozenset().union(
+                *(_free_names(names.functions[callee].node) for callee in {name, *reached})
+            )
+
+
+def _calls(names: SpecificationNames) -> dict[str, set[str]]:
+    """The functions of the specification that each of them calls."""
+    known = names.functions
+    return {name: {*_called(function.node.body)} & known.keys() for name, function in known.items()}
+
+
+def topics_of(names: SpecificationNames, function: str) -> list[str]:
+    """What a function publishes, and those that it calls."""
+    reached = _reached({function}, _calls(names))
+    found = (node for name in reached for node in _nodes(names.functions[name].node.body))
+    return sorted({node.topic for node in found if isinstance(node, tree.Publish)})
+
+
+def _signature(shared: Shared, names: SpecificationNames, node: tree.Function) -> HelperFunction:
+    if node.name in names.functions or node.name in _TAKEN:
+        raise SpecificationError.at(node.position, f"the function {shown(node.name)} is declared twice")
+    result = value_types.VOID if node.type is None else resolve(node.type, shared.messages)
+    parameters = []
+    references = []
+    for parameter in node.parameters:
+        kind = resolve(parameter.type, shared.messages)
+        variable = Variable(
+            parameter.name,
+            kind,
+            shared.symbols.fresh("v"),
+            parameter.position,
+            constant=parameter.type.constant and parameter.type.reference,
+            copied=(kind == value_types.CHARACTERS and not parameter.type.reference)
+            or parameter.type.name == ("[]",),
+        )
+        parameters.append(variable)
+        if parameter.type.reference and not parameter.type.constant:
+            references.append(variable)
+    return HelperFunction(
+        node.name, shared.symbols.fresh("h"), result, tuple(parameters), tuple(references), node
+    )
+
+
+def _reached(first: Set[str], called: Mapping[str, Set[str]]) -> set[str]:
+    """The functions that are called from these, however far away, and these."""
+    seen = set(first)
+    waiting = list(first)
+    while waiting:
+        further = called[waiting.pop()] - seen
+        seen |= further
+        waiting += further
+    return seen
+
+
+def _called(node: tree.Node) -> Iterable[str]:
+    for inner in _nodes(node):
+        if isinstance(inner, tree.Call) and isinstance(inner.callee, tree.Name):
+            yield inner.callee.parts[-1]
+
+
+def _free_names(function: tree.Function) -> set[str]:
+    """The names in a function that it does not declare itself."""
+    inside = list(_nodes(function.body))
+    own = {inner.name for inner in inside if isinstance(inner, tree.Declarator | tree.RangeFor)}
+    own |= {parameter.name for parameter in function.parameters}
+    return {
+        inner.parts[0] for inner in inside if isinstance(inner, tree.Name) and len(inner.parts) == 1
+    } - own
+
+
+def _nodes(node: tree.Node) -> Iterable[tree.Node]:
+    waiting: list[object] = [node]
+    while waiting:
+        current = waiting.pop()
+        if isinstance(current, tuple):
+            waiting += current
+        elif isinstance(current, tree.Node):
+            yield current
+            waiting += [getattr(current, name) for name in current.__dataclass_fields__]
+
+
+def compile_function(shared: Shared, names: SpecificationNames, function: HelperFunction) -> None:
+    """Write a helper function."""
+    scope = Scope(shared, names, "function")
+    scope.drop_refused = "a function has no message; return a `bool` and drop in the action"
+    scope.result, scope.references, scope.recursive = function.result, function.references, function.recursive
+    for variable in function.parameters:
+        scope.declare(variable)
+    with scope.at(function.node):
+        charge(scope, function.node.body)
+        if function.recursive:
+            scope.add(nodes.LimitDepth(scope.lines.site, function.name))
+        write(scope, function.node.body)
+        nothing = nodes.Literal(value_types.VOID, None)
+        value = nothing if isinstance(function.result, value_types.Void) else nodes.Zero(function.result)
+        handed = tuple(variable.code for variable in function.references)
+        scope.add(nodes.Return(scope.lines.site, value, handed))
+    function.changes, function.calls = frozenset(scope.changes_shared), frozenset(scope.calls)
+    parameters = [variable.code for variable in function.parameters] + ["n"] * function.recursive
+    shared.define(scope.function(function.code, tuple(parameters)))
+
+
+def compile_handler(
+    shared: Shared, names: SpecificationNames, handler: tree.Handler, drop_refused: str | None
+) -> str:
+    """Write the function of a handler; returns its name."""
+    scope = Scope(shared, names, "handler")
+    scope.drop_refused = drop_refused
+    write(scope, handler.body)
+    function = shared.symbols.fresh("j")
+    shared.define(scope.function(function, ("m",)))
+    return function

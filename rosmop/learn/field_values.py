@@ -1,0 +1,155 @@
+"""The values of a message's fields by their paths, as far as something can be learnt from them.
+
+Numbers, strings and times come as they are, arrays of numbers as numpy arrays, arrays of strings as lists; of arrays of
+messages only how many there are. Bytes (images, points, maps) mean nothing one by one and are left out, as is the
+`seq` of headers, which every publisher counts on by itself.
+"""
+
+import struct
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from roswire.message_layout import ArrayPart, FixedPart, Layout, Leaf, StringPart
+from roswire.message_text import PRIMITIVES
+
+MOST_ELEMENTS = 20_000
+"""Longer arrays are left out: a monitor that looks at each of their elements would be too slow."""
+
+_LENGTH = struct.Struct("<I")
+_BYTES = frozenset({"uint8", "int8", "char", "byte", "bool"})
+_NO_NUMBERS = frozenset({"time", "duration"})
+
+Value = Any  # float, int, bool, str, (seconds, nanoseconds) or an array of the first four
+_Part = Callable[[bytes, int, dict[str, Value]], int]
+
+
+class MessageError(Exception):
+    """The bytes are no message of this type."""
+
+
+class Fields:
+    """Reads the messages of one type."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._parts = [_reader(part) for part in layout.parts]
+        self.types = dict(_types(layout))
+        """The primitive types of the fields that are read; with `[]` those of arrays, `length` where only that is."""
+
+    def read(self, data: bytes) -> dict[str, Value]:
+        """The values by path. Raises `MessageError`."""
+        values: dict[str, Value] = {}
+        position = 0
+        try:
+            for part in self._parts:
+                position = part(data, position, values)
+        except (struct.error, ValueError) as error:
+            raise MessageError(str(error)) from error
+        return values
+
+
+def _wanted(path: str) -> bool:
+    return path != "header.seq" and not path.endswith(".header.seq")
+
+
+def _types(layout: Layout) -> Iterator[tuple[str, str]]:
+    for part in layout.parts:
+        for item in part.leaves if isinstance(part, FixedPart) else (part,):
+            if isinstance(item, StringPart):
+                yield item.path, "string"
+            elif isinstance(item, Leaf) and item.count is None:
+                if _wanted(item.path):
+                    yield item.path, item.type
+            elif _elements_read(item):
+                yield item.path, f"{item.type}[]"
+            elif isinstance(item, ArrayPart):
+                yield item.path, "length"
+
+
+def _elements_read(item: Leaf | ArrayPart) -> bool:
+    return item.layout is None and item.type not in _BYTES | _NO_NUMBERS
+
+
+def _reader(part: FixedPart | StringPart | ArrayPart) -> _Part:
+    if isinstance(part, FixedPart):
+        return _fixed(part)
+    if isinstance(part, StringPart):
+
+        def text(data: bytes, position: int, values: dict[str, Value]) -> int:
+            end, values[part.path] = _string(data, position)
+            return end
+
+        return text
+    return _array(part)
+
+
+def _fixed(part: FixedPart) -> _Part:
+    scalars = [leaf for leaf in part.leaves if leaf.count is None and _wanted(leaf.path)]
+    arrays = [
+        (leaf.path, leaf.offset, leaf.count, np.dtype("<" + PRIMITIVES[leaf.type][0]))
+        for leaf in part.leaves
+        if leaf.count is not None and leaf.count <= MOST_ELEMENTS and _elements_read(leaf)
+    ]
+    chosen = {leaf.path for leaf in scalars}
+    code = "<" + "".join(
+        PRIMITIVES[leaf.type][0] if leaf.path in chosen else f"{leaf.size}x" for leaf in part.leaves
+    )
+    unpack = struct.Struct(code).unpack_from
+    times = [leaf.type in _NO_NUMBERS for leaf in scalars]
+
+    def read(data: bytes, position: int, values: dict[str, Value]) -> int:
+        found = iter(unpack(data, position))
+        for leaf, is_time in zip(scalars, times, strict=True):
+            values[leaf.path] = (next(found), next(found)) if is_time else next(found)
+        for path, offset, count, kind in arrays:
+            values[path] = np.frombuffer(data, kind, count, position + offset)
+        return position + part.size
+
+    return read
+
+
+def _array(part: ArrayPart) -> _Part:
+    kind = (
+        np.dtype("<" + PRIMITIVES[part.type][0]) if _elements_read(part) and part.type != "string" else None
+    )
+    nested = [_reader(inner) for inner in part.layout.parts] if part.layout is not None else []
+
+    def read(data: bytes, position: int, values: dict[str, Value]) -> int:
+        count = part.count
+        if count is None:
+            (count,) = _LENGTH.unpack_from(data, position)
+            position += 4
+        if part.type == "string":
+            texts = []
+            for _ in range(count):
+                position, text = _string(data, position)
+                texts.append(text)
+            values[part.path] = texts
+            return position
+        if kind is not None:
+            values[part.path] = np.frombuffer(data, kind, count, position) if count else np.empty(0, kind)
+        else:
+            values[part.path] = count
+        if part.element_size is not None:
+            return _within(data, position + count * part.element_size)
+        for _ in range(count):
+            ignored: dict[str, Value] = {}
+            for inner in nested:
+                position = inner(data, position, ignored)
+        return position
+
+    return read
+
+
+def _string(data: bytes, position: int) -> tuple[int, str]:
+    (length,) = _LENGTH.unpack_from(data, position)
+    start = position + 4
+    end = _within(data, start + length)
+    return end, data[start:end].decode("utf-8", "surrogateescape")
+
+
+def _within(data: bytes, position: int) -> int:
+    if position > len(data):
+        raise ValueError("it ends too early")
+    return position
