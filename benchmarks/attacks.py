@@ -665,11 +665,12 @@ class Rig:
     def round(self, names: Sequence[Callable[..., None]], addresses: Sequence[str]) -> dict[str, Any]:
         """Measure while these attacks go on."""
         before = self.appliance.pids("relay")
-        started = [attack(self.crowd, function, addresses) for function in names]
+        started: list[tuple[Any, Event]] = []
         try:
-            for _, under_way in started:
-                if not under_way.wait(60):
-                    raise TimeoutError("the attack did not begin")
+            for function in names:  # one after the other: an attack may use up what the next needs to begin
+                started.append(attack(self.crowd, function, addresses))
+                if not started[-1][1].wait(60):
+                    raise TimeoutError(f"the attack {function.__name__} did not begin")
             found = self.measure()
         finally:
             for process, _ in started:
@@ -713,7 +714,7 @@ def main() -> None:
                     if who == "unknown" and "scans" in what:
                         continue  # no rule lets an unknown host publish scans
                     rows.append((what, who, rig.round(ATTACKS[what], GUEST if who == "guest" else UNKNOWN)))
-                    Console(stderr=True).print(*rows[-1])
+                    Console(stderr=True).print(json.dumps(rows[-1]), soft_wrap=True)
         for burner in burners:
             burner.kill()
     show(rows)
