@@ -21,7 +21,7 @@ from typing import cast
 
 from appliance.api.problems import ProblemError, too_many
 from appliance.api.rates import Buckets, peer_key
-from appliance.channel.answers.tokens import TokenRole
+from appliance.channel.answers.token_answers import TokenRole
 from appliance.channel.messages.api import Asked, TokenKept
 from appliance.configuration.settings import is_loopback
 from appliance.quotas.pool import Standing

@@ -19,10 +19,10 @@ from starlette.responses import JSONResponse, StreamingResponse
 
 from appliance.api.access import Bearer
 from appliance.api.denials import asks_policy
-from appliance.api.judgement import explained, granted
+from appliance.api.dry_run_policy import explained, granted
 from appliance.api.moments import given
 from appliance.api.problems import ProblemError
-from appliance.api.roles import OPERATOR, VIEWER, Viewer, ask, reads_contents
+from appliance.api.route_roles import OPERATOR, VIEWER, Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
 from appliance.api.streams import Held, Streams, in_thread, peer_of, turn
@@ -39,7 +39,7 @@ from appliance.audit.search import Follower, Shown, export, search, show
 from appliance.audit.signatures import KeyUnreadableError
 from appliance.audit.verification import verify
 from appliance.channel.admin import PolicyWanted
-from appliance.channel.answers.policy import Granted, Why
+from appliance.channel.answers.policy_answers import Granted, Why
 from appliance.policy.grant import UngrantableError
 from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 

@@ -11,11 +11,11 @@ import msgspec
 from appliance.audit.record import Record
 from appliance.audit.record_format import rule_text
 from appliance.audit.repetition import KIND
-from appliance.channel.messages.relay import NO_GRANT
+from appliance.channel.messages.relay_link import NO_GRANT
 from appliance.policy.grant import Asked, UngrantableError, asked
 from appliance.policy.model import Category
+from appliance.policy.policy_settings import AT_ONCE
 from appliance.policy.rights import category_of
-from appliance.policy.settings import AT_ONCE
 
 _ASKS = {"topic": "requestTopic", "service": "lookupService"}
 """The call that gives the right to connect, by what a connection is for."""

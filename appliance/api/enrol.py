@@ -19,17 +19,17 @@ from fastapi import Header, Request, Response
 from msgspec import convert
 from msgspec.structs import asdict
 
-from appliance.api.hosts import SLOW_SECONDS, OneName
+from appliance.api.host_routes import SLOW_SECONDS, OneName
 from appliance.api.hosts_models import Enrolled, Enrolment, Renewal
 from appliance.api.kits import Wishes, kit_of
 from appliance.api.problems import ProblemError, too_many
 from appliance.api.rates import Buckets
-from appliance.api.roles import answered
+from appliance.api.route_roles import answered
 from appliance.api.routing import Responses, Routes, answer, body, content, file
 from appliance.api.services import Services
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
-from appliance.channel.answers.hosts import NewCertificate
+from appliance.channel.answers.host_answers import NewCertificate
 from appliance.ipsec.enrolment_kit import archive, members
 
 _ALL = "all"

@@ -9,7 +9,7 @@ from typing import Literal
 import msgspec
 
 from appliance.api.problems import ProblemError
-from appliance.api.roles import add_look
+from appliance.api.route_roles import add_look
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.channel.admin import InventoryWanted, StatusWanted

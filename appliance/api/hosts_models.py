@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from appliance.channel.answers.field_docs import Moment, told
-from appliance.channel.answers.hosts import PortsState
+from appliance.channel.answers.host_answers import PortsState
 
 HOST_NAME = r"^[A-Za-z0-9](?:[A-Za-z0-9._-]{0,61}[A-Za-z0-9])?$"
 ENDPOINT = r"^[A-Za-z0-9][A-Za-z0-9.:-]{0,252}$"

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from appliance.channel.answers.hosts import KitParts
+from appliance.channel.answers.host_answers import KitParts
 from appliance.ipsec.enrolment_kit import Kit
 from appliance.network.close_ports import parse_ports, parse_services, protection
 

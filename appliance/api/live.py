@@ -19,7 +19,7 @@ from appliance.api.control import ControlAwayError
 from appliance.api.history import BUSY_SECONDS, Sample, Seen
 from appliance.api.moments import in_full
 from appliance.api.problems import ProblemError
-from appliance.api.roles import VIEWER, Viewer, ask
+from appliance.api.route_roles import VIEWER, Viewer, ask
 from appliance.api.routing import Routes, file
 from appliance.api.services import Services
 from appliance.api.streams import Held, Streams, peer_of

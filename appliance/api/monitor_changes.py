@@ -14,19 +14,19 @@ from appliance.api.access import Bearer
 from appliance.api.control import ControlLink
 from appliance.api.monitor_judgement import findings_of, refusal
 from appliance.api.monitor_models import NewSpecifications, NewText, Replaced, Switch, SwitchMany
-from appliance.api.monitors import UNKNOWN, OneName, unknown_monitor
+from appliance.api.monitor_routes import UNKNOWN, OneName, unknown_monitor
 from appliance.api.policy_changes import Confirm, DryRun
 from appliance.api.policy_models import Rollback
 from appliance.api.preconditions import IfMatch, etag, expected_tag
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Admin, Operator, answered, ask, problem_of
+from appliance.api.route_roles import Admin, Operator, answered, ask, problem_of
 from appliance.api.routing import ETAG, Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
-from appliance.channel.answers import monitors as answers
-from appliance.channel.answers.monitors import MonitorsConfirmed, Switched
-from appliance.channel.answers.tokens import may
+from appliance.channel.answers import monitor_answers as answers
+from appliance.channel.answers.monitor_answers import MonitorsConfirmed, Switched
+from appliance.channel.answers.token_answers import may
 
 _COMPILE_SECONDS = 40.0  # of RVMaster and then of the relay
 Prune = Annotated[bool, Query(description="also remove what the folder does not have")]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from appliance.api.monitor_models import EventShown, PropertyShown
 from appliance.api.problems import Finding, ProblemError
-from appliance.channel.answers.monitors import Monitors
+from appliance.channel.answers.monitor_answers import Monitors
 
 if TYPE_CHECKING:
     from rosmop.run.engine import MonitorSet

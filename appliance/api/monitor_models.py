@@ -7,7 +7,7 @@ import msgspec
 from appliance.api.policy_models import Signature
 from appliance.api.problems import Finding
 from appliance.channel.answers.field_docs import Moment, told
-from appliance.channel.answers.monitors import MonitorState, Tag
+from appliance.channel.answers.monitor_answers import MonitorState, Tag
 
 _WHOLE = r"(?!\n)"  # after `$`, which Python finds before a last newline, too
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=256)]

@@ -10,16 +10,16 @@ from fastapi import Query
 from msgspec.structs import replace
 
 from appliance.api.access import Bearer
-from appliance.api.judgement import judge_change
+from appliance.api.dry_run_policy import judge_change
 from appliance.api.policy_models import PolicyText, Report, Rollback
 from appliance.api.preconditions import IfMatch, expected_revision
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Operator, ask, problem_of
+from appliance.api.route_roles import Operator, ask, problem_of
 from appliance.api.routing import Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services
 from appliance.channel import admin
-from appliance.channel.answers.policy import Loaded, PolicyConfirmed
-from appliance.channel.answers.tokens import may
+from appliance.channel.answers.policy_answers import Loaded, PolicyConfirmed
+from appliance.channel.answers.token_answers import may
 
 _CHANGES: Responses = {
     412: {"description": "Another policy is in force than If-Match names."},

@@ -24,10 +24,10 @@ from appliance.api.access import Doorkeeper
 from appliance.api.certificate import pin_of, renew, tls_context
 from appliance.api.control import ControlLink
 from appliance.api.etags import Unchanged
-from appliance.api.gate import Gate
 from appliance.api.history import History, measures_of
 from appliance.api.journal import FOLD_SECONDS, Journal
 from appliance.api.listener import Listener
+from appliance.api.request_gate import Gate
 from appliance.api.services import Services
 from appliance.base import lazy_imports
 from appliance.channel import messages

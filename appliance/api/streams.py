@@ -16,7 +16,7 @@ from starlette.types import Receive, Scope, Send
 
 from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
-from appliance.channel.answers.tokens import TokenRole
+from appliance.channel.answers.token_answers import TokenRole
 from appliance.quotas.pool import Pool, Standing
 from appliance.quotas.table import Share
 

@@ -4,12 +4,12 @@ from typing import Annotated
 
 import msgspec
 
-from appliance.api.roles import Viewer, add_look
+from appliance.api.route_roles import Viewer, add_look
 from appliance.api.routing import Routes
 from appliance.api.services import Services
 from appliance.channel.admin import ChallengeWanted
 from appliance.channel.answers.field_docs import Moment, told
-from appliance.channel.answers.tokens import TokenRole
+from appliance.channel.answers.token_answers import TokenRole
 
 
 class Holder(msgspec.Struct, frozen=True):

@@ -16,18 +16,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, NamedTuple, 
 import msgspec
 
 from appliance.channel.answers import (
-    evidence,
-    graph,
-    hosts,
-    inventory,
+    evidence_answers,
+    graph_answers,
+    host_answers,
+    inventory_answers,
     measures,
-    monitors,
-    policy,
-    recordings,
+    monitor_answers,
+    policy_answers,
+    recording_answers,
     status,
-    tokens,
+    token_answers,
 )
-from appliance.channel.answers.tokens import TokenRole
+from appliance.channel.answers.token_answers import TokenRole
 
 A = TypeVar("A")
 PARAMETERS = {"names": "name", "topics": "topic"}
@@ -106,12 +106,12 @@ class StatusWanted(AdminRequest[status.Status], frozen=True, tag="status"):
 
 
 @rest("viewer", "GET", "/v1/inventory")
-class InventoryWanted(AdminRequest[inventory.Inventory], frozen=True, tag="inventory"):
+class InventoryWanted(AdminRequest[inventory_answers.Inventory], frozen=True, tag="inventory"):
     """What runs: version, build, parts with their licences, what is used of the kernel."""
 
 
 @rest("operator", "POST", "/v1/policy/reload", _WITHIN)
-class PolicyReload(AdminRequest[policy.Loaded], frozen=True, tag="policy reload"):
+class PolicyReload(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy reload"):
     """Read the policy file again; back by itself after `confirm_within` seconds unless confirmed."""
 
     confirm_within: float | None = None
@@ -119,7 +119,7 @@ class PolicyReload(AdminRequest[policy.Loaded], frozen=True, tag="policy reload"
 
 
 @rest("operator", "POST", "/v1/policy/rollback")
-class PolicyRollback(AdminRequest[policy.Loaded], frozen=True, tag="policy rollback"):
+class PolicyRollback(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy rollback"):
     """Back to a kept revision; None: the one before the present."""
 
     revision: int | None = None
@@ -127,14 +127,14 @@ class PolicyRollback(AdminRequest[policy.Loaded], frozen=True, tag="policy rollb
 
 
 @rest("operator", "POST", "/v1/policy/confirm")
-class PolicyConfirm(AdminRequest[policy.PolicyConfirmed], frozen=True, tag="policy confirm"):
+class PolicyConfirm(AdminRequest[policy_answers.PolicyConfirmed], frozen=True, tag="policy confirm"):
     """Keep a change that would go back by itself."""
 
     expected: int | None = None
 
 
 @rest("admin", "POST", "/v1/policy", _WITHIN)
-class PolicyLoad(AdminRequest[policy.Loaded], frozen=True, tag="policy load"):
+class PolicyLoad(AdminRequest[policy_answers.Loaded], frozen=True, tag="policy load"):
     """Bring a text into force that is not the file's: check, test, swap, decide again what is live."""
 
     text: str
@@ -145,29 +145,29 @@ class PolicyLoad(AdminRequest[policy.Loaded], frozen=True, tag="policy load"):
 
 
 @rest("viewer")
-class PolicyWanted(AdminRequest[policy.PolicyKnown], frozen=True, tag="policy"):
+class PolicyWanted(AdminRequest[policy_answers.PolicyKnown], frozen=True, tag="policy"):
     """The text of a revision (None: the one in force), and with what it is judged: its tests, the robot."""
 
     revision: int | None = None
 
 
 @rest("viewer", "GET", "/v1/policy/revisions")
-class PolicyRevisions(AdminRequest[policy.PolicyRevisionList], frozen=True, tag="policy revisions"):
+class PolicyRevisions(AdminRequest[policy_answers.PolicyRevisionList], frozen=True, tag="policy revisions"):
     """The kept revisions, the newest first."""
 
 
 @rest("viewer")
-class RegistrationsWanted(AdminRequest[graph.Registrations], frozen=True, tag="registrations"):
+class RegistrationsWanted(AdminRequest[graph_answers.Registrations], frozen=True, tag="registrations"):
     """What is live now and a change of the policy may end."""
 
 
 @rest("viewer", "GET", "/v1/graph")
-class GraphWanted(AdminRequest[graph.Graph], frozen=True, tag="graph"):
+class GraphWanted(AdminRequest[graph_answers.Graph], frozen=True, tag="graph"):
     """Nodes, topics and services, who is mediated, and rates."""
 
 
 @rest("operator", "GET", "/v1/messages", ("topic", "messages", "seconds", "latched"))
-class TopicLook(WaitingRequest[graph.TopicMessages], frozen=True, tag="topic look"):
+class TopicLook(WaitingRequest[graph_answers.TopicMessages], frozen=True, tag="topic look"):
     """The next messages of a topic, read as fields; it is recorded who looked. At most 20, and for ten seconds.
 
     `latched`: what its publishers latched comes first; whoever looks on has it already.
@@ -185,14 +185,14 @@ class MetricsWanted(AdminRequest[measures.Measures], frozen=True, tag="metrics")
 
 
 @rest("viewer", "GET", "/v1/monitors", ("texts",))
-class MonitorsWanted(AdminRequest[monitors.Monitors], frozen=True, tag="monitors"):
+class MonitorsWanted(AdminRequest[monitor_answers.Monitors], frozen=True, tag="monitors"):
     """The monitors with their state and counters; with `texts`, also the specifications themselves."""
 
     texts: bool = False
 
 
 @rest("admin", "POST", "/v1/monitors", _LOADED)
-class MonitorLoad(AdminRequest[monitors.Replaced], frozen=True, tag="monitor load"):
+class MonitorLoad(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor load"):
     """Add or replace files of specifications, and the message definitions they need (`package/Type.msg`).
 
     `signatures` are the site's, by the names of both.
@@ -212,7 +212,7 @@ class MonitorLoad(AdminRequest[monitors.Replaced], frozen=True, tag="monitor loa
 
 
 @rest("operator")
-class MonitorTry(WaitingRequest[monitors.Tried], frozen=True, tag="monitor try"):
+class MonitorTry(WaitingRequest[monitor_answers.Tried], frozen=True, tag="monitor try"):
     """What loading these would do (see `MonitorLoad`): they are compiled, and nothing changes."""
 
     files: dict[str, str]
@@ -224,7 +224,7 @@ class MonitorTry(WaitingRequest[monitors.Tried], frozen=True, tag="monitor try")
 
 
 @rest("admin", "PUT", "/v1/monitors/{name}", _LOADED)
-class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor replace"):
+class MonitorReplace(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor replace"):
     """Put a text in the place of the file that the monitor `name` stands in, or of the file of this name.
 
     `signatures` are those of the definitions.
@@ -243,7 +243,7 @@ class MonitorReplace(AdminRequest[monitors.Replaced], frozen=True, tag="monitor 
 
 
 @rest("operator", "POST", "/v1/monitors/reload", ("prune", *_LOADED))
-class MonitorReload(AdminRequest[monitors.Replaced], frozen=True, tag="monitor reload"):
+class MonitorReload(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor reload"):
     """Take what the folder of specifications has now; what it does not have stays, unless `prune`."""
 
     expected: str | None = None
@@ -255,7 +255,7 @@ class MonitorReload(AdminRequest[monitors.Replaced], frozen=True, tag="monitor r
 
 @rest("admin", "DELETE", "/v1/monitors", ("names", "confirm_within"))
 @rest("admin", "DELETE", "/v1/monitors/{names}", _WITHIN)
-class MonitorRemove(AdminRequest[monitors.Replaced], frozen=True, tag="monitor remove"):
+class MonitorRemove(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor remove"):
     """Remove specifications, by the names of their files or monitors."""
 
     names: list[str]
@@ -264,7 +264,7 @@ class MonitorRemove(AdminRequest[monitors.Replaced], frozen=True, tag="monitor r
 
 
 @rest("admin", "POST", "/v1/monitors/rollback")
-class MonitorRollback(AdminRequest[monitors.Replaced], frozen=True, tag="monitor rollback"):
+class MonitorRollback(AdminRequest[monitor_answers.Replaced], frozen=True, tag="monitor rollback"):
     """Back to a kept revision; None: the one before the present."""
 
     revision: int | None = None
@@ -272,19 +272,21 @@ class MonitorRollback(AdminRequest[monitors.Replaced], frozen=True, tag="monitor
 
 
 @rest("operator", "POST", "/v1/monitors/confirm")
-class MonitorConfirm(AdminRequest[monitors.MonitorsConfirmed], frozen=True, tag="monitor confirm"):
+class MonitorConfirm(AdminRequest[monitor_answers.MonitorsConfirmed], frozen=True, tag="monitor confirm"):
     """Keep specifications that would go back by themselves."""
 
     expected: str | None = None
 
 
 @rest("viewer", "GET", "/v1/monitors/revisions")
-class MonitorRevisions(AdminRequest[monitors.MonitorRevisionList], frozen=True, tag="monitor revisions"):
+class MonitorRevisions(
+    AdminRequest[monitor_answers.MonitorRevisionList], frozen=True, tag="monitor revisions"
+):
     """The kept revisions of the specifications."""
 
 
 @rest("viewer", "GET", "/v1/monitors/revisions/{revision}")
-class MonitorRevisionWanted(AdminRequest[monitors.RevisionTexts], frozen=True, tag="monitor revision"):
+class MonitorRevisionWanted(AdminRequest[monitor_answers.RevisionTexts], frozen=True, tag="monitor revision"):
     """The texts of a kept revision."""
 
     revision: int
@@ -292,7 +294,7 @@ class MonitorRevisionWanted(AdminRequest[monitors.RevisionTexts], frozen=True, t
 
 @rest("operator", "PATCH", "/v1/monitors")
 @rest("operator", "PATCH", "/v1/monitors/{names}")
-class MonitorSwitch(AdminRequest[monitors.Switched], frozen=True, tag="monitor switch"):
+class MonitorSwitch(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor switch"):
     """Let the events of these monitors happen, or not: for `for_seconds`, or (None) until they are enabled again."""
 
     names: list[str]
@@ -303,7 +305,7 @@ class MonitorSwitch(AdminRequest[monitors.Switched], frozen=True, tag="monitor s
 
 @rest("operator", "PATCH", "/v1/monitors", ("force",))
 @rest("operator", "PATCH", "/v1/monitors/{names}", ("force",))
-class MonitorShadow(AdminRequest[monitors.Switched], frozen=True, tag="monitor shadow"):
+class MonitorShadow(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor shadow"):
     """Put these monitors into shadow mode, or (false) bring those in shadow mode into force; `force` as of a load."""
 
     names: list[str]
@@ -314,7 +316,7 @@ class MonitorShadow(AdminRequest[monitors.Switched], frozen=True, tag="monitor s
 
 @rest("operator", "PATCH", "/v1/monitors")
 @rest("operator", "PATCH", "/v1/monitors/{names}")
-class MonitorTrial(AdminRequest[monitors.Switched], frozen=True, tag="monitor trial"):
+class MonitorTrial(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor trial"):
     """The same under the name of earlier versions; deprecated."""
 
     names: list[str]
@@ -324,7 +326,7 @@ class MonitorTrial(AdminRequest[monitors.Switched], frozen=True, tag="monitor tr
 
 @rest("operator", "PATCH", "/v1/monitors", says={"held": False})
 @rest("operator", "PATCH", "/v1/monitors/{names}", says={"held": False})
-class MonitorResume(AdminRequest[monitors.Switched], frozen=True, tag="monitor resume"):
+class MonitorResume(AdminRequest[monitor_answers.Switched], frozen=True, tag="monitor resume"):
     """Let the topics that these monitors hold go on."""
 
     names: list[str]
@@ -332,19 +334,19 @@ class MonitorResume(AdminRequest[monitors.Switched], frozen=True, tag="monitor r
 
 
 @rest("viewer", "GET", "/v1/recordings")
-class RecordingsWanted(WaitingRequest[recordings.Recordings], frozen=True, tag="recordings"):
+class RecordingsWanted(WaitingRequest[recording_answers.Recordings], frozen=True, tag="recordings"):
     """The recordings that are kept."""
 
 
 @rest("viewer", "GET", "/v1/recordings/{id}")
-class RecordingWanted(WaitingRequest[recordings.Recording], frozen=True, tag="recording"):
+class RecordingWanted(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording"):
     """One of them."""
 
     id: str
 
 
 @rest("operator", "POST", "/v1/recordings")
-class RecordNow(WaitingRequest[recordings.RecordingBegun], frozen=True, tag="record now"):
+class RecordNow(WaitingRequest[recording_answers.RecordingBegun], frozen=True, tag="record now"):
     """Record from `before` seconds before now to `after` seconds after; None: as configured."""
 
     before: float | None = None
@@ -353,14 +355,14 @@ class RecordNow(WaitingRequest[recordings.RecordingBegun], frozen=True, tag="rec
 
 
 @rest("investigator", "GET", "/v1/recordings/{id}/bag")
-class RecordingFetch(WaitingRequest[recordings.Recording], frozen=True, tag="recording fetch"):
+class RecordingFetch(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording fetch"):
     """Somebody takes the messages of a recording: it is recorded who."""
 
     id: str
 
 
 @rest("investigator", "GET", "/v1/recordings/{id}/messages", ("topics",))
-class RecordingRead(WaitingRequest[recordings.Recording], frozen=True, tag="recording read"):
+class RecordingRead(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording read"):
     """Somebody reads messages of a recording, of these topics (none: of all): it is recorded who."""
 
     id: str
@@ -368,7 +370,7 @@ class RecordingRead(WaitingRequest[recordings.Recording], frozen=True, tag="reco
 
 
 @rest("investigator", "POST", "/v1/recordings/memory")
-class RecordingOfMemory(WaitingRequest[recordings.Recording], frozen=True, tag="recording memory"):
+class RecordingOfMemory(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording memory"):
     """What is in memory, to be read: from `since` to `until`, nanoseconds since the epoch (None: all, now).
 
     It is no recording that is kept: for ten minutes, or until somebody else asks, it can be fetched as one.
@@ -379,13 +381,13 @@ class RecordingOfMemory(WaitingRequest[recordings.Recording], frozen=True, tag="
 
 
 @rest("admin", "DELETE", "/v1/recordings/{id}")
-class RecordingRemove(WaitingRequest[recordings.Recording], frozen=True, tag="recording remove"):
+class RecordingRemove(WaitingRequest[recording_answers.Recording], frozen=True, tag="recording remove"):
     """Remove a recording."""
 
     id: str
 
 
-class TokenAdd(AdminRequest[tokens.NewToken], frozen=True, tag="token add"):
+class TokenAdd(AdminRequest[token_answers.NewToken], frozen=True, tag="token add"):
     """Make a token that ends after `seconds`; the answer is the only place where its text ever stands."""
 
     name: str
@@ -394,12 +396,12 @@ class TokenAdd(AdminRequest[tokens.NewToken], frozen=True, tag="token add"):
 
 
 @rest("admin", "GET", "/v1/tokens")
-class TokenList(AdminRequest[tokens.Tokens], frozen=True, tag="token list"):
+class TokenList(AdminRequest[token_answers.Tokens], frozen=True, tag="token list"):
     """All access tokens that were made, without their secrets; for admins."""
 
 
 @rest("admin", "DELETE", "/v1/tokens/{name}")
-class TokenRevoke(AdminRequest[tokens.Token], frozen=True, tag="token revoke"):
+class TokenRevoke(AdminRequest[token_answers.Token], frozen=True, tag="token revoke"):
     """End a token now."""
 
     name: str
@@ -407,7 +409,7 @@ class TokenRevoke(AdminRequest[tokens.Token], frozen=True, tag="token revoke"):
 
 @rest("admin", "POST", "/v1/hosts", says={"how": "token"}, fixed={"new": True})
 @rest("admin", "POST", "/v1/hosts/{name}/token", fixed={"new": False})
-class HostToken(WaitingRequest[hosts.EnrolmentToken], frozen=True, tag="host token"):
+class HostToken(WaitingRequest[host_answers.EnrolmentToken], frozen=True, tag="host token"):
     """Make a token by which a host enrols itself once within `token_seconds`; an earlier one of the name ends.
 
     Its text is in the answer and nowhere else. `endpoint` (None: the appliance finds it), `ports` and `open` are kept
@@ -427,7 +429,7 @@ class HostToken(WaitingRequest[hosts.EnrolmentToken], frozen=True, tag="host tok
 
 
 @rest("admin", "POST", "/v1/hosts", says={"how": "kit"})
-class HostAdd(WaitingRequest[hosts.KitParts], frozen=True, tag="host add"):
+class HostAdd(WaitingRequest[host_answers.KitParts], frozen=True, tag="host add"):
     """Enrol a host by a signing request (PKCS #10, PEM) for the key that it has, for `days`.
 
     `address`: the virtual address it shall have; None: the next free one.
@@ -441,7 +443,7 @@ class HostAdd(WaitingRequest[hosts.KitParts], frozen=True, tag="host add"):
 
 
 @rest(None)
-class HostEnrol(WaitingRequest[hosts.KitParts], frozen=True, tag="host enrol"):
+class HostEnrol(WaitingRequest[host_answers.KitParts], frozen=True, tag="host enrol"):
     """The host itself, at the real address `peer`, brings its token and a signing request (PEM)."""
 
     token: str
@@ -450,7 +452,7 @@ class HostEnrol(WaitingRequest[hosts.KitParts], frozen=True, tag="host enrol"):
 
 
 @rest("admin", "POST", "/v1/hosts/{name}/kit")
-class HostRenew(WaitingRequest[hosts.KitParts], frozen=True, tag="host renew"):
+class HostRenew(WaitingRequest[host_answers.KitParts], frozen=True, tag="host renew"):
     """A new certificate for an enrolled host; the one before is revoked."""
 
     name: str
@@ -460,7 +462,7 @@ class HostRenew(WaitingRequest[hosts.KitParts], frozen=True, tag="host renew"):
 
 
 @rest(None)
-class HostRenewItself(WaitingRequest[hosts.NewCertificate], frozen=True, tag="host renew itself"):
+class HostRenewItself(WaitingRequest[host_answers.NewCertificate], frozen=True, tag="host renew itself"):
     """A host asks through its tunnel, at its virtual address `peer`, for a certificate for a new key.
 
     `proof` is the signature of its present key over the bytes of `request`. The certificate before is good until
@@ -474,7 +476,7 @@ class HostRenewItself(WaitingRequest[hosts.NewCertificate], frozen=True, tag="ho
 
 
 @rest(None)
-class HostRenewed(AdminRequest[hosts.Renewed], frozen=True, tag="host renewed"):
+class HostRenewed(AdminRequest[host_answers.Renewed], frozen=True, tag="host renewed"):
     """A host at its virtual address `peer` has put its new certificate in place: the one before ends now."""
 
     name: str
@@ -482,24 +484,24 @@ class HostRenewed(AdminRequest[hosts.Renewed], frozen=True, tag="host renewed"):
 
 
 @rest("viewer", "GET", "/v1/hosts")
-class HostList(AdminRequest[hosts.Hosts], frozen=True, tag="host list"):
+class HostList(AdminRequest[host_answers.Hosts], frozen=True, tag="host list"):
     """All hosts that were enrolled or declared, with their tunnels."""
 
 
 @rest("viewer")
-class HostEndpoint(AdminRequest[hosts.Endpoint], frozen=True, tag="host endpoint"):
+class HostEndpoint(AdminRequest[host_answers.Endpoint], frozen=True, tag="host endpoint"):
     """At which address hosts reach the appliance, where nobody says it: `endpoint`, and `reason`: why that one."""
 
 
 @rest("operator")
-class HostKit(AdminRequest[hosts.KitParts], frozen=True, tag="host kit"):
+class HostKit(AdminRequest[host_answers.KitParts], frozen=True, tag="host kit"):
     """What an enrolled host's kit is made of, without its private key."""
 
     name: str
 
 
 @rest("admin", "DELETE", "/v1/hosts/{name}")
-class HostRevoke(AdminRequest[hosts.Revoked], frozen=True, tag="host revoke"):
+class HostRevoke(AdminRequest[host_answers.Revoked], frozen=True, tag="host revoke"):
     """Let a host in no more, and cut what it has, now."""
 
     name: str
@@ -507,7 +509,7 @@ class HostRevoke(AdminRequest[hosts.Revoked], frozen=True, tag="host revoke"):
 
 
 @rest("operator", "PUT", "/v1/hosts/{name}/ports")
-class HostPorts(AdminRequest[hosts.PortsTold], frozen=True, tag="host ports"):
+class HostPorts(AdminRequest[host_answers.PortsTold], frozen=True, tag="host ports"):
     """Somebody tried the ROS ports of a host from outside, at `checked` (seconds since the epoch; None: now).
 
     `name` is an enrolled or declared host's, or an address of a machine that nodes run on.
@@ -521,29 +523,29 @@ class HostPorts(AdminRequest[hosts.PortsTold], frozen=True, tag="host ports"):
 
 
 @rest("operator", "POST", "/v1/hosts/reload")
-class HostsReload(AdminRequest[hosts.Reloaded], frozen=True, tag="hosts reload"):
+class HostsReload(AdminRequest[host_answers.Reloaded], frozen=True, tag="hosts reload"):
     """Read `ipsec/hosts.yaml` again."""
 
     expected: int | None = None
 
 
 @rest(None)
-class RevocationsWanted(AdminRequest[hosts.RevocationList], frozen=True, tag="host revocations"):
+class RevocationsWanted(AdminRequest[host_answers.RevocationList], frozen=True, tag="host revocations"):
     """The authority's signed list of revoked certificates, in PEM."""
 
 
 @rest(None)
-class AuthorityWanted(AdminRequest[hosts.AuthorityCertificate], frozen=True, tag="host authority"):
+class AuthorityWanted(AdminRequest[host_answers.AuthorityCertificate], frozen=True, tag="host authority"):
     """The authority's certificate, in PEM."""
 
 
 @rest("viewer")
-class LogSealed(WaitingRequest[evidence.Sealed], frozen=True, tag="audit seal"):
+class LogSealed(WaitingRequest[evidence_answers.Sealed], frozen=True, tag="audit seal"):
     """Have all that was recorded sealed by a signed checkpoint, now."""
 
 
 @rest("viewer")
-class EvidenceExported(WaitingRequest[evidence.Sealed], frozen=True, tag="evidence exported"):
+class EvidenceExported(WaitingRequest[evidence_answers.Sealed], frozen=True, tag="evidence exported"):
     """Record that a bundle was made whose manifest has this hash, and have that sealed.
 
     It has so many `records`, from `since` until before `until` (nanoseconds since the epoch), and the `recording` of
@@ -558,7 +560,7 @@ class EvidenceExported(WaitingRequest[evidence.Sealed], frozen=True, tag="eviden
 
 
 @rest("viewer", "GET", "/v1/challenge")
-class ChallengeWanted(AdminRequest[tokens.Challenge], frozen=True, tag="challenge"):
+class ChallengeWanted(AdminRequest[token_answers.Challenge], frozen=True, tag="challenge"):
     """A challenge: an order that changes something is signed under one, and each is good once."""
 
 

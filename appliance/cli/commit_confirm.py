@@ -7,13 +7,13 @@ from typing import Annotated, TypeVar
 import typer
 
 from appliance.channel.admin import AdminRequest
-from appliance.channel.answers import monitors, policy
+from appliance.channel.answers import monitor_answers, policy_answers
 from appliance.cli.durations import span_given
 from appliance.cli.output import say, say_json
 from appliance.cli.target import Appliance, speaks
 
-_Listed = TypeVar("_Listed", policy.PolicyRevisionList, monitors.MonitorRevisionList)
-_Confirmed = TypeVar("_Confirmed", policy.PolicyConfirmed, monitors.MonitorsConfirmed)
+_Listed = TypeVar("_Listed", policy_answers.PolicyRevisionList, monitor_answers.MonitorRevisionList)
+_Confirmed = TypeVar("_Confirmed", policy_answers.PolicyConfirmed, monitor_answers.MonitorsConfirmed)
 _Done = TypeVar("_Done")
 
 ConfirmWithin = Annotated[
@@ -74,11 +74,13 @@ def verbs_of(
     return speaks(revisions), speaks(rollback), speaks(confirm)
 
 
-def _say_revision(row: policy.PolicyRevision | monitors.MonitorRevision, *, as_json: bool) -> None:
+def _say_revision(
+    row: policy_answers.PolicyRevision | monitor_answers.MonitorRevision, *, as_json: bool
+) -> None:
     if as_json:
         say_json(row)
         return
-    files = row.file if isinstance(row, policy.PolicyRevision) else " ".join(row.names)
+    files = row.file if isinstance(row, policy_answers.PolicyRevision) else " ".join(row.names)
     mark = "in force" if row.in_force else ""
     say(f"{row.revision:>5}  {_time(row.loaded)}  {row.who}: {row.note}  {files}  {mark}".rstrip())
 

@@ -10,7 +10,7 @@ import typer
 
 from appliance.channel import admin
 from appliance.channel.admin import A, AdminRequest
-from appliance.cli.admin_socket import AdminSocket, NotRunningError
+from appliance.cli.admin_client import AdminSocket, NotRunningError
 
 Complete = Callable[[typer.Context, str], list[str]]
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 import yaml
 
-from appliance.configuration.sources import ConfigError, json_schema, plain, resolve
+from appliance.configuration.config_sources import ConfigError, json_schema, plain, resolve
 
 _CheckedFile = Annotated[Path | None, typer.Argument(metavar="[FILE]", help="The same as --config FILE")]
 _File = Annotated[

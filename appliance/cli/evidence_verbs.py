@@ -15,8 +15,8 @@ from appliance.audit.record_format import rfc3339
 from appliance.audit.timestamps import parse_moment
 from appliance.base.atomic_files import name_to_make
 from appliance.cli import completion
-from appliance.cli.admin_socket import AdminSocket
-from appliance.cli.audit.errors import Errors, fail
+from appliance.cli.admin_client import AdminSocket
+from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.durations import Since, Until
 from appliance.cli.output import Json, say, say_json, usage_error
 from appliance.cli.rest.orders import RestWay

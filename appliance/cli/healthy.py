@@ -11,7 +11,7 @@ from pathlib import Path
 
 from appliance.channel.admin import StatusWanted
 from appliance.channel.status_summary import unserved
-from appliance.cli.admin_socket import AdminSocket, NotRunningError
+from appliance.cli.admin_client import AdminSocket, NotRunningError
 
 _STATE = "/var/lib/rosrv"  # the default of the configuration's key `state`
 _SECONDS = 4.0

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import typer
 
 from appliance.channel.admin import HostPorts, StatusWanted
-from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.admin_client import NotRunningError
 from appliance.cli.target import Appliance, speaks
 from appliance.network import close_ports as protection
 from appliance.network.firewall.firewall_rules import PortRange

@@ -16,9 +16,9 @@ from appliance.audit.record_format import rfc3339
 from appliance.audit.timestamps import parse_moment
 from appliance.base.atomic_files import name_to_make
 from appliance.channel import admin
-from appliance.channel.answers.recordings import RecordedMessages, Recording, Timeline
+from appliance.channel.answers.recording_answers import RecordedMessages, Recording, Timeline
 from appliance.cli import completion
-from appliance.cli.admin_socket import AdminSocket, NotRunningError
+from appliance.cli.admin_client import AdminSocket, NotRunningError
 from appliance.cli.durations import span_given
 from appliance.cli.output import counted, printable, refused, say, say_json, usage_error
 from appliance.cli.target import Appliance, speaks

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from appliance.api.moments import in_full
 from appliance.channel.admin import StatusWanted
-from appliance.channel.answers.hosts import PortsSeen
+from appliance.channel.answers.host_answers import PortsSeen
 from appliance.channel.answers.status import FirewallState, IpsecState, PolicyState, ProcessInfo, Status
 from appliance.channel.status_summary import no_relay, probe_failed
 from appliance.cli.output import counted, moment, say_json

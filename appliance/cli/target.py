@@ -17,7 +17,7 @@ import msgspec
 import typer
 
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
-from appliance.cli.admin_socket import AdminSocket, NotRunningError
+from appliance.cli.admin_client import AdminSocket, NotRunningError
 from appliance.cli.output import Json, printable, say_json, usage_error
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke
-from appliance.channel.answers.tokens import TokenRole
+from appliance.channel.answers.token_answers import TokenRole
 from appliance.cli import completion
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say, say_json

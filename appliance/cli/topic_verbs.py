@@ -8,7 +8,7 @@ import typer
 
 from appliance.api.moments import in_full
 from appliance.channel import admin
-from appliance.channel.answers.graph import Topic, TopicMessage
+from appliance.channel.answers.graph_answers import Topic, TopicMessage
 from appliance.cli import completion
 from appliance.cli.output import printable, refused, say, say_json, usage_error
 from appliance.cli.target import Appliance, speaks

@@ -16,8 +16,8 @@ import structlog
 import typer
 
 from appliance.cli.up_inputs import read_inputs
+from appliance.configuration.config_sources import resolve
 from appliance.configuration.settings import Settings
-from appliance.configuration.sources import resolve
 from appliance.control.robot import own_address
 from appliance.supervisor.errors import StartError
 from appliance.supervisor.roles import roles_of

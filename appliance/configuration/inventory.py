@@ -14,7 +14,7 @@ from typing import cast
 
 import appliance
 from appliance.base.shipped import DPKG, SHIPPED
-from appliance.channel.answers.inventory import Inventory, Part
+from appliance.channel.answers.inventory_answers import Inventory, Part
 
 # Of packages.txt: what runs on the robot's machine.
 RUNS = (

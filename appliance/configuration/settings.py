@@ -1,6 +1,6 @@
 """The configuration of the appliance: every key with its default, as `appliance.yaml` spells it.
 
-`appliance.configuration.sources` reads the file, the environment and the flags into it; the supervisor writes
+`appliance.configuration.config_sources` reads the file, the environment and the flags into it; the supervisor writes
 the result to `run/config.json` in the state directory, from where the other processes load it: what was
 checked once they have without pydantic, which takes each of them a tenth of a second. A key is here because
 something reads it. One file, for it is what an operator can say.

@@ -23,8 +23,8 @@ from appliance.control.recording_orders import RecordingOrders
 from appliance.control.supervisor_link import ControlLifeline
 from appliance.master import rosout
 from appliance.master.calls.call import served
+from appliance.master.calls.call_execution import Execution
 from appliance.master.calls.call_table import MASTER_CALLS, master_table
-from appliance.master.calls.execution import Execution
 from appliance.master.calls.gate import Gate, HostLimits
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.monitor_calls import MonitorCalls
@@ -34,7 +34,7 @@ from appliance.master.calls.parameter_calls import ParameterCalls, ParameterSear
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
-from appliance.master.calls.repetition import Repetitions
+from appliance.master.calls.repeated_calls import Repetitions
 from appliance.master.endpoints.delivery import Delivery
 from appliance.master.endpoints.endpoint_addresses import Addresses, Places
 from appliance.master.endpoints.node_api import NodeApi

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from itertools import islice
 from typing import TypeVar
 
-from appliance.channel.answers.hosts import Host
+from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import Status
 from appliance.channel.messages import MonitorRow

@@ -2,7 +2,7 @@
 
 import msgspec
 
-from appliance.channel.answers import monitors as answers
+from appliance.channel.answers import monitor_answers as answers
 from appliance.channel.answers.status import MonitorsState
 from appliance.channel.messages import Approach, MarginRow
 from appliance.master.graph.registry import Kind, Registry

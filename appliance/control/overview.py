@@ -5,7 +5,7 @@ Everything is read from the registry and the relay's reports at one moment. The 
 
 from msgspec.structs import asdict
 
-from appliance.channel.answers.graph import Connection, Graph, Node, Publisher, Service, Topic
+from appliance.channel.answers.graph_answers import Connection, Graph, Node, Publisher, Service, Topic
 from appliance.control.assembly import Parts
 from appliance.master.endpoints.relay_control import RelayControl
 from appliance.master.graph.registry import Incarnation, Kind, Life

@@ -21,8 +21,8 @@ import structlog
 from appliance.base.input_files import read_given_text
 from appliance.base.withdrawal import require_awaited, take_effect
 from appliance.channel import admin
-from appliance.channel.answers import policy as answers
-from appliance.channel.answers.policy import Loaded
+from appliance.channel.answers import policy_answers as answers
+from appliance.channel.answers.policy_answers import Loaded
 from appliance.control.errors import UnknownThingError
 from appliance.policy.host_sets import Network
 from appliance.policy.judgement import Known, judge

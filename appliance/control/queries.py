@@ -10,10 +10,16 @@ import msgspec
 import appliance
 from appliance.base import lazy_imports
 from appliance.channel import admin
-from appliance.channel.answers.graph import Graph, Registration, Registrations, TopicMessage, TopicMessages
-from appliance.channel.answers.inventory import InUse, Inventory
+from appliance.channel.answers.graph_answers import (
+    Graph,
+    Registration,
+    Registrations,
+    TopicMessage,
+    TopicMessages,
+)
+from appliance.channel.answers.inventory_answers import InUse, Inventory
 from appliance.channel.answers.measures import Measures
-from appliance.channel.answers.monitors import Monitors
+from appliance.channel.answers.monitor_answers import Monitors
 from appliance.channel.answers.status import (
     AuditState,
     ClockState,

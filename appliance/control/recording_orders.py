@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import Any, TypeVar
 
 from appliance.channel import admin, messages
-from appliance.channel.answers.recordings import (
+from appliance.channel.answers.recording_answers import (
     OPERATORS,
     Recording,
     RecordingBegun,

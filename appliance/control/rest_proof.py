@@ -18,7 +18,7 @@ import time
 
 from appliance.audit.record import Severity
 from appliance.channel import admin
-from appliance.channel.answers.tokens import Challenge, TokenRole, may
+from appliance.channel.answers.token_answers import Challenge, TokenRole, may
 from appliance.channel.messages.api import Asked, RequestMade
 from appliance.control.challenges import SECONDS, ChallengeRefusedError, Challenges
 from appliance.control.rest_meaning import NoOrderError, meant

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import cast
 
 from appliance.channel import admin
-from appliance.channel.answers import tokens as answers
+from appliance.channel.answers import token_answers as answers
 from appliance.channel.messages.api import TokenKept
 from appliance.store.access_tokens import BadTokenNameError, TokenRow, make_token
 from appliance.store.state_file import StateStore

@@ -39,7 +39,7 @@ from appliance.channel.admin import (
     RecordingFetch,
     Trouble,
 )
-from appliance.channel.answers.recordings import Recording
+from appliance.channel.answers.recording_answers import Recording
 from appliance.evidence.page import Page
 from appliance.signing.fingerprints import file_name
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from appliance.audit.record_format import printable, rfc3339
-from appliance.channel.answers.recordings import Recording
+from appliance.channel.answers.recording_answers import Recording
 
 _MOST_ROWS = 2000
 _SEVERE = ("notice", "warning", "alarm")

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from appliance.channel import admin
-from appliance.channel.answers.hosts import AuthorityCertificate, KitParts, RevocationList
+from appliance.channel.answers.host_answers import AuthorityCertificate, KitParts, RevocationList
 from appliance.channel.messages import CertificateMade
 from appliance.hosts.certificate_requests import Authority, AuthorityError
 from appliance.hosts.enrolment_tokens import Awaited

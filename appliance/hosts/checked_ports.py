@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from appliance.audit.record import Severity
 from appliance.channel import admin
-from appliance.channel.answers.hosts import PortsTold
+from appliance.channel.answers.host_answers import PortsTold
 from appliance.hosts.certification import Certification
 from appliance.hosts.host_table import HostRefusedError
 from appliance.hosts.view import HostView

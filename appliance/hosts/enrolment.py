@@ -15,7 +15,7 @@ from collections.abc import Awaitable, Callable
 
 from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
-from appliance.channel.answers import hosts as answers
+from appliance.channel.answers import host_answers as answers
 from appliance.channel.answers.status import IpsecState
 from appliance.hosts.certification import Certification
 from appliance.hosts.checked_ports import CheckedPorts

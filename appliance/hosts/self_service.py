@@ -18,7 +18,7 @@ import time
 
 from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import admin
-from appliance.channel.answers.hosts import KitParts, NewCertificate, Renewed
+from appliance.channel.answers.host_answers import KitParts, NewCertificate, Renewed
 from appliance.hosts.certification import Certification
 from appliance.hosts.enrolment_tokens import BadEnrolmentTokenError
 from appliance.hosts.host_table import HostForbiddenError, HostRefusedError

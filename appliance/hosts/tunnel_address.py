@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from appliance.channel.answers.hosts import Endpoint
+from appliance.channel.answers.host_answers import Endpoint
 from appliance.channel.messages import EndpointFound
 from appliance.configuration.settings import Settings
 from appliance.hosts.host_table import HostRefusedError

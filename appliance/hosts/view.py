@@ -5,7 +5,7 @@ import time
 from collections.abc import Mapping
 from typing import cast
 
-from appliance.channel.answers.hosts import Host, Machine, PortsSeen, PortsState, State
+from appliance.channel.answers.host_answers import Host, Machine, PortsSeen, PortsState, State
 from appliance.channel.answers.status import IpsecState
 from appliance.hosts.enrolment_tokens import Awaited
 from appliance.hosts.host_table import HostTable

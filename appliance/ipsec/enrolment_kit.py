@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from string import Template
 
-from appliance.channel.answers.hosts import KitParts
+from appliance.channel.answers.host_answers import KitParts
 from appliance.channel.messages import APPLIANCE_NAME
 from appliance.ipsec.strongswan import CHILD, ESP_PROPOSALS, IKE_PROPOSALS
 

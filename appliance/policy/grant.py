@@ -17,9 +17,9 @@ from appliance.policy.model import Address, Category, Request, Rule
 from appliance.policy.policy import Policy
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import Findings, PolicyError
+from appliance.policy.policy_settings import TAKEOVERS
 from appliance.policy.rights import Right, decide_right, rights_of, rights_of_call
 from appliance.policy.sections import BY_CATEGORY, DEFAULT, GROUPS, OPTIONS, PARAMETERS
-from appliance.policy.settings import TAKEOVERS
 
 _MOST_LINES = 8  # that one grant changes
 

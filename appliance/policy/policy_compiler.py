@@ -15,9 +15,9 @@ from appliance.policy.model import Address, Category
 from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import Findings, quoted
 from appliance.policy.policy_lint import lint
+from appliance.policy.policy_settings import read_monitor, read_options, read_ports
 from appliance.policy.rate_limits import read_limits
 from appliance.policy.rules import RuleCompiler
-from appliance.policy.settings import read_monitor, read_options, read_ports
 
 
 def compile_policy(

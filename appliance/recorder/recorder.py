@@ -26,7 +26,7 @@ from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter
 from appliance.audit.search import Follower, export, search
 from appliance.channel import messages
-from appliance.channel.answers.recordings import Recording, Trigger
+from appliance.channel.answers.recording_answers import Recording, Trigger
 from appliance.configuration.settings import RecorderRules
 from appliance.recorder.recording import MOST_TRIGGERS, Progress, RecordingInProgress, load_progress
 from appliance.recorder.recording_plan import KEPT, HourlyLimit, lane, span

@@ -21,7 +21,13 @@ import msgspec
 from appliance.audit.record import Severity
 from appliance.audit.record_format import Entry, as_json
 from appliance.base.atomic_files import write_whole
-from appliance.channel.answers.recordings import OPERATORS, LeftOutTopic, RecordedTopic, Recording, Trigger
+from appliance.channel.answers.recording_answers import (
+    OPERATORS,
+    LeftOutTopic,
+    RecordedTopic,
+    Recording,
+    Trigger,
+)
 from appliance.channel.messages import RevisionsStated
 from appliance.recorder.bag_writer import BagWriter, Message
 from appliance.recorder.never import NAMED

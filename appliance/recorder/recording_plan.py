@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from appliance.audit.record import Severity
-from appliance.channel.answers.recordings import APPLIANCE, OPERATORS, ROBOT, Recording, TriggerKind
+from appliance.channel.answers.recording_answers import APPLIANCE, OPERATORS, ROBOT, Recording, TriggerKind
 from appliance.configuration.settings import RecorderRules
 from appliance.recorder.triggers import kinds_of
 

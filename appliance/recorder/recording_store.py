@@ -30,7 +30,7 @@ from pathlib import Path
 import msgspec
 import structlog
 
-from appliance.channel.answers.recordings import Recording
+from appliance.channel.answers.recording_answers import Recording
 from appliance.recorder.recording_plan import KEPT
 
 BAG, ABOUT, PROGRESS = "recording.bag", "recording.json", "progress"

@@ -17,7 +17,7 @@ import msgspec
 
 from appliance.audit.record import Severity
 from appliance.audit.record_format import without_binding
-from appliance.channel.answers.recordings import (
+from appliance.channel.answers.recording_answers import (
     EventKind,
     EventMarks,
     RecordedEvent,

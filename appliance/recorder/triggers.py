@@ -8,7 +8,7 @@ from collections.abc import Collection
 
 from appliance.audit.record import Record, Severity
 from appliance.audit.record_format import without_binding
-from appliance.channel.answers.recordings import APPLIANCE, Trigger, TriggerKind
+from appliance.channel.answers.recording_answers import APPLIANCE, Trigger, TriggerKind
 
 _BY_EVENT: dict[str, TriggerKind] = {
     "message dropped": "drop",

@@ -33,8 +33,8 @@ import structlog
 from appliance.audit.record import Severity
 from appliance.base.withdrawal import WithdrawnError, require_awaited, take_effect
 from appliance.channel import admin, messages
-from appliance.channel.answers import monitors as answers
-from appliance.channel.answers.monitors import Replaced, Switched
+from appliance.channel.answers import monitor_answers as answers
+from appliance.channel.answers.monitor_answers import Replaced, Switched
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all
 from appliance.specifications.allocation import Allocation
 from appliance.specifications.folder import SpecificationFolder

@@ -23,7 +23,7 @@ import msgspec
 import structlog
 
 from appliance.channel.answers.status import FirewallState
-from appliance.channel.own_node import ADDRESS as OWN_NODE_ADDRESS
+from appliance.channel.rosout_address import ADDRESS as OWN_NODE_ADDRESS
 from appliance.ipsec.leftovers import LeftoversError, clear_leftovers
 from appliance.ipsec.strongswan import USER_SPACE_INTERFACE
 from appliance.network import interfaces

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import structlog
 
+from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Settings, Unasked
-from appliance.configuration.sources import plain
 from appliance.network.close_ports import local_port_range
 from appliance.network.firewall.iptables import load_modules
 from appliance.supervisor import signals

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from appliance.channel import admin
-from appliance.cli.admin_socket import AdminSocket
+from appliance.cli.admin_client import AdminSocket
 from appliance.control.administration import KEPT
 from tests.support.appliance import OPEN_POLICY, Appliance
 from tests.support.waiting import eventually

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from typing import Any
 
 from appliance.master.calls.call import served
+from appliance.master.calls.call_execution import Execution
 from appliance.master.calls.call_table import master_table
-from appliance.master.calls.execution import Execution
 from appliance.master.calls.gate import Gate, HostLimits
 from appliance.master.calls.lookups import LookupCalls
 from appliance.master.calls.monitor_calls import MonitorCalls
@@ -14,7 +14,7 @@ from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterSearch
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
-from appliance.master.calls.repetition import Repetitions
+from appliance.master.calls.repeated_calls import Repetitions
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.policy import Policy

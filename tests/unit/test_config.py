@@ -9,8 +9,8 @@ from typing import Any, get_type_hints
 import pytest
 from pydantic import ValidationError
 
+from appliance.configuration.config_sources import plain, read
 from appliance.configuration.settings import Settings, load_resolved, split_address
-from appliance.configuration.sources import plain, read
 
 
 def test_every_key_has_a_default() -> None:

@@ -1,4 +1,4 @@
-"""Tests of `appliance.configuration.sources`."""
+"""Tests of `appliance.configuration.config_sources`."""
 
 import re
 from contextlib import suppress
@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings
-from appliance.configuration.sources import ConfigError, resolve
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import yaml
 
-from appliance.configuration.sources import resolve
+from appliance.configuration.config_sources import resolve
 from appliance.hosts.rest_place import rest_place
 from appliance.supervisor.privileges import SUPERVISORS
 from appliance.supervisor.roles import ROLES

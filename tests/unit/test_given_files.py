@@ -123,8 +123,8 @@ def test_no_certificate_of_another_kind_is_waited_for(
 def test_a_pipe_of_the_shell_is_read(tmp_path: Path) -> None:
     """`rosrv policy check <(command)` reads what the command writes: that pipe has a writer."""
     script = (
-        "import sys; from pathlib import Path; from appliance import given_files;"
-        " print(given_files.read_given(Path(sys.argv[1])))"
+        "import sys; from pathlib import Path; from appliance.base import input_files;"
+        " print(input_files.read_given(Path(sys.argv[1])))"
     )
     said = subprocess.run(
         ["bash", "-c", '"$0" -c "$1" <(printf a; printf b)', sys.executable, script],

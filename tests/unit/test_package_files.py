@@ -4,8 +4,8 @@ import re
 from dataclasses import fields
 from pathlib import Path
 
+from appliance.configuration.config_sources import resolve
 from appliance.configuration.inventory import RUNS
-from appliance.configuration.sources import resolve
 from appliance.supervisor.privileges import SUPERVISORS
 from distribution.environment import INTERPRETERS
 

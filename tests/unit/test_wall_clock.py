@@ -7,8 +7,8 @@ from tests.support.sources import ROOT, product_files
 
 READERS = {
     "a moment that people are shown, or that stands in a file": [
-        "api/history.py", "audit/ids.py", "audit/log.py", "telemetry/audit_trail.py", "backup/create.py", "control/policies.py",
-        "control/queries.py",
+        "api/history.py", "audit/ids.py", "audit/log.py", "telemetry/audit_trail.py", "backup/create.py",
+        "control/policies.py", "control/queries.py",
         "control/recording_orders.py", "evidence/bundle.py", "forwarding/log_forwarder.py",
         "hosts/checked_ports.py", "hosts/host_table.py",
         "recorder/recorder.py", "recorder/ring.py", "relay/topic_taps.py", "relay/monitors/interceptor.py",
@@ -17,7 +17,7 @@ READERS = {
         "supervisor/rings.py", "supervisor/supervisor.py",
     ],
     "an end that is a date: of a certificate, a token, a revocation": [
-        "api/access.py", "api/metrics.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
+        "api/access.py", "api/metrics_route.py", "api/process.py", "cli/selftest/file_checks.py", "cli/token.py",
         "control/token_orders.py", "hosts/certification.py", "hosts/enrolment_tokens.py", "hosts/revocation_list.py",
         "hosts/revoked_certificates.py", "hosts/tunnel_state.py", "hosts/view.py", "ipsec/certificate_authority.py",
     ],
@@ -29,7 +29,7 @@ READERS = {
     ],
     "a moment that people ask for (`--since 1h`), or a page that is shown once": [
         "api/moments.py", "cli/audit/filter.py", "cli/evidence_verbs.py", "cli/monitor/offline.py",
-        "cli/monitor/recorder.py", "cli/policy/learn_verb.py", "cli/protect_verb.py", "cli/record_verbs.py",
+        "cli/monitor/recorder_input.py", "cli/policy/learn_verb.py", "cli/protect_verb.py", "cli/record_verbs.py",
         "cli/status_verb.py", "cli/status_view.py",
     ],
 }  # fmt: skip

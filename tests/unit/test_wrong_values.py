@@ -14,8 +14,8 @@ from fastapi.routing import iter_route_contexts
 
 from appliance.api.problems import ProblemError
 from appliance.base.validation_messages import refusal
+from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings
-from appliance.configuration.sources import ConfigError, resolve
 from tests.support.command import commands, rosrv
 from tests.unit.api.conftest import app  # noqa: F401  the fixture
 

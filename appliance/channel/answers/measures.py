@@ -2,7 +2,7 @@
 
 import msgspec
 
-from appliance.channel.answers.hosts import Host
+from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.status import Status
 
 Observed = tuple[list[int], float]

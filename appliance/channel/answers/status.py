@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from appliance.channel.answers.field_docs import Moment, told
-from appliance.channel.answers.hosts import PortsSeen
+from appliance.channel.answers.host_answers import PortsSeen
 
 
 class ProcessInfo(msgspec.Struct, frozen=True):

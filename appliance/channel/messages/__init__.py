@@ -16,7 +16,7 @@ from appliance.channel.messages.compiler import *
 from appliance.channel.messages.forwarding import *
 from appliance.channel.messages.lifeline import *
 from appliance.channel.messages.message import *
-from appliance.channel.messages.recorder import *
-from appliance.channel.messages.relay import *
-from appliance.channel.messages.signer import *
+from appliance.channel.messages.recorder_link import *
+from appliance.channel.messages.relay_link import *
+from appliance.channel.messages.signer_link import *
 from appliance.channel.messages.tunnels import *

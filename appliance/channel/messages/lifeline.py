@@ -6,8 +6,8 @@ import msgspec
 
 from appliance.channel.answers.status import FirewallState, ProcessInfo
 from appliance.channel.messages.message import Message
-from appliance.channel.messages.recorder import RingGiven
-from appliance.channel.messages.signer import SignatureMade, SignatureWanted
+from appliance.channel.messages.recorder_link import RingGiven
+from appliance.channel.messages.signer_link import SignatureMade, SignatureWanted
 from appliance.channel.messages.tunnels import TunnelsEnclosed, TunnelsWanted
 
 

@@ -21,7 +21,7 @@ from appliance.audit.query import Filter
 from appliance.audit.record_format import Entry, as_json, as_object
 from appliance.audit.search import LARGEST_PAGE
 from appliance.audit.signatures import read_public_key
-from appliance.cli.audit.errors import Errors, fail, tell
+from appliance.cli.audit.audit_errors import Errors, fail, tell
 from appliance.cli.audit.filter import filtered
 from appliance.cli.audit.record_table import (
     line,

@@ -13,7 +13,7 @@ from appliance.audit.query import Filter
 from appliance.audit.record import Severity
 from appliance.audit.record_format import printable
 from appliance.audit.timestamps import MomentError, parse_moment
-from appliance.cli.audit.errors import Errors, tell
+from appliance.cli.audit.audit_errors import Errors, tell
 from appliance.cli.durations import Since, Until
 from appliance.cli.target import Appliance
 

@@ -14,7 +14,7 @@ from appliance.audit.copies import SignedCheckpoint
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record_format import Entry, entry_of, rfc3339
 from appliance.audit.search import Page, Shown
-from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.admin_client import NotRunningError
 from appliance.cli.audit.source import Progress
 from appliance.cli.rest.session import ProblemError, RestClient
 

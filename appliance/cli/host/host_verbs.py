@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from appliance.api.kits import Wishes
 from appliance.base.validation_messages import meant
 from appliance.channel.admin import HostAdd, HostList, HostRenew, HostRevoke, HostsReload, HostToken
-from appliance.channel.answers.hosts import Host, PortsSeen
+from appliance.channel.answers.host_answers import Host, PortsSeen
 from appliance.cli import completion
 from appliance.cli.durations import span_given
 from appliance.cli.host.kit_files import KitWriter, placed, wishes_of, write_script

@@ -9,7 +9,7 @@ import typer
 from appliance.api.kits import Wishes, kit_of
 from appliance.base.input_files import open_given
 from appliance.channel.admin import HostEndpoint
-from appliance.channel.answers.hosts import EnrolmentToken, KitParts
+from appliance.channel.answers.host_answers import EnrolmentToken, KitParts
 from appliance.cli.host.private_output import Output, usage_error
 from appliance.cli.output import moment, say_json
 from appliance.cli.target import Appliance

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer
-from appliance.channel.answers.monitors import MonitorState, Replaced, Switched
+from appliance.channel.answers.monitor_answers import MonitorState, Replaced, Switched
 from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within
 from appliance.cli.durations import span_given

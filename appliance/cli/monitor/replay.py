@@ -14,8 +14,8 @@ from appliance.channel import admin
 from appliance.cli.monitor.bag import Replayed, definitions_of, open_bag, refusals, replay
 from appliance.cli.monitor.bounded_bag import BoundedReader
 from appliance.cli.monitor.input import Folders, read_definitions, read_specifications, usage_error
-from appliance.cli.monitor.output import BILLION, because
-from appliance.cli.monitor.recorder import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
+from appliance.cli.monitor.monitor_output import BILLION, because
+from appliance.cli.monitor.recorder_input import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
 from appliance.cli.output import counted, refused, say, say_json
 from appliance.cli.progress_bar import progress
 from appliance.cli.tables import say_table, table_of

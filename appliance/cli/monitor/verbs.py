@@ -13,7 +13,7 @@ import typer
 from appliance.cli.monitor.bag import Recording, definitions_of, open_bag, refusals, replay
 from appliance.cli.monitor.bounded_bag import BoundedReader
 from appliance.cli.monitor.input import Files, Folders, read_definitions, read_specifications, usage_error
-from appliance.cli.monitor.output import explained, lines, record, say_finding
+from appliance.cli.monitor.monitor_output import explained, lines, record, say_finding
 from appliance.cli.output import Json, counted, printable, refused, say, say_json
 from appliance.cli.progress_bar import progress
 from rosmop.certify.properties import certificates_of

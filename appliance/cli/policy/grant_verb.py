@@ -9,9 +9,9 @@ import typer
 from appliance.audit.record import Record
 from appliance.base.input_files import read_given
 from appliance.channel.admin import PolicyLoad, PolicyWanted
-from appliance.channel.answers.policy import Granted, Why
-from appliance.cli.admin_socket import NotRunningError
-from appliance.cli.audit.errors import Errors, fail
+from appliance.channel.answers.policy_answers import Granted, Why
+from appliance.cli.admin_client import NotRunningError
+from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
 from appliance.cli.output import printable, say, say_json, usage_error, write_told
 from appliance.cli.policy.live_verbs import say_loaded
@@ -44,7 +44,7 @@ def _explained(appliance: Appliance, record: str) -> Why:
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "why"), Why)
     from appliance.api.denials import asks_policy  # noqa: PLC0415  not for every verb
-    from appliance.api.judgement import explained  # noqa: PLC0415  as above
+    from appliance.api.dry_run_policy import explained  # noqa: PLC0415  as above
 
     with Errors():
         found = _record(appliance, record)
@@ -121,7 +121,7 @@ def _granted(appliance: Appliance, record: str) -> Granted:
     """Over REST the appliance works it out, over the socket this program."""
     if appliance.place is not None:
         return msgspec.convert(_over_rest(appliance, record, "grant"), Granted)
-    from appliance.api.judgement import granted  # noqa: PLC0415  not for every verb
+    from appliance.api.dry_run_policy import granted  # noqa: PLC0415  not for every verb
     from appliance.policy.grant import UngrantableError  # noqa: PLC0415  as above
 
     with Errors():

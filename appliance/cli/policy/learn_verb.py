@@ -12,7 +12,7 @@ import typer
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.timestamps import MomentError, parse_moment
-from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.admin_client import NotRunningError
 from appliance.cli.durations import Since
 from appliance.cli.output import counted, refused, say_json
 from appliance.cli.policy.policy_input import Robot, networks_of, request_of, usage_error

@@ -1,7 +1,7 @@
 """`rosrv policy reload|rollback|confirm|revisions`: the policy in force of the running appliance."""
 
 from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
-from appliance.channel.answers.policy import Loaded
+from appliance.channel.answers.policy_answers import Loaded
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within, verbs_of
 from appliance.cli.output import counted, say
 from appliance.cli.target import Appliance, speaks

@@ -16,7 +16,7 @@ from appliance.audit.query import Filter, FilterError
 from appliance.base.input_files import read_given_text
 from appliance.channel.admin import RegistrationsWanted
 from appliance.cli import output
-from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.admin_client import NotRunningError
 from appliance.cli.target import Appliance
 from appliance.policy.actions import BadWordError, find_hosts
 from appliance.policy.host_sets import Network, canonical_address, canonical_network

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.admin_client import NotRunningError
 from appliance.cli.output import Json, counted, refused, say, say_json
 from appliance.cli.policy.policy_input import (
     Enrolled,
@@ -27,8 +27,8 @@ from appliance.cli.policy.policy_input import (
 from appliance.cli.policy.trial import Trial, try_policy
 from appliance.cli.target import Appliance, speaks
 from appliance.policy.actions import BadWordError, check_resource
+from appliance.policy.decision_reasons import Explanation, explain, render
 from appliance.policy.diff import Difference, diff
-from appliance.policy.explain import Explanation, explain, render
 from appliance.policy.grant import Asked, UngrantableError
 from appliance.policy.grant import grant as grant_of
 from appliance.policy.judgement import Judged, judge

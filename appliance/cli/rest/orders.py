@@ -8,8 +8,8 @@ import msgspec
 
 from appliance.channel import admin
 from appliance.channel.admin import PARAMETERS, A, AdminAnswer, AdminRequest, Operation, Trouble, operation_of
-from appliance.channel.answers.graph import Graph, Registration, Registrations
-from appliance.cli.admin_socket import NotRunningError, encoded
+from appliance.channel.answers.graph_answers import Graph, Registration, Registrations
+from appliance.cli.admin_client import NotRunningError, encoded
 from appliance.cli.rest.session import ProblemError, RestClient
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 import httpx
 
 from appliance.base.input_files import read_given_text
-from appliance.cli.admin_socket import SECONDS, UNKNOWN, NotRunningError
+from appliance.cli.admin_client import SECONDS, UNKNOWN, NotRunningError
 from appliance.configuration.settings import is_loopback
 from appliance.signing.request_signing import HEADER, proof_of, reading_key, statement
 from appliance.store.access_tokens import parse_token

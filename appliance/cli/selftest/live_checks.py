@@ -9,7 +9,7 @@ from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.query import Filter, FilterError
 from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.status import ProcessInfo, Status
-from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.admin_client import NotRunningError
 from appliance.cli.selftest.probe_nodes import TOPIC, RefusedError, call, message_through_the_relay
 from appliance.cli.selftest.selftest_findings import Found, fail, ok, skip, told, warn
 from appliance.cli.status_verb import troubles_of

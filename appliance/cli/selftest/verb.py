@@ -12,13 +12,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from appliance.cli.admin_socket import ADMIN_SOCKET, AdminSocket
+from appliance.cli.admin_client import ADMIN_SOCKET, AdminSocket
 from appliance.cli.output import counted, printable, say_json
 from appliance.cli.selftest.selftest_findings import Found, fail
 from appliance.cli.tables import say_table
 from appliance.cli.target import Appliance, speaks
+from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings, load_resolved
-from appliance.configuration.sources import ConfigError, resolve
 
 _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 

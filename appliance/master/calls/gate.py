@@ -17,8 +17,8 @@ from appliance.master.graph.registry import Incarnation, Kind, Life, Registry
 from appliance.master.reconcile.liveness import Presence, Probe
 from appliance.policy.model import Address, Category, Decision
 from appliance.policy.policy import Policy
+from appliance.policy.policy_settings import AT_ONCE
 from appliance.policy.rights import decide, rights_of_call
-from appliance.policy.settings import AT_ONCE
 from appliance.quotas.table import NAMES
 from roswire.parameter_tree import Tree
 

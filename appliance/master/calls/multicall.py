@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from appliance.master.calls.call import Attempt, Verb, with_record
+from appliance.master.calls.call_execution import Execution, Visit
 from appliance.master.calls.call_order import touch
-from appliance.master.calls.execution import Execution, Visit
 from appliance.master.calls.parameter_calls import ParameterCalls
 from appliance.policy.model import Category
 from appliance.rpc.bulk import weigh

@@ -10,9 +10,9 @@ import structlog
 
 from appliance.master.caller import Caller
 from appliance.master.calls.call import Attempt, Table
-from appliance.master.calls.execution import Execution, Visit
+from appliance.master.calls.call_execution import Execution, Visit
 from appliance.master.calls.multicall import LIMIT_FAULT, MULTICALL, PARSE_FAULT, Multicall
-from appliance.master.calls.repetition import Repetitions
+from appliance.master.calls.repeated_calls import Repetitions
 from appliance.master.endpoints.endpoint_addresses import Addresses
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Category

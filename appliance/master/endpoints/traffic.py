@@ -9,7 +9,7 @@ import msgspec
 
 from appliance.audit.record import Severity
 from appliance.channel import messages
-from appliance.channel.answers.graph import Flow
+from appliance.channel.answers.graph_answers import Flow
 from appliance.channel.messages import TopicTraffic
 from appliance.master.graph.registry import Kind, Registry
 from appliance.policy.rate_limits import LimitRule

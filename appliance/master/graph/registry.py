@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
-from appliance.channel import own_node
+from appliance.channel import rosout_address
 from appliance.policy.model import Address
 from roswire.uris import NodeUri, node_uri
 
@@ -120,7 +120,7 @@ class Incarnation:
     @property
     def call_uri(self) -> NodeUri:
         """Where the appliance calls the node: at its peer address, whatever host it claimed; our own at `own_node`."""
-        host = own_node.ADDRESS if self.own and not self.of_monitors else str(self.host)
+        host = rosout_address.ADDRESS if self.own and not self.of_monitors else str(self.host)
         return NodeUri("http", host, self.api.port, self.api.path)
 
     def outer_uri(self, told: str) -> str:

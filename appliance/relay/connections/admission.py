@@ -8,7 +8,7 @@ roscpp never tries again after an error header, so such a peer is kept waiting f
 
 from collections.abc import Mapping
 
-from appliance.channel.messages.relay import NO_GRANT
+from appliance.channel.messages.relay_link import NO_GRANT
 from appliance.relay.connections.headers import switched_on, too_long
 from appliance.relay.granted import StatedTable
 from roswire.errors import InvalidNameError

@@ -12,7 +12,7 @@ import socket
 from collections.abc import Callable
 
 from appliance.channel.messages import PublicationRefused, UpstreamLost, UpstreamWanted
-from appliance.channel.messages.relay import Violation
+from appliance.channel.messages.relay_link import Violation
 from appliance.relay.connections.frames import SMALL, Batch, FrameReceiver
 from appliance.relay.connections.headers import size_of
 from appliance.relay.connections.memory import Stall, Weight

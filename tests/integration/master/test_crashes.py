@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from appliance.channel.admin import PolicyReload
-from appliance.cli.admin_socket import AdminSocket
+from appliance.cli.admin_client import AdminSocket
 from tests.support.appliance import OPEN_POLICY
 from tests.support.field import Field, Impostor, answering
 from tests.support.processes import LIMIT

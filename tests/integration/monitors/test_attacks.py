@@ -18,8 +18,8 @@ from appliance.channel.admin import (
     MonitorSwitch,
     StatusWanted,
 )
-from appliance.channel.answers.monitors import Replaced
-from appliance.cli.admin_socket import AdminSocket
+from appliance.channel.answers.monitor_answers import Replaced
+from appliance.cli.admin_client import AdminSocket
 from tests.support.appliance import Appliance
 from tests.support.nodes import RosSession, has_ros
 from tests.support.processes import Event, Process

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from appliance.channel.own_node import ADDRESS
+from appliance.channel.rosout_address import ADDRESS
 from appliance.network.firewall.firewall import BackendChoice, Firewall
 from appliance.network.firewall.firewall_rules import FirewallSettings, OwnNode, PortRange
 from appliance.supervisor.users import account_of

@@ -1,7 +1,7 @@
 """Tests of `appliance.api.audit`."""
 
 from appliance.api.audit import page_of
-from appliance.api.monitors import records_of
+from appliance.api.monitor_routes import records_of
 from appliance.audit.query import Filter
 from tests.support.audit import decision, settle
 from tests.unit.api.test_streams import bearer

@@ -12,8 +12,8 @@ from fastapi import FastAPI
 
 import appliance.api
 from appliance.api.console import VIEWS, routes
-from appliance.api.gate import is_console
 from appliance.api.problems import ProblemError
+from appliance.api.request_gate import is_console
 from appliance.configuration.settings import Settings
 from appliance.policy.model import Category
 

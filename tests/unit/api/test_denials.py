@@ -6,15 +6,15 @@ from typing import get_args, get_type_hints
 import pytest
 
 from appliance.api.denials import DENIALS, asks_policy, is_denial
-from appliance.api.judgement import explained
+from appliance.api.dry_run_policy import explained
 from appliance.audit.events import EVENTS
 from appliance.audit.record import Record, RuleReference
-from appliance.channel.answers.policy import PolicyKnown, Why
-from appliance.channel.messages.relay import Violation
+from appliance.channel.answers.policy_answers import PolicyKnown, Why
+from appliance.channel.messages.relay_link import Violation
 from appliance.master.graph.graph import revocation
 from appliance.policy.live_rights import Live, may_keep
 from appliance.policy.policy_compiler import compile_policy
-from appliance.policy.settings import AT_ONCE
+from appliance.policy.policy_settings import AT_ONCE
 from appliance.telemetry.audit_trail import rule_reference
 from distribution.audit_events_page import uses
 

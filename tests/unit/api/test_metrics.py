@@ -1,4 +1,4 @@
-"""Tests of `appliance.telemetry.metrics` and `appliance.api.metrics`."""
+"""Tests of `appliance.telemetry.metrics` and `appliance.api.metrics_route`."""
 
 import os
 import time
@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 from prometheus_client.parser import text_string_to_metric_families
 
-from appliance.api.metrics import rendered
+from appliance.api.metrics_route import rendered
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import RecorderState
 from appliance.telemetry.metrics import BOUNDS, METRICS, Meter, markdown

@@ -10,7 +10,7 @@ from appliance.api.moments import describe, given, in_full
 from appliance.api.problems import ProblemError
 from appliance.api.routing import CONTRACT
 from appliance.channel.answers.field_docs import UNIT, Moment, NanoMoment, told
-from appliance.channel.answers.graph import Graph
+from appliance.channel.answers.graph_answers import Graph
 from tests.support.answers import example
 
 

@@ -10,7 +10,7 @@ from appliance.api.monitor_judgement import (
     properties_of,
     refusal,
 )
-from appliance.channel.answers.monitors import Monitors
+from appliance.channel.answers.monitor_answers import Monitors
 from tests.support.answers import example
 
 A = "a() { int n; event said() /chatter std_msgs/String '{}' { } ere: said said @match { } }"

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from starlette.responses import StreamingResponse
 
-from appliance.api import recordings
+from appliance.api import recording_routes
 from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
 from appliance.api.services import Services
 from appliance.channel.admin import AdminAnswer
-from appliance.channel.answers.recordings import Recording
+from appliance.channel.answers.recording_answers import Recording
 from appliance.recorder.bag_writer import BagWriter, Message
 from appliance.recorder.mcap import as_mcap
 from tests.support.answers import example
@@ -60,6 +60,6 @@ def test_what_is_answered_is_sent_to_its_end(tmp_path: Path, *, mcap: bool) -> N
 
 
 async def _asked(services: Services, *, mcap: bool) -> StreamingResponse:
-    response = await recordings.bag_response(services, "a" * 20, _EVE, mcap=mcap)
+    response = await recording_routes.bag_response(services, "a" * 20, _EVE, mcap=mcap)
     assert isinstance(response, StreamingResponse)
     return response

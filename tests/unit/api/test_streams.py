@@ -10,7 +10,7 @@ from starlette.responses import Response
 from appliance.api.access import Bearer
 from appliance.api.problems import ProblemError
 from appliance.api.streams import Held, Streams
-from appliance.channel.answers.tokens import TokenRole
+from appliance.channel.answers.token_answers import TokenRole
 from appliance.quotas.table import REST_STREAM_PEERS, REST_STREAMS
 
 

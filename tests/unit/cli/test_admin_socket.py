@@ -1,14 +1,14 @@
-"""Tests of `appliance.cli.admin_socket`: how long it waits, and words that cannot be sent."""
+"""Tests of `appliance.cli.admin_client`: how long it waits, and words that cannot be sent."""
 
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-from appliance.api.hosts import SLOW_SECONDS
+from appliance.api.host_routes import SLOW_SECONDS
 from appliance.channel.admin import TokenAdd
-from appliance.cli import admin_socket
-from appliance.cli.admin_socket import AdminSocket, NotRunningError
+from appliance.cli import admin_client
+from appliance.cli.admin_client import AdminSocket, NotRunningError
 from appliance.cli.main import app
 
 NO_TEXT = "alice\udcff"
@@ -16,7 +16,7 @@ NO_TEXT = "alice\udcff"
 
 def test_it_waits_for_the_slowest_answer() -> None:
     """Longer than REST waits for control's slowest, a new host that waits for the tunnels' process."""
-    assert admin_socket.SECONDS > SLOW_SECONDS
+    assert admin_client.SECONDS > SLOW_SECONDS
 
 
 def test_bytes_that_are_no_text_are_told(tmp_path: Path) -> None:

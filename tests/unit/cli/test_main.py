@@ -8,7 +8,7 @@ import pytest
 
 from appliance import __version__
 from appliance.cli import main
-from appliance.configuration.sources import ConfigError, Mistake
+from appliance.configuration.config_sources import ConfigError, Mistake
 from appliance.network.namespaces import NetworkError
 from appliance.supervisor.errors import StartError
 from tests.support.command import ROSRV

@@ -8,9 +8,9 @@ import pytest
 from typer.testing import CliRunner
 
 from appliance.channel.admin import AdminAnswer, AdminRequest, HostPorts
-from appliance.channel.answers.hosts import PortsTold
+from appliance.channel.answers.host_answers import PortsTold
 from appliance.channel.answers.status import Status
-from appliance.cli.admin_socket import AdminSocket, NotRunningError
+from appliance.cli.admin_client import AdminSocket, NotRunningError
 from appliance.cli.main import app
 from appliance.network.scan import ScanResult
 from tests.support.answers import example

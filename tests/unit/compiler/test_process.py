@@ -117,10 +117,10 @@ def test_texts_that_take_too_much_are_no_burden(memory: int, seconds: int) -> No
     program = f"""
 import resource, sys
 from pathlib import Path
-from appliance import late
+from appliance.base import lazy_imports
 from appliance.channel import messages
 from appliance.compiler import process
-late.load("appliance.specifications.checking")
+lazy_imports.load("appliance.specifications.checking")
 size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (size + {memory}, size + {memory}))
 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

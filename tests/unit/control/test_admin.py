@@ -12,9 +12,9 @@ import pytest
 from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer, PolicyConfirm, decode, encode
-from appliance.channel.answers.policy import PolicyConfirmed
-from appliance.cli import admin_socket
-from appliance.cli.admin_socket import ADMIN_SOCKET, AdminSocket, NotRunningError
+from appliance.channel.answers.policy_answers import PolicyConfirmed
+from appliance.cli import admin_client
+from appliance.cli.admin_client import ADMIN_SOCKET, AdminSocket, NotRunningError
 from appliance.control.admin_socket import AdminServer
 from appliance.control.administration import Administration
 
@@ -84,7 +84,7 @@ async def test_a_tool_without_an_answer_says_how_to_find_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where control does not even answer what became of the order, the tool names the command that finds out."""
-    monkeypatch.setattr(admin_socket, "_GRACE_SECONDS", 0.05)
+    monkeypatch.setattr(admin_client, "_GRACE_SECONDS", 0.05)
     wanted = pytest.raises(NotRunningError, match=r"may have taken effect; .* rosrv audit search --since 5m")
     async with served(tmp_path) as slow:
         # An order that has not begun is answered when it is withdrawn.

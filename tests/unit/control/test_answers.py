@@ -8,7 +8,7 @@ import pytest
 
 from appliance.channel import admin, messages
 from appliance.channel.admin import answer_to
-from appliance.channel.answers.graph import TopicMessage
+from appliance.channel.answers.graph_answers import TopicMessage
 from appliance.channel.messages import api
 from appliance.control.administration import Orders, request_of
 from appliance.control.queries import Looks

@@ -10,7 +10,7 @@ import pytest
 
 from appliance.audit.ids import IdSource
 from appliance.channel import admin, messages
-from appliance.channel.answers.recordings import Recording, Trigger
+from appliance.channel.answers.recording_answers import Recording, Trigger
 from appliance.channel.channel import Channel
 from appliance.configuration.settings import RecorderRules
 from appliance.control.errors import SenselessError, UnknownThingError

@@ -16,16 +16,16 @@ from fastapi.routing import iter_route_contexts
 from appliance.api.access import Bearer, Doorkeeper
 from appliance.api.app import build_app
 from appliance.api.control import ControlLink, _made
-from appliance.api.gate import Gate
 from appliance.api.history import History
 from appliance.api.journal import Journal
+from appliance.api.request_gate import Gate
 from appliance.api.services import Services
 from appliance.channel import admin
 from appliance.channel.admin import CHANGES, OPERATIONS, A, AdminAnswer, AdminRequest
-from appliance.channel.answers.graph import Registrations
-from appliance.channel.answers.hosts import Endpoint
+from appliance.channel.answers.graph_answers import Registrations
+from appliance.channel.answers.host_answers import Endpoint
 from appliance.channel.answers.measures import Measures
-from appliance.channel.answers.policy import PolicyKnown
+from appliance.channel.answers.policy_answers import PolicyKnown
 from appliance.channel.messages.api import Asked, RequestMade, TokenKept
 from appliance.configuration.settings import ApiLimits, Settings
 from appliance.control.rest_meaning import NoOrderError, meant

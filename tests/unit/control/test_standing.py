@@ -2,7 +2,7 @@
 
 import ipaddress
 
-from appliance.channel.answers.recordings import APPLIANCE, ROBOT, UNKNOWN
+from appliance.channel.answers.recording_answers import APPLIANCE, ROBOT, UNKNOWN
 from appliance.control.quota_class import HostStanding, charged_to
 from appliance.policy.policy_compiler import compile_policy
 from appliance.quotas.pool import Standing

@@ -12,9 +12,9 @@ from appliance.audit.log import AuditLog
 from appliance.audit.record import Severity
 from appliance.channel import admin
 from appliance.channel.admin import AdminAnswer, AdminRequest
-from appliance.channel.answers.monitors import RevisionTexts
-from appliance.channel.answers.policy import PolicyKnown
-from appliance.channel.answers.recordings import Recording
+from appliance.channel.answers.monitor_answers import RevisionTexts
+from appliance.channel.answers.policy_answers import PolicyKnown
+from appliance.channel.answers.recording_answers import Recording
 from appliance.control.evidence_orders import EvidenceOrders, NotSealedError
 from appliance.evidence.bundle import Kept, Span, export
 from appliance.signing.fingerprints import fingerprint, fingerprint_of_all

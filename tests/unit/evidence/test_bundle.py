@@ -28,7 +28,7 @@ from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
 from appliance.audit.retention import Retention
 from appliance.audit.search import search
-from appliance.channel.answers.recordings import RecordedTopic, Trigger
+from appliance.channel.answers.recording_answers import RecordedTopic, Trigger
 from appliance.evidence import bundle as bundles
 from appliance.evidence import bundle_verifier
 from appliance.evidence.bundle import VERIFIER, BundleError, Span, export

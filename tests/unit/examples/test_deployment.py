@@ -5,7 +5,7 @@ from typing import Any
 
 import yaml
 
-from appliance.configuration.sources import resolve
+from appliance.configuration.config_sources import resolve
 from appliance.policy.policy_compiler import compile_policy
 
 ROOT = Path(__file__).parents[3]

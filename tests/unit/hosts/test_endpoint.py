@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from appliance.channel.answers.hosts import Endpoint
+from appliance.channel.answers.host_answers import Endpoint
 from appliance.channel.messages import EndpointFound
 from appliance.configuration.settings import Ipsec, Settings
 from appliance.hosts.host_table import HostRefusedError

@@ -30,7 +30,7 @@ from appliance.channel.admin import (
     HostToken,
     RevocationsWanted,
 )
-from appliance.channel.answers.hosts import Endpoint, EnrolmentToken, KitParts, PortsSeen
+from appliance.channel.answers.host_answers import Endpoint, EnrolmentToken, KitParts, PortsSeen
 from appliance.channel.channel import Channel
 from appliance.channel.link import Link
 from appliance.channel.messages import (

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
+from appliance.configuration.config_sources import read
 from appliance.configuration.settings import Settings
-from appliance.configuration.sources import read
 from appliance.hosts.rest_place import rest_place
 
 NET = ["192.168.1.0/24"]

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 from msgspec import structs
 
-from appliance.channel.answers.hosts import KitParts
+from appliance.channel.answers.host_answers import KitParts
 from appliance.ipsec.enrolment_kit import Kit, archive, swanctl_conf
 from appliance.network.close_ports import protection
 from appliance.network.firewall.firewall_rules import PortRange

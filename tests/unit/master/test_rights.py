@@ -33,8 +33,8 @@ from appliance.master.graph.revocation import CALLS
 from appliance.policy.actions import VERBS
 from appliance.policy.cases import run_cases
 from appliance.policy.commands import COMMANDS
+from appliance.policy.decision_reasons import explain
 from appliance.policy.diff import diff
-from appliance.policy.explain import explain
 from appliance.policy.grant import Asked, UngrantableError, grant
 from appliance.policy.judgement import Known
 from appliance.policy.learn import Observation, learn

@@ -2,7 +2,7 @@
 
 import ipaddress
 
-from appliance.policy.explain import Explanation, explain, render
+from appliance.policy.decision_reasons import Explanation, explain, render
 from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.rights import decide, rights_of

@@ -4,8 +4,8 @@ import ipaddress
 
 import pytest
 
+from appliance.policy.decision_reasons import explain, render
 from appliance.policy.diff import diff
-from appliance.policy.explain import explain, render
 from appliance.policy.model import Category, Request
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError

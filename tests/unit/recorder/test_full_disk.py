@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from appliance.channel import messages
-from appliance.channel.answers.recordings import Recording, Trigger
+from appliance.channel.answers.recording_answers import Recording, Trigger
 from tests.support.requirements import need_root
 from tests.unit.recorder.test_recorder import SECOND, TEXT, Scene
 

@@ -14,7 +14,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag2.storage_mcap import McapReader
 
 from appliance.channel import messages
-from appliance.channel.answers.recordings import Recording, Trigger
+from appliance.channel.answers.recording_answers import Recording, Trigger
 from appliance.recorder.mcap import as_mcap
 from tests.unit.recorder.test_recorder import BEGAN, SECOND, Scene
 

@@ -8,7 +8,7 @@ import pytest
 from msgspec import structs
 
 from appliance.audit.record import Severity
-from appliance.channel.answers.recordings import OPERATORS, ROBOT, UNKNOWN, TriggerKind
+from appliance.channel.answers.recording_answers import OPERATORS, ROBOT, UNKNOWN, TriggerKind
 from appliance.configuration.settings import RecorderRules
 from appliance.recorder.recording_plan import HourlyLimit, RecordingPlan, span
 from tests.unit.recorder.test_shelf import SECOND, recording

@@ -14,7 +14,7 @@ from rosbags.rosbag1 import Reader
 
 from appliance.audit.log import AuditLog
 from appliance.channel import messages
-from appliance.channel.answers.recordings import Recording, Trigger
+from appliance.channel.answers.recording_answers import Recording, Trigger
 from appliance.configuration.settings import RecorderRules
 from appliance.recorder.never import NAMED
 from appliance.recorder.recorder import SETTLE_SECONDS, Recorder

@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from appliance.channel.answers.recordings import OPERATORS, ROBOT, Recording, Trigger, TriggerKind
+from appliance.channel.answers.recording_answers import OPERATORS, ROBOT, Recording, Trigger, TriggerKind
 from appliance.recorder.recording_store import ABOUT, Shelf
 
 MIB = 1 << 20

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from appliance.channel.answers.recordings import Recording, Sender
+from appliance.channel.answers.recording_answers import Recording, Sender
 from appliance.recorder.bag_reader import BagReader, Place
 from appliance.recorder.bag_writer import BagWriter, Message
 from appliance.recorder.timeline import MOST_EVENTS, messages_around, timeline

@@ -5,7 +5,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 from appliance.audit.record import Record, Severity
-from appliance.channel.answers.recordings import TriggerKind
+from appliance.channel.answers.recording_answers import TriggerKind
 from appliance.configuration.settings import RecorderRules
 from appliance.recorder.triggers import trigger_of
 

@@ -4,8 +4,8 @@ import json
 from dataclasses import fields
 from pathlib import Path
 
+from appliance.configuration.config_sources import plain
 from appliance.configuration.settings import Relay, Settings
-from appliance.configuration.sources import plain
 from appliance.relay.bounds import Limits
 from appliance.supervisor.relay_entry import limits_of
 

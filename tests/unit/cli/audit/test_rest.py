@@ -10,7 +10,7 @@ import pytest
 from appliance.audit.query import Filter, FilterError
 from appliance.audit.record import Record
 from appliance.audit.record_format import Entry, as_object
-from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.admin_client import NotRunningError
 from appliance.cli.audit import log_over_rest as audit_rest
 from appliance.cli.audit.log_over_rest import RestLog
 from appliance.cli.rest.session import ProblemError, RestClient

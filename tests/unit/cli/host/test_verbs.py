@@ -18,9 +18,9 @@ from appliance.channel.admin import (
     HostToken,
     MonitorsWanted,
 )
-from appliance.channel.answers.hosts import Endpoint, EnrolmentToken, Hosts, KitParts, Revoked
-from appliance.channel.answers.monitors import Monitors
-from appliance.cli.admin_socket import AdminSocket
+from appliance.channel.answers.host_answers import Endpoint, EnrolmentToken, Hosts, KitParts, Revoked
+from appliance.channel.answers.monitor_answers import Monitors
+from appliance.cli.admin_client import AdminSocket
 from appliance.cli.main import app
 from tests.support.answers import example
 

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from appliance.channel.admin import AdminAnswer, encode
-from appliance.channel.answers.monitors import Monitors, MonitorState, Replaced
+from appliance.channel.answers.monitor_answers import Monitors, MonitorState, Replaced
 from appliance.cli.main import app
 from tests.support.answers import example
 

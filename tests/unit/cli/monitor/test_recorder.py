@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from appliance.channel.admin import AdminAnswer, Trouble, encode
-from appliance.channel.answers.recordings import Recording, Recordings
+from appliance.channel.answers.recording_answers import Recording, Recordings
 from tests.support.answers import example
 from tests.unit.cli.monitor.test_verbs import invoke, make_bag, number, records, write
 

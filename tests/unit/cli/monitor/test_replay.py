@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from appliance.channel.admin import AdminAnswer, encode
-from appliance.channel.answers.monitors import Monitors, MonitorState
+from appliance.channel.answers.monitor_answers import Monitors, MonitorState
 from tests.support.answers import example
 from tests.unit.cli.monitor.test_verbs import GOOD, invoke, make_bag, number, records, write
 

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import pytest
 
-from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.admin_client import NotRunningError
 from appliance.cli.selftest import live_checks as selftest_running
 from appliance.cli.target import Appliance
 

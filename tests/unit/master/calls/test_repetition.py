@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from appliance.master.calls.call_table import MASTER_CALLS
-from appliance.master.calls.repetition import Repetitions
+from appliance.master.calls.repeated_calls import Repetitions
 from appliance.master.graph.registry import Kind
 from appliance.rpc.server import HttpRequest
 from roswire.xmlrpc import Value

@@ -16,11 +16,11 @@ from appliance.api.problems import Finding, ProblemError
 from appliance.audit.record import Record
 from appliance.audit.why import lines_of
 from appliance.channel.admin import PolicyLoad
-from appliance.channel.answers.graph import Registration
-from appliance.channel.answers.policy import Granted, PolicyKnown, Why
+from appliance.channel.answers.graph_answers import Registration
+from appliance.channel.answers.policy_answers import Granted, PolicyKnown, Why
 from appliance.policy.actions import BadWordError, check_resource, find_hosts
+from appliance.policy.decision_reasons import Explanation, explain
 from appliance.policy.diff import diff
-from appliance.policy.explain import Explanation, explain
 from appliance.policy.grant import UngrantableError, grant
 from appliance.policy.judgement import Judged, Known, judge
 from appliance.policy.live_rights import Live, endings

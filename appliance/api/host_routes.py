@@ -17,11 +17,11 @@ from appliance.api.kits import Wishes, kit_of
 from appliance.api.moments import given
 from appliance.api.preconditions import IfMatch, etag, expected_revision
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Admin, Operator, Viewer, answered, ask
+from appliance.api.route_roles import Admin, Operator, Viewer, answered, ask
 from appliance.api.routing import ETAG, Responses, Routes, Tagged, answer, body, content, tagged
 from appliance.api.services import Services
 from appliance.channel import admin
-from appliance.channel.answers import hosts as answers
+from appliance.channel.answers import host_answers as answers
 from appliance.ipsec.enrolment_kit import archive
 from appliance.ipsec.requests import make_key, signing_request
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 from appliance.audit.record_format import rfc3339
 from appliance.audit.timestamps import parse_moment
 from appliance.channel import admin
-from appliance.channel.answers.recordings import Recording, Recordings
-from appliance.cli.admin_socket import NotRunningError
+from appliance.channel.answers.recording_answers import Recording, Recordings
+from appliance.cli.admin_client import NotRunningError
 from appliance.cli.monitor.input import usage_error
 from appliance.cli.output import refused
 from appliance.cli.record_verbs import bag_of

@@ -8,11 +8,11 @@ from typing import Annotated
 
 from fastapi import Path
 
-from appliance.api.roles import Admin, add_look, ask
+from appliance.api.route_roles import Admin, add_look, ask
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.channel.admin import TokenList, TokenRevoke
-from appliance.channel.answers.tokens import Token
+from appliance.channel.answers.token_answers import Token
 
 _UNKNOWN: Responses = {422: {"description": "There is no token of this name that can be used."}}
 

@@ -13,14 +13,19 @@ from appliance.api.monitor_judgement import Compiler, events_of, picture_of, pro
 from appliance.api.monitor_models import Happened, History, Monitor
 from appliance.api.policy_models import OneRevision
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Viewer, ask, reads_contents
+from appliance.api.route_roles import Viewer, ask, reads_contents
 from appliance.api.routing import Responses, Routes, Tagged, file, tagged
 from appliance.api.services import Services
 from appliance.audit.query import Filter
 from appliance.audit.record_format import Entry, rfc3339, without_contents
 from appliance.audit.search import search
 from appliance.channel.admin import MonitorRevisions, MonitorRevisionWanted, MonitorsWanted
-from appliance.channel.answers.monitors import MonitorRevisionList, Monitors, MonitorState, RevisionTexts
+from appliance.channel.answers.monitor_answers import (
+    MonitorRevisionList,
+    Monitors,
+    MonitorState,
+    RevisionTexts,
+)
 
 UNKNOWN: Responses = {404: {"description": "There is no such monitor, or revision."}}
 _PICTURE = file("image/svg+xml", "OK")

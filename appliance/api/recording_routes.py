@@ -17,13 +17,13 @@ from appliance.api.access import Bearer
 from appliance.api.control import ControlLink
 from appliance.api.moments import given
 from appliance.api.problems import ProblemError
-from appliance.api.roles import Admin, Investigator, Operator, Viewer, answered, ask
+from appliance.api.route_roles import Admin, Investigator, Operator, Viewer, answered, ask
 from appliance.api.routing import Responses, Routes, answer, body, content, file
 from appliance.api.services import Services
 from appliance.api.streams import Held, in_thread, peer_of, turn
 from appliance.channel import admin
 from appliance.channel.answers.field_docs import told
-from appliance.channel.answers.recordings import (
+from appliance.channel.answers.recording_answers import (
     RecordedMessages,
     Recording,
     RecordingBegun,

@@ -9,8 +9,8 @@ from starlette.responses import StreamingResponse
 from appliance.api.access import Bearer
 from appliance.api.moments import given
 from appliance.api.problems import ProblemError
-from appliance.api.recordings import OneId
-from appliance.api.roles import Investigator, Reader, problem_of
+from appliance.api.recording_routes import OneId
+from appliance.api.route_roles import Investigator, Reader, problem_of
 from appliance.api.routing import Responses, Routes, file
 from appliance.api.services import Services
 from appliance.api.streams import Held, in_thread, peer_of

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from appliance.channel.admin import MonitorConfirm, MonitorRevisions, MonitorRevisionWanted, MonitorRollback
-from appliance.channel.answers.monitors import RevisionTexts
+from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.cli.commit_confirm import verbs_of
 from appliance.cli.monitor.in_force import say_replaced
 from appliance.cli.output import say, say_json, usage_error

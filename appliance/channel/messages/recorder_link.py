@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import msgspec
 
-from appliance.channel.answers.recordings import Recording, Trigger
+from appliance.channel.answers.recording_answers import Recording, Trigger
 from appliance.channel.messages.message import Message
 
 

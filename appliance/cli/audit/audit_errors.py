@@ -13,7 +13,7 @@ from appliance.audit.query import FilterError
 from appliance.audit.record_format import printable
 from appliance.audit.signatures import KeyUnreadableError
 from appliance.audit.timestamps import MomentError
-from appliance.cli.admin_socket import NotRunningError
+from appliance.cli.admin_client import NotRunningError
 
 CANNOT_READ = 2
 

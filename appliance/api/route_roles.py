@@ -7,11 +7,11 @@ from fastapi.security import HTTPBearer
 
 from appliance.api.access import Bearer
 from appliance.api.control import ControlLink
-from appliance.api.gate import BEARER
 from appliance.api.problems import ProblemError
+from appliance.api.request_gate import BEARER
 from appliance.api.routing import Routes
 from appliance.channel.admin import A, AdminAnswer, AdminRequest, Trouble, answer_to, operation_of
-from appliance.channel.answers.tokens import TokenRole, may
+from appliance.channel.answers.token_answers import TokenRole, may
 
 _SCHEME = HTTPBearer(auto_error=False, description="A token made by `rosrv token add`")
 

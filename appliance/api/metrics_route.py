@@ -14,11 +14,11 @@ from prometheus_client.registry import Collector
 from prometheus_client.utils import floatToGoString
 from starlette.responses import Response
 
-from appliance.api.roles import Viewer, ask
+from appliance.api.route_roles import Viewer, ask
 from appliance.api.routing import Routes, file
 from appliance.api.services import Services
 from appliance.channel.admin import MetricsWanted
-from appliance.channel.answers.hosts import Host
+from appliance.channel.answers.host_answers import Host
 from appliance.channel.answers.measures import Measures
 from appliance.channel.answers.status import ForwardingState, ProcessInfo
 from appliance.channel.status_summary import no_relay, probe_failed, process_names

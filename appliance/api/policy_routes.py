@@ -8,16 +8,16 @@ import msgspec
 from fastapi import Query
 
 from appliance.api.access import Bearer
-from appliance.api.judgement import explanation, judge_text
+from appliance.api.dry_run_policy import explanation, judge_text
 from appliance.api.policy_models import Decided, Explained, LostRule, OneRevision, Question, RuleText, Text
-from appliance.api.roles import Viewer, add_look, ask
+from appliance.api.route_roles import Viewer, add_look, ask
 from appliance.api.routing import Responses, Routes, Tagged, body, tagged
 from appliance.api.services import Services
 from appliance.channel.admin import PolicyRevisions, PolicyWanted
 from appliance.channel.answers.field_docs import told
-from appliance.channel.answers.policy import PolicyInForce, RevisionText
+from appliance.channel.answers.policy_answers import PolicyInForce, RevisionText
 from appliance.policy.cases import CaseResult
-from appliance.policy.explain import Explanation
+from appliance.policy.decision_reasons import Explanation
 from appliance.policy.model import Category
 
 _UNKNOWN: Responses = {404: {"description": "There is no such revision."}}

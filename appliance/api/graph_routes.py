@@ -4,11 +4,11 @@ from typing import Annotated
 
 from fastapi import Query
 
-from appliance.api.roles import Operator, add_look, ask
+from appliance.api.route_roles import Operator, add_look, ask
 from appliance.api.routing import Responses, Routes
 from appliance.api.services import Services
 from appliance.channel.admin import GraphWanted, TopicLook
-from appliance.channel.answers.graph import TopicMessages
+from appliance.channel.answers.graph_answers import TopicMessages
 
 _UNKNOWN: Responses = {404: {"description": "No node publishes or subscribes to it."}}
 
