@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rosmop.fast.deferred_output import Line
+from rosmop.form.compiled import Compiled
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
@@ -107,3 +108,11 @@ class FeedModule:
     lines: Sequence[Line]
     said: int
     """Where lines of output are noted, by their places among the `lines`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The specifications of a set that one process runs, and the module of those that are not in shadow mode."""
+
+    compiled: Compiled
+    module: FeedModule

@@ -9,8 +9,8 @@ from typing import Any, get_type_hints
 
 import msgspec
 
-from rosmop.fast.abi import FeedModule
-from rosmop.form.compiled import Compiled, Part
+from rosmop.fast.abi import FeedModule, Part
+from rosmop.form.compiled import Compiled
 from rosmop.logics.bounded import BoundedProperty
 from rosmop.logics.cfg import GrammarProperty
 from rosmop.logics.interface import CompiledProperty, FiniteProperty

@@ -4,10 +4,10 @@ from collections.abc import Collection
 from dataclasses import fields
 
 from rosmop.certify.steps import check_steps
-from rosmop.fast.abi import FeedModule
+from rosmop.fast.abi import FeedModule, Part
 from rosmop.fast.batch_codegen import WrittenModule, written
 from rosmop.fast.wasm_instance import translated
-from rosmop.form.compiled import Compiled, Part
+from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
 from rosmop.runtime.values import Values
 

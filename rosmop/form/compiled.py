@@ -3,13 +3,11 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from rosmop.fast.abi import FeedModule
 from rosmop.form import nodes
 from rosmop.form.connected_groups import sharing, way_of
 from rosmop.form.positions import Finding, Position
 from rosmop.form.sites import Site, Symbols
 from rosmop.logics.interface import CompiledProperty
-from rosmop.run.interpreter import Interpreter
 from rosmop.types import value_types
 from rosmop.types.messages import Messages
 from rosmop.types.value_types import Type
@@ -143,11 +141,6 @@ class Compiled:
     messages: Messages
     publications: tuple[Publication, ...]
 
-    def interpreter(self) -> Interpreter:
-        """What runs them, on a state of its own."""
-        contexts = {one.context: one.name for one in self.specifications}
-        return Interpreter(self.functions, self.sites, self.types, contexts, self.messages)
-
     def alone(self, names: Collection[str]) -> "Compiled":
         """As `part`, without anything of the others: the same whatever else is in the set."""
         part = self.part(names)
@@ -196,11 +189,3 @@ class Compiled:
             if event.part is None
         ]
         return frozenset(event.topic for event in events if event.topic and self.is_stamped(event.type))
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """What one process runs of a set: these specifications, and the module of those that are not on trial."""
-
-    compiled: Compiled
-    module: FeedModule

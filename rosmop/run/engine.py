@@ -33,6 +33,7 @@ from rosmop.form.positions import Finding, Position
 from rosmop.form.specification_groups import groups
 from rosmop.run.causes import NOBODY, Sender
 from rosmop.run.execution import Asked, Execution, OnFault
+from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import Group, Monitor, Step, monitors_of
 from rosmop.run.outcomes import Outcome
 from rosmop.run.slice_quota import HolderOf, no_holder
@@ -135,7 +136,10 @@ class MonitorSet:
         self._tapped_ways: frozenset[str] = frozenset()
         self.warnings: tuple[Finding, ...] = compiled.warnings
         self.compiled = compiled
-        self.interpreter = compiled.interpreter()
+        contexts = {one.context: one.name for one in compiled.specifications}
+        self.interpreter = Interpreter(
+            compiled.functions, compiled.sites, compiled.types, contexts, compiled.messages
+        )
         self.on_fault: OnFault = on_fault
         self.patience = patience
         self._monitors = monitors_of(compiled, self.interpreter, 0, slices, holder_of)

@@ -7,10 +7,10 @@ import msgspec
 
 from appliance.channel.messages import SpecificationsStated
 from appliance.relay.monitors.loader import Result
-from rosmop.fast.abi import FeedModule
+from rosmop.fast.abi import FeedModule, Part
 from rosmop.fast.serialization import decoded_part
 from rosmop.fast.wasm_instance import load
-from rosmop.form.compiled import Compiled, Part
+from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
 from rosmop.run.slice_quota import HolderOf
 from rosmop.types.messages import Messages
