@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from roswire.standard import standard_definitions
 
@@ -111,7 +112,7 @@ def messages(trace: Path) -> list[tuple[str, bytes]]:
 def failing(specifications: Sequence[str], trace: Sequence[tuple[str, bytes]]) -> tuple[list[int], float]:
     """The events at which one of them is violated, counted from 1, and the microseconds of an event."""
     sources = {f"{number}.rv": text for number, text in enumerate(specifications)}
-    monitors = MonitorSet.load(sources, standard_definitions(), slices=SLICES)
+    monitors = MonitorSet.of(compiled_from(sources, standard_definitions()), slices=SLICES)
     monitors.start(0)
     found = []
     started = time.process_time()

@@ -23,6 +23,7 @@ import numpy as np
 
 from examples.landshark.drive import TYPES, VELOCITY, Part, Simulation
 from examples.landshark.messages import DEFINITIONS, Messages, long_name
+from rosmop.check.sources import compiled_from
 from rosmop.learn.learner import Learnt, learn
 from rosmop.run.engine import MonitorSet
 from roswire.definitions import Definitions
@@ -290,7 +291,7 @@ def seeded(kind: str, drives: Sequence[Drive], chance: random.Random) -> tuple[D
 
 def alarms(learnt: Learnt, rows: Sequence[Row]) -> list[tuple[int, str, str]]:
     """Time, specification and text of every warning."""
-    monitors = MonitorSet.load({"learnt.rv": learnt.text}, KNOWN)
+    monitors = MonitorSet.of(compiled_from({"learnt.rv": learnt.text}, KNOWN))
     monitors.start(rows[0][1], frozenset(TYPES))
     found = []
     for topic, time, data in rows:

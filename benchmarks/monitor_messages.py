@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from roswire.standard import standard_definitions
 
@@ -84,7 +85,7 @@ def microseconds(action: Callable[[], object], times: int) -> float:
 
 
 def monitors(text: str) -> MonitorSet:
-    loaded = MonitorSet.load({"benchmark.rv": text}, DEFINITIONS)
+    loaded = MonitorSet.of(compiled_from({"benchmark.rv": text}, DEFINITIONS))
     loaded.start(0)
     return loaded
 
@@ -145,7 +146,8 @@ def main() -> None:
     loop = microseconds(lambda: scans.process("/scan", LASER, 1), MESSAGES // 20)
     print(f"{'a loop over 100 numbers, engine':32} {loop:8.2f} µs")
     print(f"{'a loop over 100, 64 together':32} {batched(64, LASER, SCAN, '/scan'):8.2f} µs")
-    loading = microseconds(lambda: MonitorSet.load({"benchmark.rv": REFERENCE}, DEFINITIONS), 20) / 1000
+    files = {"benchmark.rv": REFERENCE}
+    loading = microseconds(lambda: MonitorSet.of(compiled_from(files, DEFINITIONS)), 20) / 1000
     print(f"{'loading the reference':32} {loading:8.2f} ms")
     module = microseconds(lambda: monitors(REFERENCE).write_module(), 20) / 1000
     print(f"{'the same with its module':32} {module:8.2f} ms")

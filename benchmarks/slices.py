@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from roswire.standard import standard_definitions
 
@@ -50,7 +51,7 @@ def ids(count: int) -> list[bytes]:
 
 def monitors(text: str) -> MonitorSet:
     """A set that has begun."""
-    loaded = MonitorSet.load({"slices.rv": text}, standard_definitions(), slices=MANY)
+    loaded = MonitorSet.of(compiled_from({"slices.rv": text}, standard_definitions()), slices=MANY)
     loaded.start(0)
     return loaded
 

@@ -61,11 +61,13 @@ class Compiler:
 
 
 def _compiled(files: dict[str, str], definitions: dict[str, str]) -> MonitorSet:
+    from rosmop.check.sources import compiled_from  # noqa: PLC0415  the compiler: see the head
     from rosmop.run.engine import MonitorSet  # noqa: PLC0415  the compiler: see the head
     from roswire.definitions import Definitions  # noqa: PLC0415  the compiler: see the head
     from roswire.standard import standard_definitions  # noqa: PLC0415  the compiler: see the head
 
-    return MonitorSet.load(files, standard_definitions().extended(Definitions.from_files(definitions)))
+    known = standard_definitions().extended(Definitions.from_files(definitions))
+    return MonitorSet.of(compiled_from(files, known))
 
 
 def events_of(monitor: Monitor) -> list[EventShown]:

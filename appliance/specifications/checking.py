@@ -7,6 +7,7 @@ from appliance.channel.messages import Contents, PartNames
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from rosmop.certify.properties import DEFECT, certificates_of
 from rosmop.certify.steps import StepDiffersError
+from rosmop.check.sources import compiled_from
 from rosmop.fast.serialization import decoded, encoded, encoded_part
 from rosmop.fast.wasm_build import part_of
 from rosmop.run.engine import MonitorSet
@@ -22,7 +23,7 @@ def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:
     """What is in these files, with these definitions. Raises `SpecificationsRefusedError` with all that is wrong."""
     try:
         definitions = _standard().extended(Definitions.from_files(texts))
-        monitors = MonitorSet.load(files, definitions, margins=True)
+        monitors = MonitorSet.of(compiled_from(files, definitions, margins=True))
     except SpecificationError as error:
         raise SpecificationsRefusedError([str(finding) for finding in error.findings]) from error
     except DefinitionError as error:

@@ -18,6 +18,7 @@ from rosbags.rosbag1 import Writer
 
 from examples.landshark.messages import DEFINITIONS, MONITORS, TRIGGER, Messages, long_name
 from examples.landshark.nodes import physics
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
@@ -123,7 +124,7 @@ class Simulation:
         self._velocity, self._told, self._charge = physics.Velocity(), START, 1.0
         definitions = standard_definitions().extended(Definitions.from_files(DEFINITIONS))
         texts = {file.name: file.read_text(encoding="utf-8") for file in specifications}
-        self._monitors = MonitorSet.load(texts, definitions)
+        self._monitors = MonitorSet.of(compiled_from(texts, definitions))
         self._monitors.start(START)
 
     def run(self, mission: Sequence[Part] = MISSION) -> Drive:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 
+from rosmop.check.sources import compiled_from
 from rosmop.check.specification import compile_files
 from rosmop.form.positions import Position
 from rosmop.learn.recordings import Recording
@@ -42,7 +43,7 @@ def covered(
 
     A state counts how often it was entered or stayed in by an event. Raises `SpecificationError`.
     """
-    MonitorSet.load(texts, definitions)  # errors are those of the text as it is
+    compiled_from(texts, definitions)  # errors are those of the text as it is
     marked = _Marked([parse(text, name) for name, text in texts.items()])
     counts: Counter[Item] = Counter()
     for recording in recordings:

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from rosmop.check.sources import compiled_from
 from rosmop.learn.candidates import Candidate, Knowledge
 from rosmop.learn.field_values import Fields, MessageError
 from rosmop.learn.recordings import Part, Received, Recording, Windows, split
@@ -102,7 +103,7 @@ class _Learner:
         rows = list(specifications(kept, known))
         names = {candidate.key: name for name, _, group in rows for candidate in group}
         text = "\n".join([self._head(known, kept, left_out), *(row[1] for row in rows)])
-        MonitorSet.load({"learnt.rv": text}, self._definitions)
+        compiled_from({"learnt.rv": text}, self._definitions)
         return Learnt(
             text,
             tuple(kept),
@@ -171,7 +172,7 @@ class _Learner:
         groups = {name: group for name, _, group in rows}
         text = "\n".join(row[1] for row in rows)
         for part in self._held_out if rows else ():
-            monitors = MonitorSet.load({"learnt.rv": text}, self._definitions)
+            monitors = MonitorSet.of(compiled_from({"learnt.rv": text}, self._definitions))
             monitors.start(part.began, frozenset(part.topics))
             for topic, time, data in self._messages(part):
                 outcome = monitors.process(topic, data, time)

@@ -2,16 +2,15 @@
 
 Theory of operation:
 
-1. `MonitorSet.load` compiles files; `start` gives the variables their first values. A file that is wrong
-   changes nothing: the set in force stays.
+1. `MonitorSet.of` takes what was compiled; `start` gives the variables their first values.
 2. `process` gives a message to the events on its topic (`execution.py`).
 3. Time is what the caller says: nanoseconds, with every message. Ticks and deadlines that are due (`agenda.py`) happen
    before a message; `process` returns them in `before`. While no message comes, the caller calls `advance` when
    `next_due` has come; a deadline may have been put off since.
 4. `walker` offers, for most topics, a walk that does what `process` does to many messages at once (`walks.py`), as
    far as these need nothing that is recorded or explained. Its results differ in nothing but the time that they take.
-5. `replaced` makes the set that follows: one swap between two messages. Specifications whose text is the same
-   keep their variables and runs.
+5. A new set takes the place of another one with `succeed`, in one swap between two messages. Specifications whose
+   text is the same keep their variables and runs.
 6. Specifications on trial are sets of their own (`trials`), one for those that share variables: nothing that one does
    or uses up is seen by others. Where the first of such a set would stand among the others, a copy of the message as
    it is there is left in `tapped`; the caller gives it to them when the message is passed on (`Tapped.give`), and what
@@ -170,40 +169,6 @@ class MonitorSet:
             weakref.finalize(self, part.let_go).atexit = False
 
     @classmethod
-    def load(
-        cls,
-        sources: Mapping[str, str],
-        definitions: Definitions,
-        on_fault: OnFault = "drop",
-        patience: Patience = lambda: _never,
-        *,
-        trials: Collection[str] = (),
-        trial_patience: Patience = lambda: _never,
-        margins: bool = False,
-        slices: int = LIMIT,
-        holder_of: HolderOf = no_holder,
-    ) -> "MonitorSet":
-        """Compile files (name to text) in this order; raises `SpecificationError` with all that is wrong.
-
-        `patience()` is asked when something is due: what says whether that has taken too long (`trial_patience` for
-        those on trial). With one that is named in `trials`, all that share variables with it are on trial. With
-        `margins` they note how close comparisons of numbers come (`take_margins`). A parametric specification has at
-        most so many `slices`.
-        """
-        from rosmop.check.sources import compiled_from  # noqa: PLC0415  the compiler: not in a relay
-
-        compiled = compiled_from(sources, definitions, margins=margins)
-        return cls.of(
-            compiled,
-            on_fault,
-            patience,
-            trials=trials,
-            trial_patience=trial_patience,
-            slices=slices,
-            holder_of=holder_of,
-        )
-
-    @classmethod
     def of(
         cls,
         compiled: Compiled,
@@ -216,7 +181,11 @@ class MonitorSet:
         deadlines: int = sys.maxsize,
         holder_of: HolderOf = no_holder,
     ) -> "MonitorSet":
-        """The set of what was compiled; the rest as `load` and `__init__` say."""
+        """Return the set of what was compiled. With one that is named in `trials`, all that share variables are tried.
+
+        `patience()` is asked when something is due: it returns what says whether that has taken too long
+        (`trial_patience` for those on trial). A parametric specification has at most so many `slices`.
+        """
         tried = []
         for group in compiled.groups(trials):
             trial = cls(
@@ -511,23 +480,13 @@ class MonitorSet:
         self._agenda.schedule()
         return outcome
 
-    def replaced(
-        self, sources: Mapping[str, str], definitions: Definitions, time_ns: int
-    ) -> tuple["MonitorSet", Outcome]:
-        """The set that takes this one's place, started.
-
-        Specifications with the same text keep their state, `init` included, unless a message type that they use has
-        another definition now. One that begins anew goes on holding its topics if it did and is still declared
-        `hold`. Raises `SpecificationError`, and nothing changed.
-        """
-        following = MonitorSet.load(sources, definitions, self.on_fault, self.patience)
-        return following, following.succeed(self, time_ns)
-
     def succeed(
         self, before: "MonitorSet", time_ns: int, incomplete: Collection[str] = frozenset()
     ) -> Outcome:
-        """Take the place of another set, as `replaced` says; `began` names those that begin with this one.
+        """Take the place of another set and start; `began` names the specifications that begin with this one.
 
+        Specifications with the same text keep their state, `init` included, unless a message type that they use has
+        another definition now. One that begins anew goes on holding its topics if it did and is still declared `hold`.
         What goes on trial, or comes from it, keeps its state as others do; on trial it holds no topic. Those that are
         `incomplete` have not seen all messages on trial: they begin anew when they are not on trial any more.
         """

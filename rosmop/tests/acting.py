@@ -7,6 +7,7 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
+from rosmop.check.sources import compiled_from
 from rosmop.form.positions import Finding
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
@@ -86,8 +87,8 @@ def load(
     text: str, on_fault: OnFault = "drop", patience: Patience = lambda: lambda: False, **others: str
 ) -> MonitorSet:
     """The monitors of a text (and of other files by name), started at time 0."""
-    monitors = MonitorSet.load({"x.rv": text, **{f"{name}.rv": other for name, other in others.items()}},
-                               definitions(), on_fault, patience)  # fmt: skip
+    sources = {"x.rv": text, **{f"{name}.rv": other for name, other in others.items()}}
+    monitors = MonitorSet.of(compiled_from(sources, definitions()), on_fault, patience)
     monitors.start(0)
     return monitors
 
@@ -115,7 +116,7 @@ def shown(expression: str, *, conversion: str = "%s", before: str = "", data: in
 def refused(text: str) -> list[Finding]:
     """The errors of a specification; fails if there is none."""
     try:
-        MonitorSet.load({"x.rv": text}, definitions())
+        MonitorSet.of(compiled_from({"x.rv": text}, definitions()))
     except SpecificationError as error:
         return [finding for finding in error.findings if finding.severity == "error"]
     raise AssertionError("the specification was accepted")

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import message
 from roswire.standard import standard_definitions
@@ -38,7 +39,7 @@ def test_every_walk_of_a_message_ends_with_its_time(name: str) -> None:
     """A message that may be read ten times is cut off at the eleventh; without a limit it passes."""
     kind, parameter, pattern, action, data = WALKS[name]
     text = f"a() {{ double n = 0; event e({parameter}) /t {kind} '{pattern}' {{ {action} }} }}"
-    monitors = MonitorSet.load({"a.rv": text}, standard_definitions())
+    monitors = MonitorSet.of(compiled_from({"a.rv": text}, standard_definitions()))
     monitors.start(0)
     free = monitors.process("/t", bytearray(data), 1)
     assert (free.result, free.faults) == ("passed", ())
@@ -57,7 +58,7 @@ def test_on_fault_decides_about_a_message_that_was_cut_off() -> None:
         "event e(std::string s) /t std_msgs/String '{data:s}' { for (int i = 0; i < s.size(); i++) n += i; }"
     )
     sources = {f"{name}.rv": f"{name}() {{ int n = 0; {loop} }}" for name in ("a", "b")}
-    monitors = MonitorSet.load(sources, standard_definitions(), "pass")
+    monitors = MonitorSet.of(compiled_from(sources, standard_definitions()), "pass")
     monitors.start(0)
     readings: list[None] = []
     monitors.limit_time(ticking(readings), 0.010)
@@ -70,7 +71,7 @@ def test_on_fault_decides_about_a_message_that_was_cut_off() -> None:
 def test_a_hurried_message_has_a_part_of_the_time() -> None:
     """And the fault says so."""
     text = "a() { int n; event e(std::string s) /t std_msgs/String '{data:s}' { for (;;) n++; } }"
-    monitors = MonitorSet.load({"a.rv": text}, standard_definitions())
+    monitors = MonitorSet.of(compiled_from({"a.rv": text}, standard_definitions()))
     monitors.start(0)
     monitors.limit_time(ticking([]), 0.010)
     monitors.hurry(0.1)

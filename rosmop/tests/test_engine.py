@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from rosmop.run.timers import MAX_TICKS
@@ -14,6 +15,7 @@ from rosmop.tests.acting import definitions, load, message, refused
 from rosmop.tests.examples import examples
 from rosmop.tests.random_specifications import Messages, Specifications
 from rosmop.tests.random_specifications import definitions as random_definitions
+from rosmop.tests.reload import replaced
 from rosmop.text.errors import SpecificationError
 from roswire.definitions import Definitions
 
@@ -128,7 +130,7 @@ def test_init_runs_once_before_the_first_message() -> None:
         + on("/t", "e", 'ROS_INFO("%d", n++);')
         + "}"
     )
-    monitors = MonitorSet.load({"x.rv": text}, definitions())
+    monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions()))
     assert printed(monitors.start(0)) == ["init 6"]
     assert [printed(monitors.process("/t", number(0), i)) for i in (1, 2)] == [["6"], ["7"]]
 
@@ -136,7 +138,7 @@ def test_init_runs_once_before_the_first_message() -> None:
 def test_a_monitor_whose_init_faults_lets_nothing_pass() -> None:
     """Without a state to judge by, messages are dropped, with the reason."""
     text = "a() { int n; init() { n = 1 / n; }" + on("/t") + "}"
-    monitors = MonitorSet.load({"x.rv": text}, definitions())
+    monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions()))
     assert [fault.text for fault in monitors.start(0).faults] == ["division by zero"]
     outcome = monitors.process("/t", number(0), 1)
     assert (outcome.result, outcome.reason) == (
@@ -170,7 +172,7 @@ def test_a_change_is_by_the_events_that_made_the_bytes_others(
         f"{name}.rv": f"{name}() {{" + on("/t", "e", body) + "}"
         for name, body in zip("ab", bodies, strict=True)
     }
-    monitors = MonitorSet.load(texts, definitions(), "pass")
+    monitors = MonitorSet.of(compiled_from(texts, definitions()), "pass")
     monitors.start(0)
     outcome = monitors.process("/t", bytearray(number(given)), 0)
     assert (outcome.result, list(outcome.changed_by)) == (result, changed_by)
@@ -208,7 +210,7 @@ def test_a_change_stands_where_the_changed_fields_were_assigned(
     x: float, y: float, frame: str, lines: list[int]
 ) -> None:
     """Every statement that assigned to a field whose bytes are others, also as part of another, or by a function."""
-    monitors = MonitorSet.load({"x.rv": ASSIGNS}, definitions())
+    monitors = MonitorSet.of(compiled_from({"x.rv": ASSIGNS}, definitions()))
     monitors.start(0)
     kind = "geometry_msgs/PoseWithCovarianceStamped"
     body = message(kind, header__frame_id=frame, pose__pose__position__x=x, pose__pose__position__y=y)
@@ -240,7 +242,7 @@ def test_a_drop_is_by_the_monitor_that_dropped(name: str) -> None:
 def test_a_fault_that_is_passed_over_has_dropped_nothing() -> None:
     """With `on_fault: pass` the drop is of who dropped, not of who faulted before it."""
     text = "a() {" + on("/t", "e", "x = 1 / (x - 5);") + "} b() {" + on("/t", "e", "return;") + "}"
-    monitors = MonitorSet.load({"x.rv": text}, definitions(), "pass")
+    monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions()), "pass")
     monitors.start(0)
     outcome = monitors.process("/t", bytearray(number(5)), 0)
     assert [fault.monitor for fault in outcome.faults] == ["a"]
@@ -272,9 +274,11 @@ def test_changes_are_by_whom_a_comparison_of_all_bytes_finds() -> None:
     most = 0
     for seed in range(examples(60)):
         try:
-            monitors = MonitorSet.load(
-                {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())},
-                random_definitions(),
+            monitors = MonitorSet.of(
+                compiled_from(
+                    {f"{place}.rv": text for place, text in enumerate(Specifications(seed).texts())},
+                    random_definitions(),
+                ),
                 ("drop", "pass")[seed % 2],
             )
         except SpecificationError:
@@ -428,7 +432,9 @@ def test_ticks_come_without_messages_too() -> None:
 
 def test_timers_wait_for_messages_that_are_known_to_come() -> None:
     """In a recording with messages for the specification, the first tick waits for the first of them."""
-    monitors = MonitorSet.load({"x.rv": "a() { event tick() every 1s { }" + on("/t") + "}"}, definitions())
+    monitors = MonitorSet.of(
+        compiled_from({"x.rv": "a() { event tick() every 1s { }" + on("/t") + "}"}, definitions())
+    )
     monitors.start(0, frozenset({"/t"}))
     assert monitors.next_due is None
     monitors.process("/t", number(0), 10 * SECOND)
@@ -626,7 +632,7 @@ def test_an_unchanged_specification_keeps_its_state_through_a_swap() -> None:
         "x.rv": "\n// moved down\n" + kept,
         "y.rv": "b() { int k = 5;" + on("/u", "e", 'ROS_INFO("%d", k++);') + "}",
     }
-    following, _ = monitors.replaced(changed, definitions(), 10)
+    following, _ = replaced(monitors, changed, definitions(), 10)
     assert printed(following.process("/t", number(0), 11)) == ["3 3", "three"]
     assert printed(following.process("/u", number(0), 11)) == ["5"]
 
@@ -639,10 +645,11 @@ def test_what_goes_on_does_not_begin_again() -> None:
     second = (
         "b() { int seen = 0; init() { seen = n; ROS_WARN(\"second\"); } event e() /t std_msgs/Bool '{}' {} }"
     )
-    monitors = MonitorSet.load({"a.rv": first}, definitions())
+    monitors = MonitorSet.of(compiled_from({"a.rv": first}, definitions()))
     assert [line.text for line in monitors.start(0).log] == ["begins"]
     monitors.process("/t", b"\x01", 1)
-    following, outcome = monitors.replaced(
+    following, outcome = replaced(
+        monitors,
         {"a.rv": first, "b.rv": second.replace("seen = n;", 'ROS_WARN_STREAM("n is " << n);')},
         definitions(),
         2,
@@ -655,7 +662,7 @@ def test_a_wrong_set_is_refused_whole() -> None:
     """The set in force stays as it was."""
     monitors = load("a() {" + on("/t", "e", "return;") + "}")
     with pytest.raises(SpecificationError):
-        monitors.replaced({"x.rv": "a() {"}, definitions(), 0)
+        replaced(monitors, {"x.rv": "a() {"}, definitions(), 0)
     assert monitors.process("/t", number(0), 1).result == "dropped"
 
 
@@ -665,7 +672,7 @@ def test_a_specification_whose_variables_others_use_cannot_be_removed_alone() ->
     monitors = load("a() { int n;" + on("/t") + "}", y=user)
     assert monitors.monitor("b").code.uses == {"a"}
     with pytest.raises(SpecificationError, match=r"y\.rv:1.*there is no variable `n`"):
-        monitors.replaced({"y.rv": user}, definitions(), 0)
+        replaced(monitors, {"y.rv": user}, definitions(), 0)
 
 
 # Publishing and services
@@ -769,7 +776,7 @@ def test_init_of_an_unchanged_specification_does_not_run_again() -> None:
     monitors = load(kept)
     monitors.process("/t", number(0), 1)
     new = 'b() { int m; init() { m = n; ROS_INFO("%d", m); }' + on("/u") + "}"
-    _, outcome = monitors.replaced({"a.rv": kept, "b.rv": new}, definitions(), 2)
+    _, outcome = replaced(monitors, {"a.rv": kept, "b.rv": new}, definitions(), 2)
     assert printed(outcome) == ["2"]
 
 
@@ -777,13 +784,13 @@ def test_a_changed_message_type_begins_anew() -> None:
     """Values of a type that is another now are not kept."""
     text = "a() { own::T v; int n; event e(int x) /t own/T '{x:x}' { n++; ROS_INFO(\"%d\", n); } }"
     first = Definitions.from_files({"own/T.msg": "int32 x\n"})
-    monitors = MonitorSet.load({"x.rv": text}, first)
+    monitors = MonitorSet.of(compiled_from({"x.rv": text}, first))
     monitors.start(0)
     monitors.process("/t", b"\1\0\0\0", 1)
-    same, _ = monitors.replaced({"x.rv": text}, Definitions.from_files({"own/T.msg": "int32 x\n"}), 2)
+    same, _ = replaced(monitors, {"x.rv": text}, Definitions.from_files({"own/T.msg": "int32 x\n"}), 2)
     assert printed(same.process("/t", b"\1\0\0\0", 3)) == ["2"]
-    other, _ = monitors.replaced(
-        {"x.rv": text}, Definitions.from_files({"own/T.msg": "int32 y\nint32 x\n"}), 2
+    other, _ = replaced(
+        monitors, {"x.rv": text}, Definitions.from_files({"own/T.msg": "int32 y\nint32 x\n"}), 2
     )
     assert printed(other.process("/t", b"\1\0\0\0" * 2, 3)) == ["1"]
 
@@ -796,12 +803,12 @@ def test_only_what_uses_a_changed_message_type_begins_anew() -> None:
         "value": "value() { own::T v; int n; event e() /c own/Other '{}' { n++; ROS_INFO(\"%d\", n); } }",
     }
     files = {"own/T.msg": "int32 x\n", "own/Outer.msg": "own/T[] all\n", "own/Other.msg": "int32 x\n"}
-    monitors = MonitorSet.load(texts, Definitions.from_files(files))
+    monitors = MonitorSet.of(compiled_from(texts, Definitions.from_files(files)))
     monitors.start(0)
     for topic in ("/a", "/b", "/c"):
         monitors.process(topic, b"\0\0\0\0", 1)
     files["own/T.msg"] = "int32 y\nint32 x\n"
-    other, _ = monitors.replaced(texts, Definitions.from_files(files), 2)
+    other, _ = replaced(monitors, texts, Definitions.from_files(files), 2)
     assert other.began == ("nested", "value")
     counts = [printed(other.process(topic, b"\0\0\0\0", 3)) for topic in ("/a", "/b", "/c")]
     assert counts == [["1"], ["2"], ["1"]]
@@ -813,10 +820,10 @@ def test_only_an_operator_lets_the_topics_of_a_held_monitor_go_on() -> None:
     monitors = load(text)
     monitors.start(0, restarted=True)
     monitors.resume("b")
-    edited, _ = monitors.replaced({"x.rv": text.replace("first", "second")}, definitions(), 1)
+    edited, _ = replaced(monitors, {"x.rv": text.replace("first", "second")}, definitions(), 1)
     assert (edited.monitor("a").held, edited.monitor("b").held) == (True, False)
     assert edited.process("/t", number(0), 1).result == "dropped"
-    freed, _ = edited.replaced(
-        {"x.rv": text.replace("first", "second").replace("hold a", "a")}, definitions(), 2
+    freed, _ = replaced(
+        edited, {"x.rv": text.replace("first", "second").replace("hold a", "a")}, definitions(), 2
     )
     assert freed.process("/t", number(0), 3).result == "passed"

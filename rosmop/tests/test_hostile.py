@@ -5,6 +5,7 @@ import tracemalloc
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.runtime.action_context import BUDGET as BUDGET_SIZE
 from rosmop.tests.acting import act, definitions, load, message, refused, refused_action
@@ -328,7 +329,7 @@ def test_random_bytes_for_text_are_refused_with_a_position() -> None:
         "\ufeff",
     ):
         with pytest.raises(SpecificationError) as caught:
-            MonitorSet.load({"x.rv": text}, definitions())
+            MonitorSet.of(compiled_from({"x.rv": text}, definitions()))
         assert caught.value.findings[0].position.line >= 1
         assert all(character.isprintable() for character in caught.value.findings[0].text)
 

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rosmop.check.sources import compiled_from
 from rosmop.form import nodes
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
@@ -52,7 +53,7 @@ def test_random_specifications_and_messages(seed: int, on_fault: OnFault, step_n
     messages = Messages(seed)
     together = [(one.topic, body) for one in (messages.traffic() for _ in range(4)) for body in one.bodies()]
     try:
-        monitors = MonitorSet.load(sources, definitions(), on_fault)
+        monitors = MonitorSet.of(compiled_from(sources, definitions()), on_fault)
     except SpecificationError:
         return  # a draw that means nothing
     check(monitors, together, step_ns)
@@ -86,7 +87,7 @@ def shipped() -> MonitorSet:
     trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
     own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
     sources = {path.name: path.read_text() for path in sorted(MONITORS.glob("*.rv"))}
-    return MonitorSet.load(sources, standard_definitions().extended(own))
+    return MonitorSet.of(compiled_from(sources, standard_definitions().extended(own)))
 
 
 def a_value(values: Values, kind: value_types.Type) -> st.SearchStrategy[Any]:
@@ -151,7 +152,7 @@ def test_values_that_grow_and_fields_of_any_size(body: str) -> None:
     int deep(int down) {{ if (down == 0) {{ return deep(0); }} return down > 50 ? 5 : deep(down + 1) + 1; }}
     event e(std::vector<std::string> names, double[] position, ros::Time stamp) /j sensor_msgs/JointState
     '{{name:names, position:position, header.stamp:stamp}}' {{ {body} ROS_INFO("%d %f", n, position[0]); }} }}"""
-    monitors = MonitorSet.load({"x.rv": text}, standard_definitions())
+    monitors = MonitorSet.of(compiled_from({"x.rv": text}, standard_definitions()))
     told = [
         message("sensor_msgs/JointState", name=["a", "b"], position=[0.5, -1.0]),
         message("sensor_msgs/JointState", name=["a"], position=[3.0], velocity=[1.0]),

@@ -6,6 +6,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.run.state_of_runs import MOST_PARTS, StateTooLargeError, kept, run_of
 from roswire.standard import standard_definitions
@@ -37,7 +38,7 @@ def compiled(formula: str) -> MonitorSet:
     if formula.startswith("ptcaret"):
         events = events.replace("event e0", "event begin").replace("event e1", "event end")
         formula = formula.replace("e0", "begin").replace("e1", "end")
-    return MonitorSet.load({"s.rv": f"s() {{ {events}\n{formula}\n }}"}, standard_definitions())
+    return MonitorSet.of(compiled_from({"s.rv": f"s() {{ {events}\n{formula}\n }}"}, standard_definitions()))
 
 
 @pytest.mark.parametrize("name", FORMULAS)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import Monitor
@@ -24,7 +25,7 @@ def shipped(*names: str) -> MonitorSet:
     trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
     own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
     sources = {f"{name}.rv": (MONITORS / f"{name}.rv").read_text() for name in names}
-    monitors = MonitorSet.load(sources, standard_definitions().extended(own))
+    monitors = MonitorSet.of(compiled_from(sources, standard_definitions().extended(own)))
     started = monitors.start(0)
     assert not started.faults
     return monitors

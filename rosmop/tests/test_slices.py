@@ -12,6 +12,7 @@ from random import Random
 import pytest
 
 from rosmop.certify.properties import certificates_of
+from rosmop.check.sources import compiled_from
 from rosmop.check.specification import compile_files
 from rosmop.run.causes import Sender
 from rosmop.run.engine import MonitorSet
@@ -22,6 +23,7 @@ from rosmop.tests.acting import definitions, load, message, refused
 from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
 from rosmop.tests.logics.driving import seeded
+from rosmop.tests.reload import replaced
 from rosmop.text.parser import parse
 
 FIELDS = {"p": ("std::string", "frame_id"), "q": ("uint32_t", "seq"), "r": ("ros::Time", "stamp")}
@@ -278,7 +280,7 @@ def test_an_event_without_a_slice_does_not_happen() -> None:
 def test_slices_beyond_the_bound_are_a_fault_and_the_others_go_on() -> None:
     """The bound faults with the binding; those that are there are judged as before, and room comes again."""
     text_ = ANSWERED.replace("id.c_str(), again); }", "id.c_str(), again); if (again > 9) { DROP; } }")
-    monitors = MonitorSet.load({"x.rv": text_}, definitions(), slices=2)
+    monitors = MonitorSet.of(compiled_from({"x.rv": text_}, definitions()), slices=2)
     monitors.start(0)
     for one in ("a", "b"):
         assert not monitors.process("/goal", text(one), 1).faults
@@ -306,7 +308,9 @@ def test_a_binding_is_short() -> None:
 def test_slices_that_are_over_are_collected_and_do_not_begin_anew() -> None:
     """No memory for a goal that is answered, but its id is not taken for another one's; as many as the bound are known."""
     counted = ANSWERED.replace("again = again + 1;", "if (again < 1) again = again + 1;")
-    monitors = MonitorSet.load({"x.rv": counted}, definitions(), slices=3, margins=True)  # as in the relay
+    monitors = MonitorSet.of(
+        compiled_from({"x.rv": counted}, definitions(), margins=True), slices=3
+    )  # as in the relay
     monitors.start(0)
     for one in "abcd":
         monitors.process("/goal", text(one), 1)
@@ -325,7 +329,7 @@ def test_a_slice_that_is_as_at_its_beginning_is_forgotten() -> None:
         "event leave(std::string id) /l std_msgs/String '{data:id}' { }"
         'fsm: out [ connect -> in ] in [ leave -> out ] @fail { ROS_WARN("%s", id.c_str()); __RESET; } }'
     )
-    monitors = MonitorSet.load({"x.rv": clients}, definitions(), slices=1)
+    monitors = MonitorSet.of(compiled_from({"x.rv": clients}, definitions()), slices=1)
     monitors.start(0)
     for number in range(5):
         assert not monitors.process("/c", text(str(number)), 1).faults
@@ -340,12 +344,12 @@ def test_slices_stay_when_specifications_are_loaded_again() -> None:
     monitors = load(GOALS)
     monitors.process("/goal", text("a"), 1)
     other = "other() { event e() /o std_msgs/Empty '{}' { } }"
-    monitors, _ = monitors.replaced({"x.rv": GOALS, "y.rv": other}, definitions(), 2)
+    monitors, _ = replaced(monitors, {"x.rv": GOALS, "y.rv": other}, definitions(), 2)
     assert monitors.process("/result", text("a"), 3).verdicts
     monitors.process("/goal", text("b"), 4)
-    monitors, _ = monitors.replaced({"x.rv": GOALS + " "}, definitions(), 5)
+    monitors, _ = replaced(monitors, {"x.rv": GOALS + " "}, definitions(), 5)
     assert live(monitors) == 2
-    monitors, _ = monitors.replaced({"x.rv": GOALS.replace("again + 1", "again + 2")}, definitions(), 6)
+    monitors, _ = replaced(monitors, {"x.rv": GOALS.replace("again + 1", "again + 2")}, definitions(), 6)
     assert live(monitors) == 0
     assert not monitors.process("/result", text("b"), 7).verdicts
 
@@ -444,7 +448,7 @@ def test_runs_that_may_grow_are_fewer() -> None:
 def test_topics_with_parametric_specifications_are_the_engines_and_others_have_a_walk() -> None:
     """The module does not know slices; it takes the messages of other topics."""
     other = "other() { bool b = false; event e(bool x) /o std_msgs/Bool '{data:x}' { b = x; } }"
-    monitors = MonitorSet.load({"x.rv": GOALS, "y.rv": other}, definitions())
+    monitors = MonitorSet.of(compiled_from({"x.rv": GOALS, "y.rv": other}, definitions()))
     monitors.write_module()
     monitors.start(0)
     assert monitors.walker("/goal") is None

@@ -6,6 +6,7 @@ from random import Random
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.causes import Sender
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import TICK_BUDGET, OnFault
@@ -28,7 +29,7 @@ ACTING, OBSERVING = GOALS % "DROP;", GOALS % 'ROS_WARN("twice");'
 
 def begun(text: str, slices: int) -> MonitorSet:
     """A set in which each source is a host."""
-    monitors = MonitorSet.load({"x.rv": text}, definitions(), slices=slices, holder_of=HOSTS.get)
+    monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions()), slices=slices, holder_of=HOSTS.get)
     monitors.start(0)
     return monitors
 
@@ -158,7 +159,7 @@ def test_one_message_concerns_a_bounded_number_of_slices() -> None:
 def test_a_message_that_is_cut_has_happened_in_no_slice(on_fault: OnFault) -> None:
     """The budget ends in the middle of the slices: one fault, nothing put out, and all slices as before."""
     action = '{ times = times + 1; ROS_INFO("stop"); for (int i = 0; i < 300000; i++) { times = times; } }'
-    monitors = MonitorSet.load({"x.rv": STOPPED % action}, definitions(), on_fault)
+    monitors = MonitorSet.of(compiled_from({"x.rv": STOPPED % action}, definitions()), on_fault)
     monitors.start(0)
     for name in "abcde":
         send(monitors, "/goal", name, GUEST)

@@ -7,6 +7,7 @@ from typing import cast
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.logics.interface import CompiledProperty, FormulaError, FormulaRun, RunFaultError
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import definitions, load, message
@@ -241,8 +242,9 @@ def test_a_reset_by_a_message_that_is_dropped_later_is_none() -> None:
 
 def test_on_trial_the_trace_is_the_one_that_there_would_be() -> None:
     """A specification in shadow mode drops nothing, and goes on as if it had."""
-    monitors = MonitorSet.load(
-        {"s.rv": guard("pattern: globally: a forbids b within 5s")}, definitions(), trials=["s"]
+    monitors = MonitorSet.of(
+        compiled_from({"s.rv": guard("pattern: globally: a forbids b within 5s")}, definitions()),
+        trials=["s"],
     )
     monitors.start(0)
     results = []

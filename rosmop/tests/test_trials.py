@@ -7,6 +7,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from rosmop.check.sources import compiled_from
 from rosmop.logics.catalogue import LOGICS
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
@@ -45,9 +46,9 @@ class Both:
         place = next(at for at, text in enumerate(texts.values()) if text.startswith(tried))
         others = {file: text for file, text in texts.items() if not text.startswith(tried)}
         self.texts = dict(list(texts.items())[: place + 1])
-        self.enabled = MonitorSet.load(self.texts, definitions(), on_fault)
-        self.with_trial = MonitorSet.load(texts, definitions(), on_fault, trials=[tried])
-        self.without = MonitorSet.load(others, definitions(), on_fault)
+        self.enabled = MonitorSet.of(compiled_from(self.texts, definitions()), on_fault)
+        self.with_trial = MonitorSet.of(compiled_from(texts, definitions()), on_fault, trials=[tried])
+        self.without = MonitorSet.of(compiled_from(others, definitions()), on_fault)
         self.stories = [self.story(self.enabled.start(0)), list(self._start())]
         self.without.start(0)
 
@@ -76,7 +77,7 @@ class Both:
     def promote(self, time: int) -> None:
         """The one on trial comes into force, with its state."""
         self.check(time)
-        following = MonitorSet.load(self.texts, definitions(), self.on_fault)
+        following = MonitorSet.of(compiled_from(self.texts, definitions()), self.on_fault)
         following.succeed(self.with_trial, time)
         assert not following.began
         self.with_trial = following
@@ -231,7 +232,9 @@ NUMBER = "int n) /n std_msgs/UInt8 '{data:n}'"
 
 def trial(*texts: str, tried: Collection[str]) -> MonitorSet:
     """A set, started."""
-    found = MonitorSet.load({f"{at}.rv": text for at, text in enumerate(texts)}, definitions(), trials=tried)
+    found = MonitorSet.of(
+        compiled_from({f"{at}.rv": text for at, text in enumerate(texts)}, definitions()), trials=tried
+    )
     found.start(0)
     return found
 
@@ -294,7 +297,7 @@ def test_a_fault_and_a_loop_without_end_are_its_own() -> None:
 def test_a_disabled_one_is_given_nothing_and_nothing_is_held() -> None:
     """A specification that is declared `hold` holds no topic while it is on trial, nor when it comes from there."""
     text = f"hold a() {{ event e({NUMBER} {{ return; }} }}"
-    monitors = MonitorSet.load({"0.rv": text}, definitions(), trials=["a"])
+    monitors = MonitorSet.of(compiled_from({"0.rv": text}, definitions()), trials=["a"])
     monitors.start(0, restarted=True)
     assert not monitors.tried[0].held
     monitors.switch({"a": False}, 1)
@@ -302,7 +305,7 @@ def test_a_disabled_one_is_given_nothing_and_nothing_is_held() -> None:
     monitors.switch({"a": True}, 2)
     monitors.process("/n", number(1), 3)
     assert [one.give().dropped_by for one in monitors.tapped] == ["a"]
-    following = MonitorSet.load({"0.rv": text}, definitions())
+    following = MonitorSet.of(compiled_from({"0.rv": text}, definitions()))
     following.succeed(monitors, 4)
     assert not following.monitors[0].held
 
@@ -316,10 +319,10 @@ def test_one_that_is_incomplete_begins_anew_when_it_comes_into_force() -> None:
         monitors.process("/n", number(data), data)
     for one in monitors.tapped:
         one.give()
-    still = MonitorSet.load(sources, definitions(), trials=["a"])
+    still = MonitorSet.of(compiled_from(sources, definitions()), trials=["a"])
     still.succeed(monitors, 10, ["a"])
     assert (still.trials[0].value("a", "k"), still.tried[0].faults, still.began) == (2, 1, ())
-    anew, kept = (MonitorSet.load(sources, definitions()) for _ in range(2))
+    anew, kept = (MonitorSet.of(compiled_from(sources, definitions())) for _ in range(2))
     kept.succeed(still, 11)
     assert (kept.value("a", "k"), kept.monitors[0].faults, kept.began) == (2, 0, ())
     anew.succeed(still, 11, ["a"])

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rosmop.check.sources import compiled_from
 from rosmop.fast import wasm_runner
 from rosmop.fast.abi import AREA
 from rosmop.fast.batch_codegen import MAX_EFFECTS
@@ -26,6 +27,7 @@ from rosmop.tests.acting import message
 from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
+from rosmop.tests.reload import replaced
 from rosmop.text.errors import SpecificationError
 
 FEW = settings(max_examples=examples(90), suppress_health_check=list(HealthCheck))
@@ -47,7 +49,7 @@ class Fed:
 
     def __init__(self, *texts: str, on_fault: OnFault = "drop", margins: bool = False) -> None:
         sources = {f"{place}.rv": text for place, text in enumerate(texts)}
-        self.monitors = MonitorSet.load(sources, definitions(), on_fault, margins=margins)
+        self.monitors = MonitorSet.of(compiled_from(sources, definitions(), margins=margins), on_fault)
         self.interpreter = beside(self.monitors)
         self.monitors.write_module()
         for one in (self.monitors, self.interpreter):
@@ -577,7 +579,7 @@ def test_variables_are_the_same_for_the_module_and_for_the_engine() -> None:
         fed.check([STAMPED], "/stamped")
     fed.check([plain(9)] * 2)
     before = fed.state()
-    following, _ = fed.monitors.replaced({"0.rv": first, "1.rv": second}, definitions(), 5)
+    following, _ = replaced(fed.monitors, {"0.rv": first, "1.rv": second}, definitions(), 5)
     assert _state(following) == before
 
 
@@ -623,7 +625,9 @@ def test_a_topic_of_which_every_message_would_be_left_has_no_walk(body: str, has
 
 def test_walks_wait_until_a_monitor_has_begun() -> None:
     """Not before the first message, not while it is held."""
-    monitors = MonitorSet.load({"x.rv": "hold s() { event e() /plain own/Plain '{}' { } }"}, definitions())
+    monitors = MonitorSet.of(
+        compiled_from({"x.rv": "hold s() { event e() /plain own/Plain '{}' { } }"}, definitions())
+    )
     monitors.write_module()
     monitors.start(0, restarted=True)
     walker = monitors.walker("/plain")

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from rosmop.fast import wasm_runner
 from rosmop.fast.abi import MOST_KEPT
 from rosmop.tests.examples import examples
+from rosmop.tests.reload import replaced
 from rosmop.tests.test_walks import Fed, plain
 
 SOME = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck))
@@ -155,8 +156,8 @@ def test_strings_go_to_the_set_that_follows() -> None:
     fed = Fed(text)
     fed.check([stamped(b"one", 1), stamped(b"two\0\xff")], "/stamped")
     fed.walker("/stamped")
-    following, _ = fed.monitors.replaced(
-        {"0.rv": text, "1.rv": OTHER}, fed.monitors.compiled.messages.definitions, 5
+    following, _ = replaced(
+        fed.monitors, {"0.rv": text, "1.rv": OTHER}, fed.monitors.compiled.messages.definitions, 5
     )
     names = following.interpreter.variables
     values = [names[code] for code in following.monitors[0].code.variables.values()]

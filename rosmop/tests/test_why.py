@@ -9,6 +9,7 @@ from random import Random
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.logics import mtl, ptcaret, ptltl
 from rosmop.logics.formula import read_formula
 from rosmop.logics.interface import ClockedProperty, CompiledProperty, FormulaError, Run
@@ -381,7 +382,7 @@ def test_a_verdict_of_a_slice_is_explained_by_its_own_events() -> None:
         ere: (start end)*
         @fail { ROS_WARN("twice"); }
     }"""
-    monitors = MonitorSet.load({"goals.rv": text}, definitions())
+    monitors = MonitorSet.of(compiled_from({"goals.rv": text}, definitions()))
     monitors.start(0)
     outcome = None
     for number, (topic, value) in enumerate((("/start", 1), ("/start", 2), ("/end", 2), ("/start", 1))):
@@ -406,7 +407,7 @@ def test_what_was_compared_and_which_statement_dropped() -> None:
             count = count + 1;
         }
     }"""
-    monitors = MonitorSet.load({"gun.rv": text}, definitions())
+    monitors = MonitorSet.of(compiled_from({"gun.rv": text}, definitions()))
     monitors.start(0)
     passed = monitors.process("/fire", message("std_msgs/Int32", data=5), 1)
     assert passed.conditions == {"gun.rv:3:65": {"x": 5, "count": 0}}

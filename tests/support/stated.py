@@ -6,6 +6,7 @@ from typing import Any
 
 from appliance.channel.messages import PartNames, SpecificationsStated
 from appliance.specifications.checking import parts
+from rosmop.check.sources import compiled_from
 from rosmop.fast.serialization import encoded_part
 from rosmop.fast.wasm_build import part_of
 from rosmop.run.engine import MonitorSet
@@ -36,7 +37,7 @@ def stated(
         return SpecificationsStated(revision, b"", {}, restarted, **more)
     known = _standard().extended(Definitions.from_files(definitions))
     try:
-        monitors = MonitorSet.load(dict(files), known, margins=True)
+        monitors = MonitorSet.of(compiled_from(dict(files), known, margins=True))
     except SpecificationError:
         return SpecificationsStated(revision, NOTHING_LIKE_IT, dict(enabled), restarted, **more)
     switches = {monitor.name: enabled.get(monitor.name, True) for monitor in monitors.monitors}

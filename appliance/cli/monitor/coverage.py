@@ -19,6 +19,7 @@ from appliance.cli.monitor.input import (
 )
 from appliance.cli.output import Json, refused, say, say_json
 from appliance.cli.tables import table_of
+from rosmop.check.sources import compiled_from
 from rosmop.learn.exercised import Item, covered
 from rosmop.run.engine import MonitorSet
 from rosmop.text.errors import SpecificationError
@@ -46,7 +47,7 @@ def coverage(
         for recording in recordings:
             definitions = recording.definitions.extended(definitions)
         texts = read_specifications(files)
-        monitors = MonitorSet.load(texts, definitions)
+        monitors = MonitorSet.of(compiled_from(texts, definitions))
         for bag in bags:
             with closing(open_bag(bag)) as reader:
                 for text in refusals(monitors, reader):

@@ -17,6 +17,7 @@ from appliance.cli.monitor.monitor_output import explained, lines, record, say_f
 from appliance.cli.output import Json, counted, printable, refused, say, say_json
 from appliance.cli.progress_bar import progress
 from rosmop.certify.properties import certificates_of
+from rosmop.check.sources import compiled_from
 from rosmop.form.positions import Finding
 from rosmop.logics.interface import CompiledProperty
 from rosmop.logics.picture import dot_of, svg_of
@@ -113,7 +114,7 @@ def _load(files: list[Path], folders: list[Path], recorded: Definitions | None =
     definitions = read_definitions(files, folders)
     if recorded is not None:
         definitions = recorded.extended(definitions)
-    return MonitorSet.load(read_specifications(files), definitions)
+    return MonitorSet.of(compiled_from(read_specifications(files), definitions))
 
 
 def _report(

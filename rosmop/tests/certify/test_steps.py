@@ -13,6 +13,7 @@ from appliance.channel.messages import PartNames
 from appliance.specifications.checking import parts
 from appliance.specifications.specification_files import SpecificationsRefusedError
 from rosmop.certify.steps import StepDiffersError, check_steps
+from rosmop.check.sources import compiled_from
 from rosmop.fast import batch_codegen, wasm_build
 from rosmop.fast.batch_codegen import WrittenModule, written
 from rosmop.fast.serialization import encoded
@@ -38,7 +39,9 @@ GUARD = """s() { int n = 0;
 
 def compiled(*texts: str) -> Compiled:
     """Specifications as one set."""
-    return MonitorSet.load({f"{place}.rv": text for place, text in enumerate(texts)}, definitions()).compiled
+    return MonitorSet.of(
+        compiled_from({f"{place}.rv": text for place, text in enumerate(texts)}, definitions())
+    ).compiled
 
 
 def module(of: Compiled) -> WrittenModule:

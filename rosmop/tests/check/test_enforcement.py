@@ -2,6 +2,7 @@
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from rosmop.tests.acting import definitions, load
@@ -57,7 +58,7 @@ def test_without_a_handler_of_its_own() -> None:
 
 def test_on_trial_it_says_what_it_would_have_published() -> None:
     """In the outcome of the trial; nothing is published by the others."""
-    monitors = MonitorSet.load({"a.rv": guard()}, definitions(), trials=["guard"])
+    monitors = MonitorSet.of(compiled_from({"a.rv": guard()}, definitions()), trials=["guard"])
     monitors.start(0)
     assert monitors.process("/bumper", b"", 0).result == "passed"
     for tapped in monitors.tapped:

@@ -6,6 +6,7 @@ import struct
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from rosmop.tests.acting import STORE, definitions, fields, load, message, refused
@@ -116,7 +117,7 @@ def test_a_float_constant_of_a_message_is_a_float() -> None:
         "x:x",
         'ROS_INFO("%d %d", x == own::C::LIMIT, (double) own::C::LIMIT == 0.1);',
     )
-    monitors = MonitorSet.load({"x.rv": text}, own)
+    monitors = MonitorSet.of(compiled_from({"x.rv": text}, own))
     monitors.start(0)
     assert [line.text for line in monitors.process("/t", struct.pack("<f", 0.1), 1).log] == ["1 0"]
 

@@ -2,6 +2,7 @@
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import definitions, load, message, refused, shown
 
@@ -21,7 +22,7 @@ def test_a_beginning_may_read_what_stands_elsewhere(before: str, value: str) -> 
     """Before any first value all variables are constants or zero; before any `init` all have their first values."""
     other = "q() { int z = 5; int late = z + 1; int y; init() { y = 6; } " + EVENT % ("/u", "") + "}"
     reader = "s() {" + before + EVENT % ("/t", 'ROS_INFO("%d", a);') + "}"
-    monitors = MonitorSet.load({"a.rv": reader, "b.rv": other}, definitions())
+    monitors = MonitorSet.of(compiled_from({"a.rv": reader, "b.rv": other}, definitions()))
     assert not monitors.start(0).faults
     outcome = monitors.process("/t", message("std_msgs/Int32"), 1)
     assert [line.text for line in outcome.log] == [value]
@@ -40,7 +41,7 @@ def test_what_faults_in_its_first_values_does_not_run_its_init() -> None:
         'a() { int n; int m = 1 / n; init() { ROS_INFO("a"); } ' + EVENT % ("/t", "") + "} "
         'b() { init() { ROS_INFO("b"); } ' + EVENT % ("/u", "") + "}"
     )
-    monitors = MonitorSet.load({"x.rv": text}, definitions())
+    monitors = MonitorSet.of(compiled_from({"x.rv": text}, definitions()))
     outcome = monitors.start(0)
     assert [fault.text for fault in outcome.faults] == ["division by zero"]
     assert [line.text for line in outcome.log] == ["b"]

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from roswire.standard import standard_definitions
 
@@ -37,7 +38,7 @@ def lines_run(number: int) -> Counter[str]:
     definitions, before = standard_definitions(), sys.gettrace()
     sys.settrace(trace)
     try:
-        MonitorSet.load(files, definitions, margins=True)
+        MonitorSet.of(compiled_from(files, definitions, margins=True))
     finally:
         sys.settrace(before)
     return counted

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import pytest
 
 from rosmop.check.margins import MOST_NOTED
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import Margin, MonitorSet
 from roswire.standard import standard_definitions
 
@@ -23,7 +24,7 @@ NEAR = """near() {
 
 def started(text: str, *, margins: bool = True) -> MonitorSet:
     """The specifications in `text`, begun; with the module where there is one."""
-    monitors = MonitorSet.load({"a.rv": text}, standard_definitions(), margins=margins)
+    monitors = MonitorSet.of(compiled_from({"a.rv": text}, standard_definitions(), margins=margins))
     monitors.write_module()
     monitors.start(0)
     return monitors

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.learn.learner import LearningError, Learnt, learn
 from rosmop.run.engine import MonitorSet
 from rosmop.tests.acting import message
@@ -82,7 +83,7 @@ def learnt() -> Learnt:
 
 def warnings(learnt: Learnt, rows: Sequence[Row]) -> list[str]:
     """What the text warns of in a recording."""
-    monitors = MonitorSet.load({"learnt.rv": learnt.text}, standard_definitions())
+    monitors = MonitorSet.of(compiled_from({"learnt.rv": learnt.text}, standard_definitions()))
     monitors.start(rows[0][1], frozenset(TYPES))
     found = []
     for topic, time, data in rows:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 
+from rosmop.check.sources import compiled_from
 from rosmop.fast.batch_codegen import written
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
@@ -144,7 +145,7 @@ FAULTY = {
 def compiled(text: str, known: Definitions | None = None) -> Compiled:
     """One specification."""
     known = definitions() if known is None else known
-    return MonitorSet.load({"a.rv": text}, known).compiled
+    return MonitorSet.of(compiled_from({"a.rv": text}, known)).compiled
 
 
 def faulty(text: str, every: int = 1) -> Iterator[tuple[str, str]]:

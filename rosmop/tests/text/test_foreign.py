@@ -2,6 +2,7 @@
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.text.errors import SpecificationError
 from rosmop.text.parser import parse
@@ -14,7 +15,7 @@ EVENT = "event e(int n) /t std_msgs/Int32 '{data:n}' {"
 def refused(text: str) -> tuple[int, str]:
     """Where the first error begins, and what it says."""
     with pytest.raises(SpecificationError) as caught:
-        MonitorSet.load({"x.rv": text}, DEFINITIONS)
+        MonitorSet.of(compiled_from({"x.rv": text}, DEFINITIONS))
     finding = caught.value.findings[0]
     lines = text.splitlines(keepends=True)
     return sum(map(len, lines[: finding.position.line - 1])) + finding.position.column - 1, finding.text

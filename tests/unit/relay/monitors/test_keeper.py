@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from appliance.channel.messages import StateGiven
 from appliance.relay.monitors.keeper import Keeper
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from rosmop.tests.interpreted import check_same
@@ -65,7 +66,7 @@ def test_random_specifications_go_on_where_a_killed_process_was(seed: int, step_
     messages = Messages(seed)
     traffic = [(one.topic, body) for one in (messages.traffic() for _ in range(6)) for body in one.bodies()]
     try:
-        monitors = MonitorSet.load(sources, definitions())
+        monitors = MonitorSet.of(compiled_from(sources, definitions()))
     except SpecificationError:
         return  # a draw that means nothing
     whole, memory = again(monitors), bytearray(SIZE)
@@ -90,7 +91,7 @@ def test_random_specifications_go_on_where_a_killed_process_was(seed: int, step_
 def stop(modifier: str = "", more: str = "") -> MonitorSet:
     """An emergency stop that is latched."""
     text = STOP.format(modifier=modifier, more=more)
-    monitors = MonitorSet.load({"stop.rv": text}, standard_definitions())
+    monitors = MonitorSet.of(compiled_from({"stop.rv": text}, standard_definitions()))
     monitors.write_module()
     return monitors
 
@@ -149,8 +150,11 @@ def test_another_text_loses_the_state_and_says_so() -> None:
     begun(second, memory)
     assert drives(second) == "dropped"
     assert "changed" in second.monitor("stop").why_held
-    new = MonitorSet.load(
-        {"other.rv": STOP.format(modifier="", more="").replace("stop()", "other()")}, standard_definitions()
+    new = MonitorSet.of(
+        compiled_from(
+            {"other.rv": STOP.format(modifier="", more="").replace("stop()", "other()")},
+            standard_definitions(),
+        )
     )
     begun(new, memory)
     assert drives(new) == "passed"
@@ -223,7 +227,9 @@ PROPERTIES = (
 def test_slices_go_on_where_a_killed_process_had_them(shown: str, seed: int) -> None:
     """Their variables, automata, deadlines, which have ended, and the order in which they began."""
     random = Random(seed)  # noqa: S311  draws examples, not keys
-    monitors = MonitorSet.load({"s.rv": SLICED.replace("PROPERTY", shown)}, standard_definitions())
+    monitors = MonitorSet.of(
+        compiled_from({"s.rv": SLICED.replace("PROPERTY", shown)}, standard_definitions())
+    )
     whole, memory = again(monitors), bytearray(4 * SIZE)
     whole.start(0)
     keeper = begun(monitors, memory)
@@ -248,7 +254,7 @@ def test_slices_go_on_where_a_killed_process_had_them(shown: str, seed: int) -> 
 def test_many_slices_are_kept_and_a_message_writes_a_part_of_them() -> None:
     """With two thousand a message writes a hundredth; where they have no room, none is restored, and that holds."""
     text = SLICED.replace("PROPERTY", PROPERTIES[0]).replace("event look() every 3ms", "void look()")
-    monitors = MonitorSet.load({"s.rv": text}, standard_definitions())
+    monitors = MonitorSet.of(compiled_from({"s.rv": text}, standard_definitions()))
     memory = bytearray(8 * SIZE)
     keeper = begun(monitors, memory)
     for number in range(2_000):

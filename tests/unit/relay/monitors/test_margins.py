@@ -6,6 +6,7 @@ import pytest
 
 from appliance.channel.messages import Approach, MarginRow
 from appliance.relay.monitors.margin_counts import Margins
+from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from roswire.standard import standard_definitions
 from tests.unit.relay.monitors.test_middle import string
@@ -36,7 +37,7 @@ def world() -> Iterator[Trying]:
 
 def offline() -> list[tuple[int, int, bool, float, float]]:
     """What `rosrv monitor replay --margins` finds in these messages."""
-    monitors = MonitorSet.load({"0.rv": NEAR}, standard_definitions(), margins=True)
+    monitors = MonitorSet.of(compiled_from({"0.rv": NEAR}, standard_definitions(), margins=True))
     monitors.write_module()
     monitors.start(0)
     for word in WORDS:
@@ -84,7 +85,7 @@ def test_it_is_kept_with_the_monitor_and_begins_anew_with_another_text(world: Tr
 
 def test_a_day_ends_at_midnight() -> None:
     """The nearest of yesterday is not today's; that since the load stays."""
-    monitors = MonitorSet.load({"0.rv": NEAR}, standard_definitions(), margins=True)
+    monitors = MonitorSet.of(compiled_from({"0.rv": NEAR}, standard_definitions(), margins=True))
     monitors.start(0)
     margins = Margins()
 

@@ -18,6 +18,7 @@ from appliance.relay.monitors.interceptor import Middle
 from appliance.relay.monitors.observation_points import Place
 from appliance.relay.monitors.topic_pipeline import Lane
 from appliance.relay.report import Reporter
+from rosmop.check.sources import compiled_from
 from rosmop.fast.wasm_runner import Walked
 from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.engine import MonitorSet
@@ -84,7 +85,7 @@ class Monitored:
         self.middle.over = lambda: False
         self.middle.now = lambda: self.time  # type: ignore[method-assign]  # the test sets the time
         self._lanes: dict[tuple[str, str], Lane] = {}
-        self.set = MonitorSet.load(texts, known, on_fault, trials=trials, margins=True)
+        self.set = MonitorSet.of(compiled_from(texts, known, margins=True), on_fault, trials=trials)
         if together:
             self.set.write_module()
         self.middle.loaded(stated(1, [], {}, {}, restarted=restarted), self.set)

@@ -1,0 +1,16 @@
+"""Replace a running set by one of other texts, as loading specifications does."""
+
+from collections.abc import Mapping
+
+from rosmop.check.sources import compiled_from
+from rosmop.run.engine import MonitorSet
+from rosmop.run.outcomes import Outcome
+from roswire.definitions import Definitions
+
+
+def replaced(
+    before: MonitorSet, sources: Mapping[str, str], definitions: Definitions, time_ns: int
+) -> tuple[MonitorSet, Outcome]:
+    """Return the set that takes the place of another one, started, and what came of that."""
+    following = MonitorSet.of(compiled_from(sources, definitions), before.on_fault, before.patience)
+    return following, following.succeed(before, time_ns)
