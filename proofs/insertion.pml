@@ -496,7 +496,7 @@ end:
 proctype Request(byte p; byte s) POSSIBLE {
 end:
     do
-    /* = appliance/master/calls/execution.py Execution._decide */
+    /* = appliance/master/calls/call_execution.py Execution._decide */
     :: atomic {
         request[PAIR(p, s)] == CALLED ->
         if
@@ -509,7 +509,7 @@ end:
        since it was decided is taken back now.
        = appliance/master/calls/node_calls.py NodeCalls.request_topic
        = appliance/master/graph/graph.py Graph.topic_granted
-       = appliance/master/calls/execution.py Execution._carry_out
+       = appliance/master/calls/call_execution.py Execution._carry_out
        = appliance/master/graph/revocation.py Revocation.redecide_for */
     :: atomic {
         request[PAIR(p, s)] == DECIDED ->
