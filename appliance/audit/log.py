@@ -34,7 +34,7 @@ from appliance.audit.lock_holders import holders
 from appliance.audit.log_database import LogUnreadableError
 from appliance.audit.log_writer import ChainWriter
 from appliance.audit.losses import Lost
-from appliance.audit.record import Record, Repeated, Severity
+from appliance.audit.record import Record, Severity
 from appliance.audit.removal import Remover
 from appliance.audit.repetition import summary
 from appliance.audit.retention import Retention
@@ -97,7 +97,7 @@ class AuditLog:
         self._room = Room(path, reserve, self.budget.room)
         self._folder = Folder(fold or FoldSettings(), self.ids.next, clock)
         self._signatures = Signatures(path, signer)
-        self._queue: deque[Record | Repeated | Waiter | Callable[[], None]] = deque()
+        self._queue: deque[Record | Waiter | Callable[[], None]] = deque()
         self._held: list[Record] = []
         self._house = Housekeeping(
             path,
@@ -150,17 +150,6 @@ class AuditLog:
         found_by = self._folder.in_full(record)
         self._put(record)
         return found_by
-
-    def repeated(self, same: Repeated, duration_us: int) -> None:
-        """What was recorded before has happened once more, and changed nothing."""
-        if not same.queued and self._is_full:
-            self._lost.add(same.record)
-            return
-        same.time, same.duration_us = self._clock(), duration_us
-        same.total += 1
-        if not same.queued:
-            same.queued = True
-            self._put(same)
 
     @property
     def _is_full(self) -> bool:
@@ -232,7 +221,7 @@ class AuditLog:
             return f"{self.path}: still being written after {seconds:g} s"
         return self._unwritten
 
-    def _put(self, item: Record | Repeated | Waiter | Callable[[], None]) -> None:
+    def _put(self, item: Record | Waiter | Callable[[], None]) -> None:
         """What is to be written, somebody who waits, or what the log's thread is to do."""
         self._queue.append(item)
         # The writer sets `_idle` before it looks at the queue a last time: it sees the item or we see idle.
@@ -335,26 +324,11 @@ class AuditLog:
                 self._held.extend(written)
                 if not written or written[-1] is not item:
                     self.budget.folded(item)
-            elif isinstance(item, Repeated):
-                self._count(item, now)
             elif isinstance(item, Waiter):
                 self._waiting.append(item)
             else:
                 item()
         return bool(queue)
-
-    def _count(self, same: Repeated, now: float) -> None:
-        """Give the folder what is new, one by one until one is counted, and with that all others."""
-        left, number = same.take(), 1
-        while left:
-            left -= number
-            record = same.made(self.ids.next(), number)
-            written = list(self._folder.offer(record, now))
-            self._held.extend(written)
-            if written and written[-1] is record:
-                self.budget.summarised(record)
-            else:
-                number = left
 
     def _look_for_room(self) -> None:
         with contextlib.suppress(OSError):  # a folder that is gone is told by what writes there

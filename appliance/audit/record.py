@@ -58,34 +58,3 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     detail: dict[str, Any] = {}
     stranger: bool = False
     folds: bool = False
-
-
-class Repeated:
-    """A record that `folds`, and how often the same has happened since: the log is given at once what is new of that.
-
-    `total`, and when the last one was and how long it took, are written by who counts; `taken` by the log's thread.
-    That clears `queued` before it reads `total`, and who counts reads `queued` after he has counted: none is missed.
-    """
-
-    __slots__ = ("duration_us", "queued", "record", "taken", "time", "total")
-
-    def __init__(self, record: Record) -> None:
-        self.record = record
-        self.total = self.taken = 0
-        self.queued = False
-        self.time = record.time
-        self.duration_us = record.duration_us
-
-    def take(self) -> int:
-        """How many are new."""
-        self.queued = False
-        new = self.total - self.taken
-        self.taken += new
-        return new
-
-    def made(self, record_id: str, number: int) -> Record:
-        """The record of so many of them."""
-        detail = self.record.detail | ({"count": number} if number > 1 else {})
-        return msgspec.structs.replace(
-            self.record, id=record_id, time=self.time, duration_us=self.duration_us, detail=detail
-        )

@@ -34,7 +34,6 @@ from appliance.master.calls.parameter_calls import ParameterCalls, ParameterSear
 from appliance.master.calls.parameter_rights import ParameterRights
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
-from appliance.master.calls.repeated_calls import Repetitions
 from appliance.master.endpoints.delivery import Delivery
 from appliance.master.endpoints.endpoint_addresses import Addresses, Places
 from appliance.master.endpoints.node_api import NodeApi
@@ -335,15 +334,6 @@ class Parts:
         self.pipeline = Pipeline(
             execution,
             Multicall(execution, parameters, self.trail, offload=self._offload),
-            repetitions=Repetitions(
-                self._gate,
-                self.registry,
-                self.parameters,
-                rosmaster=self.rosmaster,
-                addresses=self._addresses,
-                policy=self._policy,
-                trail=self.trail,
-            ),
             addresses=self._addresses,
             trail=self.trail,
             limits=self._limits,

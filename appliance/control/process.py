@@ -232,12 +232,7 @@ class _Control:
     async def _serve(self) -> None:
         base, parts, sockets = self._base, self._parts, self._base.sockets
         doors = base.doors
-        await doors.open(
-            sockets[RVMASTER],
-            parts.pipeline.handler(parts.table),
-            guarded=True,
-            at_once=parts.pipeline.repetitions.answer,
-        )
+        await doors.open(sockets[RVMASTER], parts.pipeline.handler(parts.table), guarded=True)
         await doors.open(sockets[_OWN], parts.pipeline.handler(parts.table, own=True), guarded=False)
         # ROSMaster asks the kernel about every connection that it keeps, at each call that it makes.
         inner = parts.inner

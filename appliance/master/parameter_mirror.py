@@ -47,8 +47,7 @@ class ParameterMirror:
         self.tree = tree
         self.charges = charges
         self.weight = 0
-        self.version = 0  # another after every change
-        self._told_of_change = changed
+        self._changed = changed
         self._note = note
         self.together = together
         self._depth_limit = depth_limit
@@ -119,10 +118,6 @@ class ParameterMirror:
         self.weight -= before
         self._note(key, None)
         self._changed()
-
-    def _changed(self) -> None:
-        self.version += 1
-        self._told_of_change()
 
     def _recount(self, *, final: bool) -> None:
         self.weight = measure(self.tree)[0]

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from appliance.audit.events import SEVERITIES
 from appliance.audit.log import AuditLog
-from appliance.audit.record import Record, Repeated, RuleReference, Severity
+from appliance.audit.record import Record, RuleReference, Severity
 from appliance.policy.model import Decision, Rule
 from appliance.quotas.pool import Standing
 from appliance.telemetry.metrics import Meter
@@ -94,24 +94,6 @@ class AuditTrail:
         `asked_of` is what a command is about: a parameter, a node. `reads`: the call changes nothing, so that its
         repetitions are counted when it is allowed.
         """
-        record = self._of_decision(
-            asker, method, category, resource, decision, reads=reads, asked_of=asked_of
-        )
-        duration = time.monotonic_ns() - asker.arrived
-        self.meter.decided(category, decision.word, duration / 1e9)
-        return self._log.record(record)
-
-    def _of_decision(
-        self,
-        asker: Asker,
-        method: str,
-        category: str,
-        resource: str,
-        decision: Decision,
-        *,
-        reads: bool,
-        asked_of: Mapping[str, str],
-    ) -> Record:
         word = decision.word
         detail: dict[str, Any] = {"call": method, **asked_of}
         if asker.node is not None:
@@ -121,7 +103,7 @@ class AuditTrail:
         now = time.time_ns()
         severity = Severity.INFO if decision.allowed and not decision.would_deny else Severity.WARNING
         detail |= self._recordings("decision", word, severity, asker.host, now)
-        return Record(
+        record = Record(
             id=self._ids.next(),
             time=now,
             event="decision",
@@ -139,20 +121,8 @@ class AuditTrail:
             detail=detail,
             folds=reads and word == "allow",
         )
-
-    def repeatable(
-        self, asker: Asker, method: str, category: str, resource: str, decision: Decision, **asked_of: str
-    ) -> Repeated:
-        """A read that was allowed, to be counted when the same is decided again; it records nothing."""
-        return Repeated(
-            self._of_decision(asker, method, category, resource, decision, reads=True, asked_of=asked_of)
-        )
-
-    def decided_again(self, same: Repeated, arrived: int) -> None:
-        """Count a decision that is the same in all that is recorded of it; `arrived` as `Asker` has it."""
-        duration = time.monotonic_ns() - arrived
-        self.meter.decided(same.record.category or "", "allow", duration / 1e9)
-        self._log.repeated(same, duration // 1000)
+        self.meter.decided(category, word, (time.monotonic_ns() - asker.arrived) / 1e9)
+        return self._log.record(record)
 
     def happened(
         self,

@@ -79,16 +79,6 @@ class Records:
         self.events.append(("allow" if decision.allowed else "deny", resource))
         return "id"
 
-    def repeatable(
-        self, _caller: Any, _method: str, _category: str, resource: str, _decision: Decision, **_more: str
-    ) -> str:
-        """As `AuditTrail`: what `decided_again` is given."""
-        return resource
-
-    def decided_again(self, same: str, _arrived: int) -> None:
-        """As `AuditTrail`."""
-        self.events.append(("allow", same))
-
     def happened(self, event: str, _reason: str, *, resource: str | None = None, **_detail: Any) -> str:
         """As `AuditTrail`."""
         self.events.append((event, resource))
@@ -415,17 +405,11 @@ class ControlParts:
         host: str = str(HOST),
         target: Incarnation | None = None,
         own: bool = False,
-        spaces: int = 0,
     ) -> Value:
-        """A call that a node (our `own`) at `host` makes of RVMaster, or of the face of `target`, as it is answered.
-
-        `spaces` follow it: the same question in other words.
-        """
+        """A call that a node (our `own`) at `host` makes of RVMaster, or of the face of `target`, as it is answered."""
         peer = Peer(ipaddress.ip_address(host), host, "10.0.0.1")
         serve = self._serving(own=own, target=target) if own or target is not None else self._serve
-        return parse_response(
-            await serve(HttpRequest(peer, "/", build_call(method, params) + b" " * spaces, 0))
-        )
+        return parse_response(await serve(HttpRequest(peer, "/", build_call(method, params), 0)))
 
     async def register(self, node: Incarnation, kind: Kind, resource: str, detail: str = "t") -> None:
         """ROSMaster takes a registration, and control writes it down."""

@@ -14,14 +14,13 @@ from appliance.master.calls.node_calls import NODE_CALLS, NodeCalls
 from appliance.master.calls.parameter_calls import ParameterCalls, ParameterSearch
 from appliance.master.calls.pipeline import Pipeline
 from appliance.master.calls.registration import RegistrationCalls
-from appliance.master.calls.repeated_calls import Repetitions
 from appliance.master.graph.registry import Incarnation, Registry
 from appliance.master.parameter_mirror import ParameterMirror
 from appliance.policy.policy import Policy
 from appliance.quotas.pool import Standing
 from appliance.rpc.bulk import LargeWrites, bulk_turns
 from appliance.rpc.processor_time import ProcessorTime
-from appliance.rpc.server import Handler, HttpRequest
+from appliance.rpc.server import Handler
 from roswire.xmlrpc import Limits
 
 
@@ -65,9 +64,6 @@ def serving(
     pipeline = Pipeline(
         execution,
         Multicall(execution, parameters, trail, offload=offload),
-        repetitions=Repetitions(
-            gate, registry, mirror, rosmaster=rosmaster, addresses=addresses, policy=policy, trail=trail
-        ),
         addresses=addresses,
         trail=trail,
         limits=Limits(),
@@ -81,7 +77,7 @@ def serving(
             registry, graph, enactor, relay, mediation, addresses, nodes, liveness, gate, 11311
         )
         return pipeline.handler(served(NODE_CALLS.values(), node_calls), target=target)
-    handler = pipeline.handler(
+    return pipeline.handler(
         master_table(
             RegistrationCalls(
                 rosmaster, registry, graph, enactor, faces, arrivals, relay, mediation, gate, rights
@@ -102,8 +98,3 @@ def serving(
         ),
         own=own,
     )
-
-    async def serve(request: HttpRequest) -> bytes:
-        return (None if own else pipeline.repetitions.answer(request)) or await handler(request)
-
-    return serve

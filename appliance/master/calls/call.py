@@ -232,7 +232,6 @@ class Call(Generic[S]):
     command     the name that the policy knows it by, where that is another (`policy/rights` says what it needs)
     tells       the answer is the value of the ROS parameter, which may be a large tree
     small       parameters and answer are a few names: calls of the same moment travel to ROSMaster as one
-    mirrored    the answer is made of the registry and the mirror of the parameters, and of nothing else
     in_run      in a multicall it is decided, recorded and carried out together with its neighbours that are, too
     """
 
@@ -245,7 +244,6 @@ class Call(Generic[S]):
     command: str | None = None
     tells: bool = False
     small: bool = False
-    mirrored: bool = False
     in_run: bool = False
     resource: int | None = field(init=False)  # which parameter names what it is about
     api: int | None = field(init=False)  # which is the caller's own URI

@@ -106,9 +106,7 @@ _REGISTRATION: tuple[Call[RegistrationCalls], ...] = (
 )
 
 _LOOKUPS: tuple[Call[LookupCalls], ...] = (
-    Call(
-        "lookupNode", method(LookupCalls.lookup_node, NODE), Verb.READ, denial="", small=True, mirrored=True
-    ),
+    Call("lookupNode", method(LookupCalls.lookup_node, NODE), Verb.READ, denial="", small=True),
     Call(
         "lookupService",
         method(LookupCalls.lookup_service, SERVICE),
@@ -117,17 +115,9 @@ _LOOKUPS: tuple[Call[LookupCalls], ...] = (
         denial="",
         small=True,
     ),
-    Call(
-        "getSystemState", method(LookupCalls.get_system_state), Verb.READ, denial=[[], [], []], mirrored=True
-    ),
-    Call(
-        "getPublishedTopics",
-        method(LookupCalls.get_published_topics, SUBGRAPH),
-        Verb.READ,
-        denial=[],
-        mirrored=True,
-    ),
-    Call("getTopicTypes", method(LookupCalls.get_topic_types), Verb.READ, denial=[], mirrored=True),
+    Call("getSystemState", method(LookupCalls.get_system_state), Verb.READ, denial=[[], [], []]),
+    Call("getPublishedTopics", method(LookupCalls.get_published_topics, SUBGRAPH), Verb.READ, denial=[]),
+    Call("getTopicTypes", method(LookupCalls.get_topic_types), Verb.READ, denial=[]),
     Call("getUri", method(LookupCalls.get_uri), Verb.READ, denial=""),
     Call("getPid", method(LookupCalls.get_pid), Verb.READ, denial=-1),
     Call("shutdown", method(LookupCalls.shutdown_master, MESSAGE), Verb.DO, command="shutdownMaster"),
@@ -135,13 +125,7 @@ _LOOKUPS: tuple[Call[LookupCalls], ...] = (
 
 _PARAMETERS: tuple[Call[ParameterCalls], ...] = (
     Call(
-        "getParam",
-        method(ParameterCalls.get_param, KEY),
-        Verb.READ,
-        Kind.PARAMETER,
-        tells=True,
-        mirrored=True,
-        in_run=True,
+        "getParam", method(ParameterCalls.get_param, KEY), Verb.READ, Kind.PARAMETER, tells=True, in_run=True
     ),
     Call(
         "hasParam",
@@ -150,7 +134,6 @@ _PARAMETERS: tuple[Call[ParameterCalls], ...] = (
         Kind.PARAMETER,
         denial=False,
         small=True,
-        mirrored=True,
         in_run=True,
     ),
     Call("setParam", method(ParameterCalls.set_param, KEY, VALUE), Verb.WRITE, Kind.PARAMETER, in_run=True),

@@ -12,7 +12,6 @@ from appliance.master.caller import Caller
 from appliance.master.calls.call import Attempt, Table
 from appliance.master.calls.call_execution import Execution, Visit
 from appliance.master.calls.multicall import LIMIT_FAULT, MULTICALL, PARSE_FAULT, Multicall
-from appliance.master.calls.repeated_calls import Repetitions
 from appliance.master.endpoints.endpoint_addresses import Addresses
 from appliance.master.graph.registry import Incarnation
 from appliance.policy.model import Category
@@ -38,7 +37,6 @@ class Pipeline:
 
     execution: Execution
     multicall: Multicall
-    repetitions: Repetitions
     addresses: Addresses
     trail: AuditTrail
     limits: Limits
@@ -52,38 +50,31 @@ class Pipeline:
         async def handle(request: HttpRequest) -> bytes:
             await self.addresses.learn(request.peer)
             caller = Caller(request.peer, "", request.arrived, own=own, target=target)
-            before = self.repetitions.state
             with Bulk(self.bulk, caller.peer.host, self.processor) as bulk:
-                call, answer = await self._serve(Visit(table, caller, bulk), request.body)
-            if call is not None and not own and target is None:
-                self.repetitions.note(table, request, call, answer, before=before)
-            return answer
+                return await self._serve(Visit(table, caller, bulk), request.body)
 
         return handle
 
-    async def _serve(self, visit: Visit, body: bytes) -> tuple[MethodCall | None, bytes]:
-        """The call, if it was understood, and the answer."""
+    async def _serve(self, visit: Visit, body: bytes) -> bytes:
         try:
             if len(body) <= self.offload:
                 call = parse_call(body, self.limits)
             else:
                 call = await self._parse_large(body, visit.bulk)
         except PeerError as error:
-            return None, self._not_understood(visit.caller, body, error)
+            return self._not_understood(visit.caller, body, error)
         try:
             answer = await self._answer(visit, call)
             known = call.method in visit.table or call.method == MULTICALL
             seconds = (time.monotonic_ns() - visit.caller.arrived) / 1e9
             self.trail.meter.called(call.method if known else "unknown", seconds)
             if weigh(answer, self.offload) < self.offload:
-                return call, build_response(answer)
+                return build_response(answer)
             await visit.bulk.take()
-            return call, await visit.bulk.in_thread(build_response, answer)
+            return await visit.bulk.in_thread(build_response, answer)
         except EncodingError as error:
             _log.error("answer cannot be written", call=call.method, error=str(error))
-            return None, build_fault(
-                _INTERNAL_FAULT, f"the answer to {call.method} cannot be written: {error}"
-            )
+            return build_fault(_INTERNAL_FAULT, f"the answer to {call.method} cannot be written: {error}")
 
     async def _answer(self, visit: Visit, call: MethodCall) -> Value:
         if call.method == MULTICALL and visit.caller.target is None:

@@ -18,7 +18,6 @@ import structlog
 from appliance.audit.folding import FoldSettings
 from appliance.audit.log import AuditLog
 from appliance.audit.query import Filter
-from appliance.audit.record import Repeated
 from appliance.audit.search import export, search, show
 from appliance.audit.verification import verify
 from tests.support.audit import decision, settle
@@ -179,37 +178,6 @@ def test_whoever_is_denied_again_is_told_an_id_that_is_there(
     assert shown.entry.record.decision == "deny"
     assert told(resource="/another") not in again
     assert told(caller_id="/another") not in again
-
-
-@pytest.mark.parametrize("seconds", [3600.0, 0.0], ids=["folded", "in full"])
-def test_what_the_owner_counts_is_in_the_log(make_log: MakeLog, path: Path, seconds: float) -> None:
-    """Reads that are only counted while they repeat are as many as happened, however they reach the log."""
-    log = make_log(fold=FoldSettings(seconds=seconds))
-    first = msgspec.structs.replace(decision(log), folds=True)
-    log.record(first)
-    same = Repeated(first)
-    for _ in range(1000):
-        log.repeated(same, 7)
-    assert log.close() is None
-    found = events(path)
-    assert found["decision"] == (1 if seconds else 1001)
-    assert found["repetitions folded"] == (1 if seconds else 0)
-    summaries = export(path, Filter(event="repetitions folded"))
-    assert sum(entry.record.detail["count"] for entry in summaries) == (1000 if seconds else 0)
-    assert verify(path).ok
-
-
-def test_what_is_counted_first_is_in_full(make_log: MakeLog, path: Path) -> None:
-    """The log has forgotten the kind: the first that comes is a record, the others are its repetitions."""
-    log = make_log(fold=FoldSettings(seconds=3600))
-    same = Repeated(msgspec.structs.replace(decision(log), folds=True))
-    for _ in range(50):
-        log.repeated(same, 7)
-    assert log.close() is None
-    [full] = [entry.record for entry in export(path, Filter(event="decision"))]
-    assert (full.duration_us, "count" in full.detail) == (7, False)
-    [summary] = [entry.record for entry in export(path, Filter(event="repetitions folded"))]
-    assert (summary.detail["count"], summary.detail["recorded_id"]) == (49, full.id)
 
 
 def fill(path: Path) -> None:
