@@ -9,8 +9,9 @@ from appliance.backup.contents import BackupError
 from appliance.backup.create import back_up
 from appliance.backup.purge import purge as remove
 from appliance.backup.restore import restore as put_back
-from appliance.cli.output import Json, printable, refused, say, say_json
+from appliance.cli.output import Json, say_json
 from appliance.cli.target import DEFAULT_STATE, State
+from rosmop.tool.terminal import printable, refused, say
 
 _NewState = Annotated[
     Path,

@@ -9,8 +9,9 @@ import typer
 from appliance.channel.admin import AdminRequest
 from appliance.channel.answers import monitor_answers, policy_answers
 from appliance.cli.durations import span_given
-from appliance.cli.output import say, say_json
+from appliance.cli.output import say_json
 from appliance.cli.target import Appliance, speaks
+from rosmop.tool.terminal import say
 
 _Listed = TypeVar("_Listed", policy_answers.PolicyRevisionList, monitor_answers.MonitorRevisionList)
 _Confirmed = TypeVar("_Confirmed", policy_answers.PolicyConfirmed, monitor_answers.MonitorsConfirmed)

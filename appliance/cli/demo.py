@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from appliance.base.shipped import SHIPPED
-from appliance.cli.output import refused
+from rosmop.tool.terminal import refused
 
 
 def demo(

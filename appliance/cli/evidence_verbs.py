@@ -18,13 +18,14 @@ from appliance.cli import completion
 from appliance.cli.admin_client import AdminSocket
 from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.durations import Since, Until
-from appliance.cli.output import Json, say, say_json, usage_error
+from appliance.cli.output import Json, say_json, usage_error
 from appliance.cli.rest.orders import RestWay
 from appliance.cli.rest.session import ProblemError
 from appliance.cli.target import Appliance, speaks
 from appliance.evidence import bundle_verifier as verifier_module
 from appliance.evidence.bundle import VERIFIER, BundleError, Kept, Span, export
 from appliance.signing.fingerprints import fingerprint
+from rosmop.tool.terminal import say
 
 _SILENCE_SECONDS = 3600.0  # it is made twice before the first byte comes
 

@@ -5,31 +5,19 @@ characters in them, and are never read as markup.
 """
 
 import datetime
-import json
-import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
 import typer
-from rich.console import Console
-from rich.text import Text
 
 from appliance.api.moments import in_full
 from appliance.base.atomic_files import NotLastingError, write_where_told
+from rosmop.tool import terminal
+from rosmop.tool.terminal import printable
 
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output, one object per line")]
-
-
-def printable(text: str) -> str:
-    """The text with everything that a terminal could act on escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
-
-
-def counted(number: int, noun: str) -> str:
-    """`1 error`, `2 errors`."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def moment(seconds: float) -> str:
@@ -51,22 +39,6 @@ def write_told(path: Path, data: bytes) -> None:
         typer.echo(f"rosrv: {printable(str(path))}: {error.strerror}", err=True)
 
 
-def refused(findings: Iterable[object]) -> typer.Exit:
-    """Write what is wrong with a text, a finding a line; raise the result (exit status 1)."""
-    for finding in findings:
-        typer.echo(printable(str(finding)), err=True)
-    return typer.Exit(1)
-
-
-def say(line: str, style: str = "") -> None:
-    """Write one line to standard output."""
-    shown = printable(line)
-    if sys.stdout.isatty():
-        Console(highlight=False, soft_wrap=True).print(Text(shown, style=style))
-    else:
-        sys.stdout.write(shown + "\n")
-
-
 def say_json(fields: msgspec.Struct | Mapping[str, Any] | tuple[Any, ...]) -> None:
     """Write one object on one line to standard output."""
-    sys.stdout.write(json.dumps(msgspec.to_builtins(in_full(fields))) + "\n")
+    terminal.say_json(in_full(fields))

@@ -20,12 +20,13 @@ from appliance.channel.answers.recording_answers import RecordedMessages, Record
 from appliance.cli import completion
 from appliance.cli.admin_client import AdminSocket, NotRunningError
 from appliance.cli.durations import span_given
-from appliance.cli.output import counted, printable, refused, say, say_json, usage_error
+from appliance.cli.output import say_json, usage_error
 from appliance.cli.target import Appliance, speaks
 from appliance.cli.topic_verbs import lines_of
 from appliance.recorder.bag_reader import Place
 from appliance.recorder.mcap import as_mcap
 from appliance.recorder.timeline import MOST_COLUMNS, MOST_NEIGHBOURS, NEIGHBOURS, messages_around, timeline
+from rosmop.tool.terminal import counted, printable, refused, say
 
 if TYPE_CHECKING:
     from appliance.cli.rest.orders import RestWay

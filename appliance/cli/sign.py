@@ -9,9 +9,10 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key, load_ssh_private_key
 
 from appliance.base.input_files import read_given
-from appliance.cli.output import Json, say, say_json, usage_error, write_told
+from appliance.cli.output import Json, say_json, usage_error, write_told
 from appliance.signing.site_keys import name_of, public_line
 from appliance.signing.site_keys import sign as signature_of
+from rosmop.tool.terminal import say
 
 _OPENSSH = b"-----BEGIN OPENSSH PRIVATE KEY-----"
 

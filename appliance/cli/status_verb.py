@@ -14,9 +14,10 @@ from appliance.channel.admin import StatusWanted
 from appliance.channel.answers.host_answers import PortsSeen
 from appliance.channel.answers.status import FirewallState, IpsecState, PolicyState, ProcessInfo, Status
 from appliance.channel.status_summary import no_relay, probe_failed
-from appliance.cli.output import counted, moment, say_json
+from appliance.cli.output import moment, say_json
 from appliance.cli.status_view import age, doubted_clock, lacking_walls, processes_table, shortened
 from appliance.cli.target import Appliance, speaks
+from rosmop.tool.terminal import counted
 
 _PORT_STATES = ("closed", "open", "unknown")
 _MOST_NAMED = 8

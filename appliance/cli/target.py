@@ -18,7 +18,8 @@ import typer
 
 from appliance.channel.admin import A, AdminAnswer, AdminRequest
 from appliance.cli.admin_client import AdminSocket, NotRunningError
-from appliance.cli.output import Json, printable, say_json, usage_error
+from appliance.cli.output import Json, say_json, usage_error
+from rosmop.tool.terminal import printable
 
 if TYPE_CHECKING:
     from appliance.cli.audit.log_over_rest import RestLog

@@ -9,8 +9,9 @@ from appliance.channel.admin import TokenAdd, TokenList, TokenRevoke
 from appliance.channel.answers.token_answers import TokenRole
 from appliance.cli import completion
 from appliance.cli.durations import span_given
-from appliance.cli.output import moment, say, say_json
+from appliance.cli.output import moment, say_json
 from appliance.cli.target import Appliance, speaks
+from rosmop.tool.terminal import say
 
 
 @speaks

@@ -10,8 +10,9 @@ from appliance.api.moments import in_full
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import Topic, TopicMessage
 from appliance.cli import completion
-from appliance.cli.output import printable, refused, say, say_json, usage_error
+from appliance.cli.output import say_json, usage_error
 from appliance.cli.target import Appliance, speaks
+from rosmop.tool.terminal import printable, refused, say
 from roswire.message_view import CUT
 
 _AT_ONCE = 20  # messages of one look

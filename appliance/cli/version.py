@@ -1,9 +1,10 @@
 """`rosrv version`: what is installed here, or what a running appliance is."""
 
 from appliance.channel.admin import InventoryWanted
-from appliance.cli.output import say, say_json
+from appliance.cli.output import say_json
 from appliance.cli.target import Appliance, speaks
 from appliance.configuration.inventory import inventory
+from rosmop.tool.terminal import say
 
 
 @speaks

@@ -17,6 +17,8 @@ from appliance import __version__
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 RUNS = [Requirement(one) for one in (*PROJECT["dependencies"], *PROJECT["optional-dependencies"]["iptables"])]
+LANGUAGE = tomllib.loads((ROOT / "rosmop" / "pyproject.toml").read_text())["project"]
+LANGUAGE_RUNS = map(Requirement, (*LANGUAGE["dependencies"], *LANGUAGE["optional-dependencies"]["fast"]))
 LOCKED = dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE))
 
 
@@ -36,7 +38,7 @@ def metadata(wheel: Path) -> Message:
         return message_from_bytes(archive.read(name))
 
 
-@pytest.mark.parametrize("requirement", RUNS, ids=lambda one: one.name)
+@pytest.mark.parametrize("requirement", sorted({*RUNS, *LANGUAGE_RUNS}, key=str), ids=lambda one: one.name)
 def test_each_dependency_has_both_bounds(requirement: Requirement) -> None:
     """The version that is tested is within them; none older than it is promised, and no major version ahead."""
     locked = LOCKED[requirement.name]
@@ -61,7 +63,7 @@ def test_it_brings_what_is_not_code(wheel: Path) -> None:
     tracked = subprocess.run(
         [
             "git", "-c", f"safe.directory={ROOT}", "ls-files", "examples", "monitors", "policies", "docs", "appliance",
-            "roswire", "rosmop", ":!rosmop/tests",
+            "roswire", "rosmop/*.py", ":!rosmop/tests",
         ],
         cwd=ROOT, capture_output=True, text=True, check=True,
     ).stdout.split()  # fmt: skip

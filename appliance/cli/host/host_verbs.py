@@ -14,8 +14,9 @@ from appliance.cli import completion
 from appliance.cli.durations import span_given
 from appliance.cli.host.kit_files import KitWriter, placed, wishes_of, write_script
 from appliance.cli.host.private_output import new_output, usage_error
-from appliance.cli.output import moment, printable, say, say_json
+from appliance.cli.output import moment, say_json
 from appliance.cli.target import Appliance, speaks
+from rosmop.tool.terminal import printable, say
 
 _Name = Annotated[
     str,

@@ -15,7 +15,7 @@ from typing import BinaryIO
 import typer
 
 from appliance.cli import output
-from appliance.cli.output import printable, refused, say
+from rosmop.tool.terminal import printable, refused, say
 
 STANDARD_OUTPUT = Path("-")
 usage_error = functools.partial(output.usage_error, verb="rosrv host")

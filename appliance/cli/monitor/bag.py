@@ -16,7 +16,7 @@ from rosbags.rosbag1 import ReaderError, Writer
 from rosbags.rosbag1.writer import WriterError
 
 from appliance.cli.monitor.bounded_bag import BoundedReader
-from appliance.cli.monitor.input import usage_error
+from appliance.cli.monitor.monitor_program import MONITOR
 from rosmop.run.causes import Sender
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome, Verdict, bound
@@ -58,7 +58,9 @@ def open_bag(path: Path) -> BoundedReader:
             if path.is_file()
             else ""
         )
-        raise usage_error(f"cannot read the bag {path}: {_said_by(error).rstrip('.')}{mend}") from error
+        raise MONITOR.usage_error(
+            f"cannot read the bag {path}: {_said_by(error).rstrip('.')}{mend}"
+        ) from error
     return reader
 
 
@@ -67,7 +69,7 @@ def messages_of(reader: BoundedReader) -> Iterator[tuple[Connection, int, bytes]
     try:
         yield from reader.in_order()
     except _DAMAGE as error:
-        raise usage_error(f"the bag {reader.path} is damaged: {_said_by(error)}") from error
+        raise MONITOR.usage_error(f"the bag {reader.path} is damaged: {_said_by(error)}") from error
 
 
 def _said_by(error: Exception) -> str:
@@ -102,7 +104,7 @@ class Recorded:
             self.began, self.ended = reader.start_time, reader.end_time - 1
             self.message_count = reader.message_count
             if not self.message_count:
-                raise usage_error(f"the bag {path} has no messages")
+                raise MONITOR.usage_error(f"the bag {path} has no messages")
             self.definitions = definitions_of(reader)
             for connection in reader.connections:
                 if not _fits(connection, patterns):
@@ -110,7 +112,7 @@ class Recorded:
                 kind = ros_type(connection.msgtype)
                 other = self.topics.setdefault(connection.topic, kind)
                 if other != kind:
-                    raise usage_error(f"{path}: {connection.topic} carries both {other} and {kind}")
+                    raise MONITOR.usage_error(f"{path}: {connection.topic} carries both {other} and {kind}")
 
     def messages(self) -> Iterator[tuple[str, int, bytes]]:
         """Topic, nanoseconds and bytes of every message, in the order of the bag."""
@@ -135,7 +137,7 @@ class Recording:
             self._writer = Writer(path)
             self._writer.open()
         except (WriterError, OSError) as error:
-            raise usage_error(f"cannot write the bag {path}: {error}") from error
+            raise MONITOR.usage_error(f"cannot write the bag {path}: {error}") from error
 
     def __enter__(self) -> "Recording":
         return self

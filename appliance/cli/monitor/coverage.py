@@ -9,20 +9,16 @@ from rich.console import Console
 from rich.table import Column
 
 from appliance.cli.monitor.bag import Recorded, open_bag, refusals
-from appliance.cli.monitor.input import (
-    Bags,
-    Files,
-    Folders,
-    read_definitions,
-    read_specifications,
-    usage_error,
-)
-from appliance.cli.output import Json, refused, say, say_json
+from appliance.cli.monitor.monitor_program import MONITOR
+from appliance.cli.output import Json, say_json
 from appliance.cli.tables import table_of
 from rosmop.check.sources import compiled_from
 from rosmop.learn.exercised import Item, covered
 from rosmop.run.engine import MonitorSet
 from rosmop.text.errors import SpecificationError
+from rosmop.tool.options import Bags, Files, Folders
+from rosmop.tool.specification_input import read_definitions, read_specifications
+from rosmop.tool.terminal import refused, say
 
 _KINDS = ("event", "branch", "function", "handler", "state", "transition")
 
@@ -43,15 +39,15 @@ def coverage(
     """
     recordings = [Recorded(bag, ["*"]) for bag in bags]
     try:
-        definitions = read_definitions(files, msg or [])
+        definitions = read_definitions(MONITOR, files, msg or [])
         for recording in recordings:
             definitions = recording.definitions.extended(definitions)
-        texts = read_specifications(files)
+        texts = read_specifications(MONITOR, files)
         monitors = MonitorSet.of(compiled_from(texts, definitions))
         for bag in bags:
             with closing(open_bag(bag)) as reader:
                 for text in refusals(monitors, reader):
-                    raise usage_error(f"{bag}: {text}")
+                    raise MONITOR.usage_error(f"{bag}: {text}")
         counts = covered(texts, definitions, recordings)
     except SpecificationError as error:
         raise refused(error.findings) from None

@@ -16,9 +16,10 @@ from appliance.channel.answers.monitor_answers import MonitorState, Replaced, Sw
 from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within
 from appliance.cli.durations import span_given
-from appliance.cli.output import counted, moment, printable, say, say_json, usage_error
+from appliance.cli.output import moment, say_json, usage_error
 from appliance.cli.tables import say_table, table_of
 from appliance.cli.target import Appliance, speaks
+from rosmop.tool.terminal import counted, printable, say
 
 _Names = Annotated[
     list[str], typer.Argument(metavar="MONITOR…", show_default=False, autocompletion=completion.monitors)
@@ -195,7 +196,7 @@ def load(
 
     Example: rosrv monitor load safe_zone.rv --shadow
     """
-    from appliance.cli.monitor.input import read_to_send  # noqa: PLC0415  it takes a while, and is for this verb only
+    from appliance.cli.monitor.sources_to_send import read_to_send  # noqa: PLC0415  it takes a while, and is for this verb only
     from rosmop.text.errors import SpecificationError  # noqa: PLC0415  as above
 
     try:

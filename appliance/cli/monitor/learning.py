@@ -10,10 +10,13 @@ import typer
 
 from appliance.base.input_files import read_given_text
 from appliance.cli.monitor.bag import Recorded
-from appliance.cli.monitor.input import BESIDE, Bags, usage_error
-from appliance.cli.output import Json, counted, say, say_json, write_told
+from appliance.cli.monitor.monitor_program import MONITOR
+from appliance.cli.output import Json, say_json, write_told
 from appliance.cli.progress_bar import progress
 from rosmop.learn.learner import LearningError, Learnt, learn
+from rosmop.tool.options import Bags
+from rosmop.tool.specification_input import BESIDE
+from rosmop.tool.terminal import counted, say
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_text import BUILTINS
@@ -42,9 +45,9 @@ def learn_monitors(
     Example: rosrv monitor learn --bag monday.bag --bag tuesday.bag --out learnt.rv
     """
     if out is not None and out.exists():
-        raise usage_error(f"{out} is there already")
+        raise MONITOR.usage_error(f"{out} is there already")
     if len({os.path.realpath(bag) for bag in bags}) < len(bags):
-        raise usage_error("a recording is given twice: it would be its own test")
+        raise MONITOR.usage_error("a recording is given twice: it would be its own test")
     recordings = [Recorded(bag, topics or ["*"]) for bag in bags]
     recorded = Definitions({})
     for recording in recordings:
@@ -56,7 +59,7 @@ def learn_monitors(
         with progress("learning", lambda: 2 * total, shares_screen=out is None) as told:
             learnt = learn(recordings, definitions, hold_out, told)
     except LearningError as error:
-        raise usage_error(str(error)) from error
+        raise MONITOR.usage_error(str(error)) from error
     if out is not None:
         _write(out, learnt, recorded)
     if as_json:
@@ -75,7 +78,7 @@ def _check_same(recording: Recorded, others: Definitions) -> None:
     """A type has one definition in all recordings, or their messages would be read wrongly."""
     for kind in set(recording.topics.values()) & set(recording.definitions.message_types):
         if kind in others.message_types and others.md5sum(kind) != recording.definitions.md5sum(kind):
-            raise usage_error(
+            raise MONITOR.usage_error(
                 f"{recording.name} has another definition of {kind} than the recordings before it"
             )
 
@@ -98,14 +101,14 @@ def _write(out: Path, learnt: Learnt, recorded: Definitions) -> None:
         path = out.parent / BESIDE / f"{name}.msg"
         text = recorded.message(name).text
         if path.exists() and read_given_text(path, errors="surrogateescape") != text:
-            raise usage_error(f"{path} is there already and is another than the recordings have")
+            raise MONITOR.usage_error(f"{path} is there already and is another than the recordings have")
         files[path] = text
     try:
         for path, text in files.items():
             path.parent.mkdir(parents=True, exist_ok=True)
             write_told(path, text.encode("utf-8", "surrogateescape"))
     except OSError as error:
-        raise usage_error(f"cannot write {out}: {error.strerror}") from error
+        raise MONITOR.usage_error(f"cannot write {out}: {error.strerror}") from error
 
 
 def _needed(learnt: Learnt, recorded: Definitions) -> list[str]:

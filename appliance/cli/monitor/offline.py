@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from appliance.cli.output import Json, refused, say, say_json, usage_error
+from appliance.cli.output import Json, say_json, usage_error
 from appliance.cli.target import DEFAULT_STATE
 from appliance.specifications.specification_revisions import forget_revision
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 from appliance.supervisor.state_directory import StateDirectory
+from rosmop.tool.terminal import refused, say
 
 _STATE, _VERB = "state.db", "rosrv monitor"
 

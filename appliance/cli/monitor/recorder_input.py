@@ -13,10 +13,10 @@ from appliance.audit.timestamps import parse_moment
 from appliance.channel import admin
 from appliance.channel.answers.recording_answers import Recording, Recordings
 from appliance.cli.admin_client import NotRunningError
-from appliance.cli.monitor.input import usage_error
-from appliance.cli.output import refused
+from appliance.cli.monitor.monitor_program import MONITOR
 from appliance.cli.record_verbs import bag_of
 from appliance.cli.target import Appliance
+from rosmop.tool.terminal import refused
 
 _SECOND = 1_000_000_000
 
@@ -54,9 +54,9 @@ def span_of(since: str | None, until: str | None) -> Span:
             now if until is None else min(now, parse_moment(until, now)),
         )
     except ValueError as error:
-        raise usage_error(str(error)) from None
+        raise MONITOR.usage_error(str(error)) from None
     if span.since >= span.until:
-        raise usage_error("--since is not before --until")
+        raise MONITOR.usage_error("--since is not before --until")
     return span
 
 
@@ -64,10 +64,12 @@ def require_recorded(known: Recordings, topics: Mapping[str, str]) -> None:
     """End the program with 2 when one of these topics (name to type) is never recorded."""
     for topic, kind in topics.items():
         if not any(fnmatchcase(topic, glob) for glob in known.topics):
-            raise usage_error(f"{topic} is not recorded: recorder.topics has {', '.join(known.topics)}")
+            raise MONITOR.usage_error(
+                f"{topic} is not recorded: recorder.topics has {', '.join(known.topics)}"
+            )
         out = next((glob for glob in known.never for name in (topic, kind) if fnmatchcase(name, glob)), None)
         if out is not None:
-            raise usage_error(f"{topic} ({kind}) is not recorded: recorder.never has {out}")
+            raise MONITOR.usage_error(f"{topic} ({kind}) is not recorded: recorder.never has {out}")
 
 
 @contextmanager
@@ -98,7 +100,7 @@ def pieces_of(appliance: Appliance, known: Recordings, span: Span) -> Iterator[l
                 try:
                     file = opened.enter_context(bag.open("rb"))
                 except OSError as error:
-                    raise usage_error(
+                    raise MONITOR.usage_error(
                         f"the bag of {row.id} is not there any more: {error.strerror}"
                     ) from None
                 bags[row.id] = Path(f"/proc/self/fd/{file.fileno()}")
@@ -125,7 +127,7 @@ def _lent(appliance: Appliance, span: Span) -> Recording | None:
     try:
         answer = appliance.ask(admin.RecordingOfMemory(*span))
     except NotRunningError as error:
-        raise usage_error(str(error)) from None
+        raise MONITOR.usage_error(str(error)) from None
     return None if answer.trouble == "unknown" else appliance.body_or_exit(answer)
 
 

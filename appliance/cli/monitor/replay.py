@@ -13,10 +13,9 @@ from rich.table import Column
 from appliance.channel import admin
 from appliance.cli.monitor.bag import Replayed, definitions_of, open_bag, refusals, replay
 from appliance.cli.monitor.bounded_bag import BoundedReader
-from appliance.cli.monitor.input import Folders, read_definitions, read_specifications, usage_error
-from appliance.cli.monitor.monitor_output import BILLION, because
+from appliance.cli.monitor.monitor_program import MONITOR
 from appliance.cli.monitor.recorder_input import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
-from appliance.cli.output import counted, refused, say, say_json
+from appliance.cli.output import say_json
 from appliance.cli.progress_bar import progress
 from appliance.cli.tables import say_table, table_of
 from appliance.cli.target import Appliance, speaks
@@ -28,6 +27,10 @@ from rosmop.run.outcomes import Outcome, bound
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
 from rosmop.text.parser import parse
+from rosmop.tool.monitor_output import BILLION, because
+from rosmop.tool.options import Folders
+from rosmop.tool.specification_input import read_definitions, read_specifications
+from rosmop.tool.terminal import counted, refused, say
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
 
@@ -92,7 +95,9 @@ def replay_monitor(
     Example: rosrv monitor replay safeTrigger --since 1h
     """
     if bool(bags) is (since is not None or until is not None):
-        raise usage_error("give --bag FILE (repeatable), or --since and --until for the flight recorder")
+        raise MONITOR.usage_error(
+            "give --bag FILE (repeatable), or --since and --until for the flight recorder"
+        )
     report = _Report(most, appliance.as_json)
     patterns = topics or ["*"]
     messages = 0
@@ -112,7 +117,7 @@ def replay_monitor(
                     known = definitions_of(reader).extended(definitions)
                     monitors = _only(chosen, MonitorSet.of(compiled_from(texts, known, margins=margins)))
                     for text in refusals(monitors, reader, patterns):
-                        raise usage_error(f"{piece.name}: {text}")
+                        raise MONITOR.usage_error(f"{piece.name}: {text}")
                     monitors.write_module()
                     messages += report.of(monitors, reader, piece, patterns)
     except SpecificationError as error:
@@ -130,12 +135,12 @@ def _specifications(
     """Texts and definitions; of the running appliance all, and whose they are that were asked for."""
     path = Path(what)
     if path.suffix == ".rv" or path.is_file():
-        return read_specifications([path]), read_definitions([path], folders), None
+        return read_specifications(MONITOR, [path]), read_definitions(MONITOR, [path], folders), None
     loaded = appliance.ask_or_exit(admin.MonitorsWanted(texts=True))
     names = [row.name for row in loaded.monitors]
     if what not in names:
         known = ", ".join(names) or "none is loaded"
-        raise usage_error(f"{what} is no file (.rv), and no monitor: there are: {known}")
+        raise MONITOR.usage_error(f"{what} is no file (.rv), and no monitor: there are: {known}")
     own = Definitions.from_files(loaded.definitions or {})
     definitions = standard_definitions().extended(own)
     return loaded.files or {}, definitions, what

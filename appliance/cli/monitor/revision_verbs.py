@@ -9,8 +9,9 @@ from appliance.channel.admin import MonitorConfirm, MonitorRevisions, MonitorRev
 from appliance.channel.answers.monitor_answers import RevisionTexts
 from appliance.cli.commit_confirm import verbs_of
 from appliance.cli.monitor.in_force import say_replaced
-from appliance.cli.output import say, say_json, usage_error
+from appliance.cli.output import say_json, usage_error
 from appliance.cli.target import Appliance, speaks
+from rosmop.tool.terminal import say
 
 _Revision = Annotated[int | None, typer.Argument(help="A kept revision; without it, the one in force")]
 

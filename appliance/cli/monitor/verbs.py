@@ -4,7 +4,6 @@ Exit status: 0 right (warnings or not), whatever the verdicts; 1 a specification
 """
 
 from contextlib import closing
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
@@ -12,18 +11,16 @@ import typer
 
 from appliance.cli.monitor.bag import Recording, definitions_of, open_bag, refusals, replay
 from appliance.cli.monitor.bounded_bag import BoundedReader
-from appliance.cli.monitor.input import Files, Folders, read_definitions, read_specifications, usage_error
-from appliance.cli.monitor.monitor_output import explained, lines, record, say_finding
-from appliance.cli.output import Json, counted, printable, refused, say, say_json
+from appliance.cli.monitor.monitor_program import MONITOR
+from appliance.cli.output import Json
 from appliance.cli.progress_bar import progress
-from rosmop.certify.properties import certificates_of
-from rosmop.check.sources import compiled_from
-from rosmop.form.positions import Finding
-from rosmop.logics.interface import CompiledProperty
-from rosmop.logics.picture import dot_of, svg_of
 from rosmop.run.engine import MonitorSet
 from rosmop.text.errors import SpecificationError
-from roswire.definitions import Definitions
+from rosmop.tool import check_command
+from rosmop.tool.monitor_output import lines, record
+from rosmop.tool.options import Dot, Files, Folders, Prove, Svg
+from rosmop.tool.specification_input import load
+from rosmop.tool.terminal import counted, refused, say, say_json
 
 _TOLD_EVERY = 1000
 
@@ -33,14 +30,9 @@ def check(
     *,
     as_json: Json = False,
     msg: Folders = None,
-    prove: Annotated[
-        bool,
-        typer.Option(
-            "--prove", help="Also prove that the relay's code of each event does what the event means"
-        ),
-    ] = False,
-    dot: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata for Graphviz")] = None,
-    svg: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the automata as a picture")] = None,
+    prove: Prove = False,
+    dot: Dot = None,
+    svg: Svg = None,
 ) -> None:
     """Report every error and warning with its place; exit status 1 if there is an error.
 
@@ -49,36 +41,8 @@ def check(
 
     Example: rosrv monitor check monitors/*.rv
     """
-    if prove and find_spec("z3") is None:
-        raise usage_error("--prove needs the package z3-solver: pip install 'rosrv-appliance[prove]'")
-    try:
-        monitors = _load(files, msg or [])
-        certificates, wrong = certificates_of(monitors.monitors)
-        findings = [*wrong, *monitors.warnings]
-    except SpecificationError as error:
-        monitors, certificates = None, {}
-        findings = list(error.findings)
-    for finding in findings:
-        say_finding(finding, as_json=as_json)
-    errors = sum(finding.severity == "error" for finding in findings)
-    if not as_json:
-        _summarise(findings, errors, monitors)
-        for monitor in monitors.monitors if monitors is not None else ():
-            for line in explained(monitor):
-                say(f"{monitor.name}: {line}")
-            for line, running in zip(certificates[monitor.name], monitor.properties, strict=True):
-                say(f"{monitor.name}: {line}")
-                say(f"{monitor.name}: {running.code.property.logic}: {running.code.enforcement}")
-    if monitors is not None:
-        properties = [
-            running.code.property for monitor in monitors.monitors for running in monitor.properties
-        ]
-        _draw(properties, dot, svg)
-        if prove:
-            from appliance.cli.monitor.proof import say_proofs  # noqa: PLC0415  its package may be missing
-
-            errors += say_proofs(monitors, as_json=as_json)
-    raise typer.Exit(1 if errors else 0)
+    status = check_command.check(MONITOR, files, msg or [], as_json=as_json, prove=prove, dot=dot, svg=svg)
+    raise typer.Exit(status)
 
 
 def run(
@@ -97,24 +61,17 @@ def run(
     """
     with closing(open_bag(bag)) as reader:
         try:
-            monitors = _load(files, msg or [], definitions_of(reader))
+            monitors = load(MONITOR, files, msg or [], definitions_of(reader))
         except SpecificationError as error:
             raise refused(error.findings) from None
         monitors.write_module()
         for text in refusals(monitors, reader):
-            typer.echo(f"rosrv monitor: {printable(text)}; its messages are dropped", err=True)
+            MONITOR.warn(f"{text}; its messages are dropped")
         if output is None:
             _report(monitors, reader, None, as_json=as_json)
         else:
             with Recording(output, monitors.definitions) as recording:
                 _report(monitors, reader, recording, as_json=as_json)
-
-
-def _load(files: list[Path], folders: list[Path], recorded: Definitions | None = None) -> MonitorSet:
-    definitions = read_definitions(files, folders)
-    if recorded is not None:
-        definitions = recorded.extended(definitions)
-    return MonitorSet.of(compiled_from(read_specifications(files), definitions))
 
 
 def _report(
@@ -140,28 +97,3 @@ def _report(
         total = ", ".join(f"{number} {word}" for word, number in counts.items())
         say(f"{counted(sum(counts.values()), 'message')}: {total}; "
             f"{counted(verdicts, 'verdict')}, {counted(faults, 'fault')}")  # fmt: skip
-
-
-def _summarise(findings: list[Finding], errors: int, monitors: MonitorSet | None) -> None:
-    warnings = len(findings) - errors
-    tail = f", {counted(warnings, 'warning')}" if warnings else ""
-    if monitors is None:
-        say(f"{counted(errors, 'error')}: refused{tail}", "red")
-        return
-    number = len(monitors.monitors)
-    say(f"{counted(number, 'specification')} right{tail}", "green")
-
-
-def _draw(properties: list[CompiledProperty], dot: Path | None, svg: Path | None) -> None:
-    for path, draw in ((dot, dot_of), (svg, svg_of)):
-        if path is None:
-            continue
-        picture = draw(properties)
-        if picture is None:
-            text = "no property's monitor is a finite automaton: there is nothing to draw"
-            typer.echo(f"rosrv monitor: {text}, and {path} is not written", err=True)
-            continue
-        try:
-            path.write_text(picture, encoding="utf-8")
-        except OSError as error:
-            raise usage_error(f"cannot write {path}: {error.strerror}") from error

@@ -13,9 +13,10 @@ from appliance.channel.answers.policy_answers import Granted, Why
 from appliance.cli.admin_client import NotRunningError
 from appliance.cli.audit.audit_errors import Errors, fail
 from appliance.cli.commit_confirm import ConfirmWithin, seconds_within
-from appliance.cli.output import printable, say, say_json, usage_error, write_told
+from appliance.cli.output import say_json, usage_error, write_told
 from appliance.cli.policy.live_verbs import say_loaded
 from appliance.cli.target import Appliance, speaks
+from rosmop.tool.terminal import printable, say
 
 
 @speaks

@@ -14,13 +14,14 @@ from appliance.audit.query import Filter, FilterError
 from appliance.audit.timestamps import MomentError, parse_moment
 from appliance.cli.admin_client import NotRunningError
 from appliance.cli.durations import Since
-from appliance.cli.output import counted, refused, say_json
+from appliance.cli.output import say_json
 from appliance.cli.policy.policy_input import Robot, networks_of, request_of, usage_error
 from appliance.cli.target import Appliance, speaks
 from appliance.policy.learn import Learned, Observation, learn
 from appliance.policy.model import Category
 from appliance.policy.policy_compiler import compile_policy
 from appliance.policy.policy_findings import PolicyError
+from rosmop.tool.terminal import counted, refused
 
 _OWN_NODE = "the appliance's own node"
 

@@ -3,8 +3,8 @@
 from appliance.channel.admin import PolicyConfirm, PolicyReload, PolicyRevisions, PolicyRollback
 from appliance.channel.answers.policy_answers import Loaded
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within, verbs_of
-from appliance.cli.output import counted, say
 from appliance.cli.target import Appliance, speaks
+from rosmop.tool.terminal import counted, say
 
 
 @speaks

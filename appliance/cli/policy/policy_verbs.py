@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from appliance.cli.admin_client import NotRunningError
-from appliance.cli.output import Json, counted, refused, say, say_json
+from appliance.cli.output import Json, say_json
 from appliance.cli.policy.policy_input import (
     Enrolled,
     Robot,
@@ -35,6 +35,7 @@ from appliance.policy.judgement import Judged, judge
 from appliance.policy.model import Category, Decision, Request
 from appliance.policy.policy_findings import Finding, PolicyError, Severity
 from appliance.policy.rights import needs_node, rights_of
+from rosmop.tool.terminal import counted, refused, say
 
 _File = Annotated[Path, typer.Argument(metavar="FILE", help="The policy", show_default=False)]
 

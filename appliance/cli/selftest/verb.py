@@ -13,12 +13,13 @@ from rich.table import Table
 from rich.text import Text
 
 from appliance.cli.admin_client import ADMIN_SOCKET, AdminSocket
-from appliance.cli.output import counted, printable, say_json
+from appliance.cli.output import say_json
 from appliance.cli.selftest.selftest_findings import Found, fail
 from appliance.cli.tables import say_table
 from appliance.cli.target import Appliance, speaks
 from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings, load_resolved
+from rosmop.tool.terminal import counted, printable
 
 _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 

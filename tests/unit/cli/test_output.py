@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from appliance.cli.output import counted, moment, printable, say, say_json, usage_error
+from appliance.cli.output import moment, say_json, usage_error
+from rosmop.tool.terminal import counted, printable, say
 
 
 def test_control_characters_never_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:

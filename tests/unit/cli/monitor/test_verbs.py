@@ -131,7 +131,7 @@ def test_what_is_proved_is_said_of_every_event(tmp_path: Path) -> None:
 
 def test_proving_without_the_prover(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exit status 2, with what to install, before anything is judged."""
-    monkeypatch.setattr("appliance.cli.monitor.verbs.find_spec", lambda name: None)
+    monkeypatch.setattr("rosmop.tool.check_command.find_spec", lambda name: None)
     result = invoke("check", write(tmp_path, "a.rv", PROVED), "--prove")
     assert (result.exit_code, result.stdout) == (2, "")
     assert "--prove needs the package z3-solver: pip install 'rosrv-appliance[prove]'" in result.stderr

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-from appliance.audit.why import lines_of_why
-from appliance.cli.output import say, say_json
 from rosmop.form.positions import Finding
 from rosmop.run.explanations import why_of
 from rosmop.run.monitor import Monitor
 from rosmop.run.outcomes import Fault, Outcome, Verdict, bound
+from rosmop.run.why_text import lines_of_why
+from rosmop.tool.terminal import say, say_json
 
 BILLION = 1_000_000_000
 

@@ -1,14 +1,14 @@
-"""What `rosrv monitor check --prove` says: of each event on a topic or service, whether its module is proved right."""
+"""Report the proofs of the events: for each, whether its code does what the event means."""
 
 import time
 
-from appliance.cli.output import say, say_json
 from rosmop.prove.equality import findings_of
 from rosmop.run.engine import MonitorSet
+from rosmop.tool.terminal import say, say_json
 
 
 def say_proofs(monitors: MonitorSet, *, as_json: bool) -> int:
-    """Write them; how many events' code does something else than the event means."""
+    """Write the proofs; return for how many events the code differs from the meaning."""
     different = 0
     for found in findings_of(monitors.compiled, time.monotonic):
         different += found.differs

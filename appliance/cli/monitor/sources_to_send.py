@@ -1,0 +1,59 @@
+"""Read specifications and message definitions to send them to the appliance."""
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from appliance.cli.monitor.monitor_program import MONITOR
+from appliance.specifications.specification_files import Sources, signatures_of
+from rosmop.form.positions import Position
+from rosmop.text.errors import SpecificationError
+from rosmop.tool.specification_input import definition_folders, definition_texts, read_specifications
+
+_NOT_UTF_8 = re.compile("[\udc80-\udcff]")
+_SAVE_AS_UTF_8 = "these bytes are no UTF-8; save the file as UTF-8"
+_STRING_CONSTANT = re.compile(r"\s*string\s+\w+\s*=")  # whose value goes to the end of the line
+
+
+def read_to_send(files: Sequence[Path], folders: Sequence[Path]) -> Sources:
+    """Specifications by the names that the appliance knows them by, and the definitions for them, as files.
+
+    The same files are taken and refused as by `read_specifications` and `read_definitions`; what the definitions say is
+    judged where they are sent to. Raises `SpecificationError`.
+    """
+    named: dict[str, Path] = {}
+    for file in files:
+        other = named.setdefault(file.name, file)
+        if os.path.realpath(other) != os.path.realpath(file):
+            raise MONITOR.usage_error(
+                f"{other} and {file} have one name, and the appliance knows specifications by the names of their "
+                "files: load them under different names"
+            )
+    definitions: dict[str, str] = {}
+    for folder in definition_folders(MONITOR, files, folders):
+        texts, places = definition_texts(MONITOR, folder)
+        definitions |= {name: _sendable(text, places[name]) for name, text in texts.items()}
+        named |= {name: Path(places[name]) for name in texts}
+    texts = read_specifications(MONITOR, files)
+    for path, text in texts.items():
+        found = _NOT_UTF_8.search(text)
+        if found is not None:
+            line = text.count("\n", 0, found.start()) + 1
+            column = found.start() - text.rfind("\n", 0, found.start())
+            raise SpecificationError.at(Position(path, line, column), _SAVE_AS_UTF_8)
+    sent = {Path(path).name: text for path, text in texts.items()}
+    return Sources(sent, definitions, signatures_of(named))
+
+
+def _sendable(text: str, place: str) -> str:
+    """The same in UTF-8. Old definitions have comments in other encodings, which mean nothing; all else would."""
+    lines = text.split("\n")
+    for number, line in enumerate(lines):
+        if line.isascii() or not _NOT_UTF_8.search(line):
+            continue
+        said = line if _STRING_CONSTANT.match(line) else line.partition("#")[0]
+        if _NOT_UTF_8.search(said):
+            raise SpecificationError.at(Position(place, number + 1, 1), _SAVE_AS_UTF_8)
+        lines[number] = _NOT_UTF_8.sub("\N{REPLACEMENT CHARACTER}", line)
+    return "\n".join(lines)

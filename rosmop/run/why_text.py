@@ -1,0 +1,49 @@
+"""The events of an explanation (`explanations.why_of`), a line for each, for people."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+
+def lines_of_why(why: Mapping[str, Any]) -> Iterator[str]:
+    """The events of an explanation, and how far they explain it."""
+    events = list_of(why.get("events"))
+    if not why:
+        return
+    if not events:
+        yield "because: no event was needed: time has passed"
+    between = why.get("left_out")
+    for number, event in enumerate(events):
+        if between and number == len(events) // 2:
+            yield f"because: … {between} more …"
+        yield f"because: {named(mapping_of(event))}"
+    if "since" in why:
+        yield (
+            f"but: this is enough only for the property as it was at {why['since']}; what came before is not kept"
+        )
+    if why.get("fewest") is False:
+        yield "but: fewer of them might do"
+    for part in list_of(why.get("decided")):
+        yield f"so: {part}"
+
+
+def named(event: Mapping[str, Any]) -> str:
+    """One event: what, when, whose message, and the state that it led to."""
+    index = f" #{event['index']}" if "index" in event else ""
+    seq = f" seq {event['seq']}" if "seq" in event else ""
+    who = "".join(
+        f", {word} {event[name]}"
+        for name, word in (("on", "on"), ("node", "by"), ("host", "on"))
+        if event.get(name)
+    )
+    state = f" -> {event['state']}" if event.get("state") else ""
+    return f"{event.get('event')}{index} at {event.get('time')}{who}{seq}{state}"
+
+
+def mapping_of(value: object) -> Mapping[str, Any]:
+    """Return the value if it is a mapping, else an empty one."""
+    return value if isinstance(value, dict) else {}
+
+
+def list_of(value: object) -> list[Any]:
+    """Return the value if it is a list, else an empty one."""
+    return value if isinstance(value, list) else []

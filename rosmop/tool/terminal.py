@@ -1,0 +1,45 @@
+"""Write lines: coloured on a terminal, plain otherwise, JSON when asked for.
+
+Strings from files and messages never reach a terminal with control characters in them, and are never read as markup.
+"""
+
+import json
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.text import Text
+
+
+def printable(text: str) -> str:
+    """Return the text with everything that a terminal could act on escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def counted(number: int, noun: str) -> str:
+    """Return `1 error`, `2 errors`."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def refused(findings: Iterable[object]) -> typer.Exit:
+    """Write the errors of a text, one on each line; raise the result (exit status 1)."""
+    for finding in findings:
+        typer.echo(printable(str(finding)), err=True)
+    return typer.Exit(1)
+
+
+def say(line: str, style: str = "") -> None:
+    """Write one line to standard output."""
+    shown = printable(line)
+    if sys.stdout.isatty():
+        Console(highlight=False, soft_wrap=True).print(Text(shown, style=style))
+    else:
+        sys.stdout.write(shown + "\n")
+
+
+def say_json(fields: Any) -> None:
+    """Write one object on one line to standard output."""
+    sys.stdout.write(json.dumps(msgspec.to_builtins(fields)) + "\n")
