@@ -1,7 +1,7 @@
 """Every finite thing that hosts can use up: how much there is, each one's share, and what happens at the limit.
 
 `SHARES` is the one list that docs/shares.md is generated from (`python -m distribution.shares_page`). Each row names
-the tests that attack it; `tests/unit/shares/test_table.py` holds that they exist. A row has a name here, and whoever
+the tests that attack it; `tests/unit/quotas/test_table.py` holds that they exist. A row has a name here, and whoever
 makes the pool takes its bounds from the row (`Pool("connections", RVMASTER_CONNECTIONS.bounds, …)`), so the page cannot
 differ from the code.
 """
@@ -51,7 +51,7 @@ RVMASTER_BYTES = Share(
     "`limit exceeded`",
     (
         "integration/master/test_shares.py::test_requests_of_two_hundred_addresses",
-        "unit/rpc/test_visitors.py::test_bytes_are_freed_by_the_host_that_holds_most",
+        "unit/rpc/test_connection_table.py::test_bytes_are_freed_by_the_host_that_holds_most",
     ),
 )
 RVMASTER_FAREWELLS = Share(
@@ -59,7 +59,7 @@ RVMASTER_FAREWELLS = Share(
     Bounds(whole=256, host=8, strangers=64, kept=64),
     "closed without a word",
     "`limit exceeded`",
-    ("unit/rpc/test_visitors.py::test_connections_turned_away_in_all",),
+    ("unit/rpc/test_connection_table.py::test_connections_turned_away_in_all",),
 )
 RVMASTER_REQUESTS = Share(
     "requests that RVMaster and faces serve at once",
@@ -69,7 +69,7 @@ RVMASTER_REQUESTS = Share(
     "none: nothing is refused",
     (
         "integration/master/test_shares.py::test_requests_of_two_hundred_addresses",
-        "unit/rpc/test_turns.py::test_requests_of_many_guests_leave_slots_for_the_robot",
+        "unit/rpc/test_fair_queue.py::test_requests_of_many_guests_leave_slots_for_the_robot",
     ),
 )
 RVMASTER_TIME = Share(
@@ -109,14 +109,14 @@ PROBES = Share(
     Bounds(whole=64, host=16, strangers=8, kept=24),
     "the node is asked when it is its host's turn",
     "none: nothing is refused",
-    ("unit/master/upkeep/test_liveness.py::test_silent_nodes_of_a_host_delay_no_look_at_anothers",),
+    ("unit/master/reconcile/test_liveness.py::test_silent_nodes_of_a_host_delay_no_look_at_anothers",),
 )
 NODE_CALLS_UNDER_WAY = Share(
     "calls that are being made to nodes for ROSMaster",
     Bounds(whole=512, host=128, strangers=64, kept=192),
     "the node is told when it is its host's turn",
     "none: nothing is refused",
-    ("unit/master/reach/test_delivery.py::test_silent_nodes_of_a_host_delay_no_call_to_anothers",),
+    ("unit/master/endpoints/test_delivery.py::test_silent_nodes_of_a_host_delay_no_call_to_anothers",),
 )
 QUEUED_NODE_CALLS = Share(
     "bytes of calls that wait for nodes",
@@ -124,7 +124,7 @@ QUEUED_NODE_CALLS = Share(
     "the host that has most loses the oldest call to the node that has most of it; the node is told how things"
     " are once it answers",
     "the process log; the node is looked at",
-    ("unit/master/reach/test_delivery.py::test_a_host_loses_only_calls_of_its_own",),
+    ("unit/master/endpoints/test_delivery.py::test_a_host_loses_only_calls_of_its_own",),
 )
 RELAY_FRAMES = Share(
     "bytes of unfinished messages in one relay",
@@ -173,7 +173,7 @@ RELAY_HEADERS = Share(
     "`connection refused`; `rosrv_relay_memory_bytes`",
     (
         "unit/relay/test_shares.py::test_headers_of_strangers_leave_room_for_the_robots",
-        "unit/relay/connections/test_anteroom.py::test_long_headers_make_room_for_short_ones",
+        "unit/relay/connections/test_pending_connections.py::test_long_headers_make_room_for_short_ones",
     ),
 )
 RELAY_TURN = Share(
@@ -190,8 +190,8 @@ RELAY_TURN = Share(
         "unit/relay/test_loop.py::test_a_host_with_thousands_of_descriptors_gets_no_more_than_one_with_one",
         "unit/relay/test_loop.py::test_costly_messages_of_many_hosts_never_come_in_a_row",
         "unit/relay/test_loop.py::test_all_unknown_hosts_together_are_one_payer",
-        "unit/relay/test_engine.py::test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time",
-        "unit/relay/test_grants.py::test_hosts_that_only_everybody_names_pay_as_one",
+        "unit/relay/test_relay.py::test_a_topic_with_many_subscribers_is_delivered_a_quantum_at_a_time",
+        "unit/relay/test_granted.py::test_hosts_that_only_everybody_names_pay_as_one",
     ),
 )
 LIMITED_TOPIC = Share(
@@ -202,9 +202,9 @@ LIMITED_TOPIC = Share(
     " its limit as a publisher in the same way",
     "`rate limited`; `rosrv_relay_limited_total`",
     (
-        "unit/relay/connections/test_flow.py::test_a_host_within_its_part_loses_nothing_because_of_others",
-        "unit/relay/connections/test_flow.py::test_names_of_a_host_share_its_limit",
-        "unit/relay/test_engine.py::test_a_limit_counts_hosts_and_not_node_names",
+        "unit/relay/connections/test_rate_limit.py::test_a_host_within_its_part_loses_nothing_because_of_others",
+        "unit/relay/connections/test_rate_limit.py::test_names_of_a_host_share_its_limit",
+        "unit/relay/test_relay.py::test_a_limit_counts_hosts_and_not_node_names",
     ),
     setting="[Limits] of the policy",
 )
@@ -217,9 +217,9 @@ RELAY_MESSAGE = Share(
     " turn",
     "`monitor fault`",
     (
-        "unit/relay/monitors/test_middle.py::test_a_message_that_takes_longer_than_the_budget_is_a_fault",
-        "unit/relay/monitors/test_middle.py::test_hosts_that_the_policy_does_not_name_have_one_pace",
-        "unit/relay/monitors/test_middle.py::test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn",
+        "unit/relay/monitors/test_interceptor.py::test_a_message_that_takes_longer_than_the_budget_is_a_fault",
+        "unit/relay/monitors/test_interceptor.py::test_hosts_that_the_policy_does_not_name_have_one_pace",
+        "unit/relay/monitors/test_interceptor.py::test_messages_that_do_not_fit_into_a_quantum_are_left_for_the_next_turn",
         "rosmop/tests/test_budget.py::test_every_walk_of_a_message_ends_with_its_time",
     ),
     setting="relay.budget (milliseconds)",
@@ -245,10 +245,10 @@ RECORDER_DISK = Share(
     " an hour by each kind of trigger, and two hosts but the robot are recorded at once",
     "`recording removed`, `recording missed`; `detail.not_recorded` of the record",
     (
-        "unit/recorder/test_shelf.py::test_a_guest_makes_room_from_its_own",
-        "unit/recorder/test_shelf.py::test_no_guest_displaces_a_recording_of_the_robot",
-        "unit/recorder/test_plan.py::test_a_guests_flood_leaves_the_robot_its_recording",
-        "unit/recorder/test_plan.py::test_unknown_hosts_are_one",
+        "unit/recorder/test_recording_store.py::test_a_guest_makes_room_from_its_own",
+        "unit/recorder/test_recording_store.py::test_no_guest_displaces_a_recording_of_the_robot",
+        "unit/recorder/test_recording_plan.py::test_a_guests_flood_leaves_the_robot_its_recording",
+        "unit/recorder/test_recording_plan.py::test_unknown_hosts_are_one",
         "unit/recorder/test_recorder.py::test_a_flood_of_triggers_fills_no_disk",
     ),
     setting="recorder.disk (one recording has an eighth of it)",
@@ -261,8 +261,8 @@ DRY_RUNS = Share(
     "`rest call` with status 422 or 503",
     (
         "unit/compiler/test_process.py::test_nested_repetitions_end_with_the_budget_of_a_dry_run",
-        "unit/specifications/test_compiler.py::test_an_order_ends_a_dry_run",
-        "unit/specifications/test_monitors.py::test_a_client_has_one_dry_run_at_a_time",
+        "unit/specifications/test_compiler_link.py::test_an_order_ends_a_dry_run",
+        "unit/specifications/test_specifications.py::test_a_client_has_one_dry_run_at_a_time",
     ),
 )
 SLICES = Share(
@@ -359,7 +359,7 @@ AUDIT_RESERVE = Share(
     "`disk nearly full`; `rosrv status`",
     (
         "unit/audit/test_budget.py::test_the_last_of_the_disk_is_for_hosts_with_a_registration",
-        "unit/audit/test_room.py::test_a_disk_that_fills_is_told_before_it_is_full",
+        "unit/audit/test_disk_space.py::test_a_disk_that_fills_is_told_before_it_is_full",
     ),
     setting="audit.reserve_bytes",
 )
@@ -371,7 +371,7 @@ NODE_PORTS = Share(
     "the refused call's record",
     (
         "integration/master/test_shares.py::test_ports_and_names",
-        "unit/master/reach/test_places.py::test_no_host_takes_all_ports",
+        "unit/master/endpoints/test_endpoint_addresses.py::test_no_host_takes_all_ports",
     ),
     setting="[Ports] range of the policy",
 )
@@ -392,7 +392,7 @@ GRANTS = Share(
     Bounds(whole=200_000, host=20_000, strangers=0, kept=0),
     "the host, or of all hosts that with most, loses its oldest grants that nobody is connected by",
     "none: a node that asks again gets it again",
-    ("unit/master/reach/test_relays.py::test_grants_of_all_hosts_are_bounded",),
+    ("unit/master/endpoints/test_relay_control.py::test_grants_of_all_hosts_are_bounded",),
 )
 IKE_HANDSHAKES = Share(
     "IKE handshakes under way (a host is an address; nobody is known before his handshake)",
@@ -407,7 +407,7 @@ DESCRIPTORS = Share(
     "never reached: where the system allows fewer, connections have no more than half of them, and those above it are"
     " told so as above any other share",
     "none",
-    ("unit/shares/test_descriptors.py::test_all_shares_together_fit_the_descriptors",),
+    ("unit/quotas/test_descriptors.py::test_all_shares_together_fit_the_descriptors",),
     setting="the system's limit (nofile)",
 )
 

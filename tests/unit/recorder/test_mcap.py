@@ -7,7 +7,7 @@ from rosbags.rosbag2.storage_mcap import McapReader
 
 from appliance.recorder.bag_writer import BagWriter, Message
 from appliance.recorder.mcap import as_mcap
-from tests.unit.recorder.test_bag import HEADER, SECOND, body
+from tests.unit.recorder.test_bag_writer import HEADER, SECOND, body
 
 
 def read(path: Path, bag: Path) -> tuple[list[tuple[str, str, int]], list[tuple[str, int, bytes]]]:

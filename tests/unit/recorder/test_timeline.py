@@ -10,7 +10,7 @@ from appliance.channel.answers.recording_answers import Recording, Sender
 from appliance.recorder.bag_reader import BagReader, Place
 from appliance.recorder.bag_writer import BagWriter, Message
 from appliance.recorder.timeline import MOST_EVENTS, messages_around, timeline
-from tests.unit.recorder.test_bag import HEADER, SECOND, body
+from tests.unit.recorder.test_bag_writer import HEADER, SECOND, body
 
 BEGAN = 100 * SECOND
 RECORDING = Recording(

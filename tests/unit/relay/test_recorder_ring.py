@@ -12,7 +12,7 @@ from appliance.recorder.never import known_sums
 from appliance.recorder.ring import SMALLEST
 from appliance.recorder.ring_reader import RingReader
 from appliance.relay.recorder_ring import Recorded
-from tests.unit.relay.connections.test_topic import HEADER, Story, batch
+from tests.unit.relay.connections.test_relayed_topic import HEADER, Story, batch
 
 EVER = 0, 1 << 63
 

@@ -1,4 +1,4 @@
-"""Whether a subscriber's type fits a publisher's (the rest of a subscriber's life is told in test_engine)."""
+"""Whether a subscriber's type fits a publisher's (the rest of a subscriber's life is told in test_relay)."""
 
 import pytest
 

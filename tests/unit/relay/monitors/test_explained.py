@@ -24,7 +24,7 @@ from rosmop.run.explanations import moment
 from rosmop.tests.acting import message
 from rosmop.tests.random_specifications import Traffic, definitions
 from tests.support.idle import idle_class
-from tests.unit.relay.monitors.test_passage import Monitored
+from tests.unit.relay.monitors.test_batch import Monitored
 
 MS = 1_000_000
 START = time.time_ns() + 3_600_000 * MS

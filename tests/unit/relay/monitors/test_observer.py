@@ -11,7 +11,7 @@ from appliance.relay.monitors import observations
 from appliance.relay.monitors.observation_points import Place
 from rosmop.tests.acting import message
 from rosmop.tests.random_specifications import Traffic, definitions
-from tests.unit.relay.monitors.test_passage import Monitored
+from tests.unit.relay.monitors.test_batch import Monitored
 
 COMMAND = "geometry_msgs/Twist"
 STOP = """stop() { std_msgs::String s; event drive(double v) /cmd geometry_msgs/Twist '{linear:{x:v}}' {

@@ -15,7 +15,7 @@ from appliance.channel.messages import (
 from appliance.relay.monitors import shadow
 from roswire.tcpros import encode_frame, encode_header, encode_service_reply
 from tests.support.stated import stated
-from tests.unit.relay.monitors.test_middle import (
+from tests.unit.relay.monitors.test_interceptor import (
     GUARD,
     TYPED,
     WANTED,

@@ -9,8 +9,8 @@ from appliance.relay.monitors.margin_counts import Margins
 from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from roswire.standard import standard_definitions
-from tests.unit.relay.monitors.test_middle import string
-from tests.unit.relay.monitors.test_trials import Trying
+from tests.unit.relay.monitors.test_interceptor import string
+from tests.unit.relay.monitors.test_shadow import Trying
 
 NEAR = """
 near() {

@@ -18,7 +18,7 @@ from appliance.channel.answers.recording_answers import Recording
 from appliance.recorder.bag_writer import BagWriter, Message
 from appliance.recorder.mcap import as_mcap
 from tests.support.answers import example
-from tests.unit.recorder.test_bag import HEADER, SECOND, body
+from tests.unit.recorder.test_bag_writer import HEADER, SECOND, body
 
 _EVE = Bearer("eve", "eve", "investigator", 1e12, "shown")
 

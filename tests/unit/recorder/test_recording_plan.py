@@ -11,7 +11,7 @@ from appliance.audit.record import Severity
 from appliance.channel.answers.recording_answers import OPERATORS, ROBOT, UNKNOWN, TriggerKind
 from appliance.configuration.settings import RecorderRules
 from appliance.recorder.recording_plan import HourlyLimit, RecordingPlan, span
-from tests.unit.recorder.test_shelf import SECOND, recording
+from tests.unit.recorder.test_recording_store import SECOND, recording
 
 NOW = 10_000 * SECOND
 HOUR = 3600 * SECOND

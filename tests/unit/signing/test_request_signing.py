@@ -115,7 +115,7 @@ def test_what_is_no_proof_is_told(header: str) -> None:
 
 def test_the_page_shows_what_a_script_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """The example of docs/rest.md makes the reading key and the proof of the vectors."""
-    page = (Path(__file__).parents[2] / "docs" / "rest.md").read_text()
+    page = (Path(__file__).parents[3] / "docs" / "rest.md").read_text()
     [example] = [block.partition("```")[0] for block in page.split("```python\n")[1:]]
     monkeypatch.setenv("ROSRV_TOKEN", TOKEN)
     names: dict[str, Any] = {}
