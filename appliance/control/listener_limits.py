@@ -49,6 +49,7 @@ class Doors:
             connections=RVMASTER_CONNECTIONS.bounds.sized(
                 connections_within(limits.connections), limits.connections_per_host
             ),
+            standing_of_arrivals=partial(standing_of_arrival, policy, standing),
         )
         self.turns = Turns(RVMASTER_REQUESTS.bounds, standing, lambda host: policy().alike(host), trail.pause)
         self.time = ProcessorTime(partial(class_of, policy, standing))
@@ -154,6 +155,17 @@ def class_of(policy: Callable[[], Policy], standing: Callable[[Address], Standin
     if host.is_loopback or policy().names(host):
         return policy().alike(host)
     return _ANYBODY if standing(host) is Standing.REGISTERED else _UNKNOWN
+
+
+def standing_of_arrival(
+    policy: Callable[[], Policy], standing: Callable[[Address], Standing], host: Address
+) -> Standing:
+    """Return a host's standing for connections that wait to be opened.
+
+    Hosts that only `*` names and that have no registration count as strangers: all of them wait in one class of
+    processor time, so their connections must not use the places of hosts that the policy names.
+    """
+    return Standing.STRANGER if class_of(policy, standing, host) == _UNKNOWN else standing(host)
 
 
 # The appliance's own nodes and the ROS Master come from one address, and nobody else reaches those listeners.

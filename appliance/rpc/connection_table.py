@@ -64,7 +64,10 @@ def _of_ros(_standing: Standing, stage: Stage, own: bool) -> float:
 
 
 class Visitors(Generic[Holder]):
-    """All connections of every listener that shares it, by host. `standing` says what is known of a host now."""
+    """All connections of every listener that shares it, by host. `standing` says what is known of a host now.
+
+    `standing_of_arrivals` counts connections that wait to be opened (None: the same).
+    """
 
     def __init__(
         self,
@@ -74,6 +77,7 @@ class Visitors(Generic[Holder]):
         held: Bounds = RVMASTER_BYTES.bounds,
         farewells: Bounds = RVMASTER_FAREWELLS.bounds,
         arriving: Bounds = RVMASTER_ARRIVALS.bounds,
+        standing_of_arrivals: Callable[[Holder], Standing] | None = None,
         patience: Patience = _of_ros,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -83,7 +87,9 @@ class Visitors(Generic[Holder]):
         self.connected: Pool[Holder] = Pool("connections open", connections, standing)
         self.held: Pool[Holder] = Pool("bytes in requests and answers under way", held, standing)
         self.farewells: Pool[Holder] = Pool("connections that are turned away", farewells, standing)
-        self.arriving: Pool[Holder] = Pool("connections that wait to be opened", arriving, standing)
+        self.arriving: Pool[Holder] = Pool(
+            "connections that wait to be opened", arriving, standing_of_arrivals or standing
+        )
         self._of: dict[Connection, tuple[Holder, Pool[Holder]]] = {}
         self._queues: dict[Stage, Queue[Holder, Connection]] = {stage: Queue(standing) for stage in Stage}
         self._stages: dict[Connection, Stage] = {}

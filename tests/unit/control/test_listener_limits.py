@@ -63,3 +63,25 @@ def test_hosts_that_only_everybody_names_share_processor_time_as_one() -> None:
     assert len({kind(f"10.9.1.{number}") for number in range(200)}) == 1
     assert len({kind(text) for text in ("10.0.0.1", "10.1.0.1", "10.9.0.7", "10.9.1.1", "127.0.0.1")}) == 5
     assert kind("10.1.0.1") == kind("10.1.255.9")
+
+
+def test_hosts_that_only_everybody_names_fill_no_place_of_a_named_host(tmp_path: Path) -> None:
+    """Two hundred hosts of `*` connect without end: a named host's connection may wait, before it has a registration.
+
+    A host of `*` with a registration has its place too.
+    """
+    policy = compile_policy("[Nodes]\ndefault = 10.0.0.1\n/guest/** = *\n", file="a.ini")
+    robot, registered = address_of("10.0.0.1"), address_of("10.9.0.7")
+    standing = {registered: Standing.REGISTERED}
+    log = AuditLog(tmp_path / "audit.db")
+    trail = AuditTrail(log, strict=False, deny_when_failed=False, recordings=lambda *_: {})
+    doors = Doors(Settings(), trail, lambda: policy, lambda host: standing.get(host, Standing.NAMED))
+    arriving = doors.visitors.arriving
+    for number in range(200):
+        for _ in range(20):
+            arriving.take(address_of(f"10.9.1.{number}"))
+    assert arriving.total == arriving.bounds.strangers
+    assert arriving.take(address_of("10.9.1.1"))
+    assert not arriving.take(robot)
+    assert not arriving.take(registered)
+    log.close()
