@@ -7,8 +7,8 @@ needs for that is its *bulk*: there is room for the bulk of `AT_ONCE` requests, 
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine
-from typing import Any, ParamSpec, Self, TypeVar
+from collections.abc import AsyncIterator, Callable
+from typing import ParamSpec, Self, TypeVar
 
 from appliance.policy.model import Address
 from appliance.quotas.pool import Bounds, Standing
@@ -71,10 +71,6 @@ class Bulk:
             return await asyncio.to_thread(measured)
         finally:
             self._processor.charge_beside(self._host, used)
-
-    async def beside(self, work: Coroutine[Any, Any, T]) -> T:
-        """Carry out work for the request in a task of its own."""
-        return await self._processor.spend(self._host, work)
 
     def give_back(self) -> None:
         """Make room for others."""

@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "architecture.md").read_text()
 SECTION = PAGE.split("\n## The kernel", 1)[1].split("\n## ", 1)[0]
 SIZES = {path: int(lines) for path, lines in re.findall(r"`([\w/]+\.py)` (\d+)", SECTION)}
-BUDGET = 15_600  # the goal is 10,000: lower it with the kernel, and never raise it
+BUDGET = 15_550  # the goal is 10,000: lower it with the kernel, and never raise it
 
 # The modules of the appliance outside the kernel that the kernel imports.
 OUTSIDE = frozenset(

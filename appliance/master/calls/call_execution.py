@@ -11,9 +11,8 @@
 What goes wrong on the way is an answer of the right shape for the caller, and a record; never an exception.
 """
 
-import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -111,13 +110,10 @@ class Execution:
                 outcome = self._settled(attempt)
             return await self._carry_out(visit, attempt, outcome)
 
-    async def answer_run(
-        self, visit: Visit, run: Sequence[Attempt], recorded: asyncio.Event, before: Awaitable[object] | None
-    ) -> list[Value]:
+    async def answer_run(self, visit: Visit, run: Sequence[Attempt]) -> list[Value]:
         """Decide calls that read and write parameters one by one, and carry them out in their order.
 
-        No call of the run reads what one before it writes, so reads are carried out first. `recorded` is set when all
-        are decided; writes of the run `before`, which touch no key of this one, are carried out before its own.
+        No call of the run reads what one before it writes, so reads are carried out first.
         """
         if sum(map(self.parameters.weight_of_answer, run)) >= self.large:
             await visit.bulk.take()
@@ -128,14 +124,14 @@ class Execution:
             if look.allowed and attempt.call.verb is Verb.WRITE
         ]
         if not writing:
-            return await self._carry_out_run(visit, run, looks, recorded, before)
+            return await self._carry_out_run(visit, run, looks)
         async with self._turn(writing) as later:
             if later:
                 looks = [
                     self._settled(attempt) if look.allowed else look
                     for attempt, look in zip(run, looks, strict=True)
                 ]
-            return await self._carry_out_run(visit, run, looks, recorded, before)
+            return await self._carry_out_run(visit, run, looks)
 
     @contextlib.asynccontextmanager
     async def _turn(self, attempts: Sequence[Attempt]) -> AsyncIterator[bool]:
@@ -164,12 +160,7 @@ class Execution:
         return answer
 
     async def _carry_out_run(
-        self,
-        visit: Visit,
-        run: Sequence[Attempt],
-        decisions: Sequence[Decision],
-        recorded: asyncio.Event,
-        before: Awaitable[object] | None,
+        self, visit: Visit, run: Sequence[Attempt], decisions: Sequence[Decision]
     ) -> list[Value]:
         policy, version = self.policy(), self.registry.version
         answers: list[Value] = [
@@ -186,10 +177,7 @@ class Execution:
                 writes.append(place)
             else:
                 answers[place] = await self._perform(visit, attempt)
-        recorded.set()
         wanted = [run[place] for place in writes]
-        if before is not None:
-            await before
         outcomes: Sequence[Value | Exception]
         stands = self.policy() is policy and not self.trail.obstacle
         if stands and self.registry.version != version:  # another host may hold the caller's name now
@@ -198,9 +186,9 @@ class Execution:
             outcomes = await self.parameters.write(
                 [Write(one.caller, one.resource, one.value) for one in wanted]
             )
-        else:  # what was decided ahead counts no more
+        else:  # it changed while a read waited for ROSMaster, or records for the disk
             looks = [self._settled(one) for one in wanted]
-            outcomes = await self._carry_out_run(visit, wanted, looks, recorded, None)
+            outcomes = await self._carry_out_run(visit, wanted, looks)
         for place, outcome in zip(writes, outcomes, strict=True):
             answers[place] = self._failed(run[place], outcome) if isinstance(outcome, Exception) else outcome
         return answers

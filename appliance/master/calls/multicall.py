@@ -2,16 +2,14 @@
 
 Roslaunch clears and sets parameters in one multicall, and the order is what counts. Calls that read and write
 parameters and follow each other are a *run*: each is decided and recorded by itself, they wait for the disk and for
-ROSMaster once. A read of what a run writes begins the next. A run of writes is decided and recorded while ROSMaster
-carries out the one before, unless it touches what that writes; ROSMaster has it when that has ended. Everything else
-waits for the part before it. After each run, and after each other part, other hosts may have their turn.
+ROSMaster once. A read of what a run writes begins the next. Every run, and every other part, waits for the one before
+it; after each, other hosts may have their turn.
 """
 
 import asyncio
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from appliance.master.calls.call import Attempt, Verb, with_record
 from appliance.master.calls.call_execution import Execution, Visit
@@ -49,29 +47,15 @@ class Multicall:
         left: _Parts = deque(params[0])
         results: list[Value] = []
         room = self.parameters.mirror.bytes_limit
-        before: _UnderWay | None = None
-        async with asyncio.TaskGroup() as group:
-            while left and not (why := await self._why_no_more(visit, room)):
-                answers: list[Value] = []
-                run = await self._run(visit, left, room) if _in_run(visit, left[0]) else None
-                if before is not None and (run is None or not run.goes_beside(before.run)):
-                    answers, before = await before.answers(), None
-                if run is None:
-                    answers.append(await self._one(visit, left.popleft()))
-                elif run.reads or not (left or before):
-                    done = self.execution.answer_run(visit, run.attempts, run.recorded, None)
-                    answers += run.answered(await done)
-                else:
-                    after = None if before is None else before.task
-                    task = self.execution.answer_run(visit, run.attempts, run.recorded, after)
-                    following = _UnderWay(run, group.create_task(visit.bulk.beside(task)))
-                    await run.recorded.wait()
-                    answers += [] if before is None else await before.answers()
-                    before = following
-                room -= await self._weigh(visit, answers)
-                results += answers
-                await asyncio.sleep(0)  # others have their turn
-            results += [] if before is None else await before.answers()
+        while left and not (why := await self._why_no_more(visit, room)):
+            if _in_run(visit, left[0]):
+                run = await self._run(visit, left, room)
+                answers = run.answered(await self.execution.answer_run(visit, run.attempts))
+            else:
+                answers = [await self._one(visit, left.popleft())]
+            room -= await self._weigh(visit, answers)
+            results += answers
+            await asyncio.sleep(0)  # others have their turn
         if left:
             why = f"{why}; {len(left)} more parts are not carried out"
             return results + [self._fault(visit, LIMIT_FAULT, "limit exceeded", why)] * len(left)
@@ -145,38 +129,22 @@ class Multicall:
 
 @dataclass(slots=True)
 class _Run:
-    """Parts that are carried out together: their answers (None: that of an attempt), and when all are recorded."""
+    """Parts that are carried out together, and their answers (None: that of an attempt)."""
 
     answers: list[Value] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
     written: list[str] = field(default_factory=list)
     reads: bool = False
-    recorded: asyncio.Event = field(default_factory=asyncio.Event)
 
     @property
     def longest(self) -> int:
         """The number of parts that it may have."""
         return _LONGEST_READING if self.reads else _LONGEST_RUN
 
-    def goes_beside(self, before: "_Run") -> bool:
-        """Whether nothing that is decided or answered here depends on what ROSMaster makes of the run before."""
-        return not self.reads and not touch(self.written, before.written)
-
     def answered(self, attempts: Iterable[Value]) -> list[Value]:
         """All answers, with those of the attempts."""
         given = iter(attempts)
         return [[next(given)] if answer is None else answer for answer in self.answers]
-
-
-class _UnderWay(NamedTuple):
-    """A run that ROSMaster carries out."""
-
-    run: _Run
-    task: asyncio.Task[list[Value]]
-
-    async def answers(self) -> list[Value]:
-        """The answers, when all parts are carried out."""
-        return self.run.answered(await self.task)
 
 
 def _in_run(visit: Visit, part: "Value | Attempt") -> bool:
