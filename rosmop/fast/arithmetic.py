@@ -6,25 +6,80 @@ from rosmop.fast.abi import NOW
 from rosmop.fast.function_parts import Parts
 from rosmop.fast.memory_layout import NotScalarError, is_signed, machine_type
 from rosmop.fast.wasm import (
-    ABS,
-    CALCULATE,
-    COMPARE,
     ELSE,
     END,
     F32,
+    F32_ABS,
+    F32_CONVERT_I32_S,
+    F32_CONVERT_I32_U,
+    F32_CONVERT_I64_S,
+    F32_CONVERT_I64_U,
+    F32_DEMOTE_F64,
+    F32_NEG,
     F64,
+    F64_ABS,
+    F64_ADD,
+    F64_CONVERT_I32_S,
+    F64_CONVERT_I32_U,
+    F64_CONVERT_I64_S,
+    F64_CONVERT_I64_U,
+    F64_DIV,
+    F64_MUL,
+    F64_NEG,
+    F64_PROMOTE_F32,
     I32,
+    I32_AND,
+    I32_EQZ,
+    I32_EXTEND8_S,
+    I32_EXTEND16_S,
+    I32_OR,
+    I32_TRUNC_SAT_F64_S,
+    I32_TRUNC_SAT_F64_U,
+    I32_WRAP_I64,
     I64,
-    IF,
-    NEG,
+    I64_ADD,
+    I64_AND,
+    I64_DIV_S,
+    I64_DIV_U,
+    I64_EQZ,
+    I64_EXTEND_I32_S,
+    I64_EXTEND_I32_U,
+    I64_GT_S,
+    I64_GT_U,
+    I64_LT_S,
+    I64_LT_U,
+    I64_MUL,
+    I64_OR,
+    I64_REM_S,
+    I64_REM_U,
+    I64_SHL,
+    I64_SUB,
+    I64_TRUNC_SAT_F64_S,
+    I64_TRUNC_SAT_F64_U,
     SELECT,
+    calculate,
+    compare,
     constant,
+    if_result,
+    load,
 )
 from rosmop.form import nodes
 from rosmop.runtime import times
 from rosmop.runtime.times import BILLION
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
+
+_ABS, _NEG = {F32: F32_ABS, F64: F64_ABS}, {F32: F32_NEG, F64: F64_NEG}
+_TRUNCATE = {
+    (32, True): I32_TRUNC_SAT_F64_S, (32, False): I32_TRUNC_SAT_F64_U,
+    (64, True): I64_TRUNC_SAT_F64_S, (64, False): I64_TRUNC_SAT_F64_U,
+}  # fmt: skip
+_CONVERT = {
+    (F32, I32, True): F32_CONVERT_I32_S, (F32, I32, False): F32_CONVERT_I32_U,
+    (F32, I64, True): F32_CONVERT_I64_S, (F32, I64, False): F32_CONVERT_I64_U,
+    (F64, I32, True): F64_CONVERT_I32_S, (F64, I32, False): F64_CONVERT_I32_U,
+    (F64, I64, True): F64_CONVERT_I64_S, (F64, I64, False): F64_CONVERT_I64_U,
+}  # fmt: skip
 
 
 class Arithmetic(Parts):
@@ -41,89 +96,83 @@ class Arithmetic(Parts):
         return constant(machine_type(node.type), 0)
 
     def _now(self, _node: nodes.Now) -> bytes:
-        return self._cell(0x29, NOW)
+        return load(I64, NOW)
 
     def _convert(self, node: nodes.Convert) -> bytes:
         code, source, target = self._value(node.value), node.value.type, node.type
         one, other = machine_type(source), machine_type(target)
         if isinstance(target, value_types.Bool):
-            return code + constant(one, 0) + bytes((COMPARE[one]["!="],))
+            return code + constant(one, 0) + compare(one, "!=")
         if isinstance(target, value_types.Floating):
             return code + to_floating(one, other, signed=is_signed(source))
         assert isinstance(target, value_types.Integer)  # noqa: S101  numbers are one of the three
         if isinstance(source, value_types.Floating):
-            return self._truncated(code + (b"\xbb" if one == F32 else b""), target)
+            return self._truncated(code + (F64_PROMOTE_F32 if one == F32 else b""), target)
         if one == other:
             return code + _narrowed(target)
         if other == I64:
-            return code + (b"\xac" if is_signed(source) else b"\xad")
-        return code + b"\xa7" + _narrowed(target)
+            return code + (I64_EXTEND_I32_S if is_signed(source) else I64_EXTEND_I32_U)
+        return code + I32_WRAP_I64 + _narrowed(target)
 
     def _truncated(self, code: bytes, target: value_types.Integer) -> bytes:
         """A double toward zero, at most the limits."""
         if target.bits >= 32:
-            wide = 4 if target.bits == 64 else 0
-            return code + b"\xfc" + bytes((2 + wide + (not target.signed),))
-        code += b"\xfc\x02" + self._set("cut")
+            return code + _TRUNCATE[64 if target.bits == 64 else 32, target.signed]
+        code += I32_TRUNC_SAT_F64_S + self._set("cut")
         for limit, operator in ((target.least, "<"), (target.most, ">")):
             limited, value = constant(I32, limit), self._get("cut")
-            test = value + limited + bytes((COMPARE[I32][operator],))
+            test = value + limited + compare(I32, operator)
             code += limited + value + test + SELECT + self._set("cut")
         return code + self._get("cut")
 
     def _arithmetic(self, node: nodes.Arithmetic) -> bytes:
         machine, operator = machine_type(node.type), node.operator
         left, right = self._value(node.left), self._value(node.right)
-        opcode = CALCULATE[machine][operator]
-        if machine in (F32, F64) or operator in "+-*&|^":
-            return left + right + bytes((opcode,))
-        unsigned = not is_signed(node.type)
-        if operator in ("<<", ">>"):
-            if machine_type(node.right.type) != machine:
-                right += b"\xa7" if machine == I32 else b"\xad"
-            return left + right + bytes((opcode + (unsigned and operator == ">>"),))
-        return self._divided(node, left, right, bytes((opcode + unsigned,)))
+        if operator in ("<<", ">>") and machine_type(node.right.type) != machine:
+            right += I32_WRAP_I64 if machine == I32 else I64_EXTEND_I32_U
+        if operator in ("/", "%") and machine in (I32, I64):
+            return self._divided(node, left, right)
+        return left + right + calculate(machine, operator, signed=is_signed(node.type))
 
-    def _divided(self, node: nodes.Arithmetic, left: bytes, right: bytes, opcode: bytes) -> bytes:
+    def _divided(self, node: nodes.Arithmetic, left: bytes, right: bytes) -> bytes:
         machine = machine_type(node.type)
         one, other = (f"{side} {machine} {len(self._locals)}" for side in ("dividend", "divisor"))
         code = left + self._set(one, machine) + right + self._set(other, machine)
-        zero = self._get(other, machine) + (b"\x45" if machine == I32 else b"\x50")
+        zero = self._get(other, machine) + (I32_EQZ if machine == I32 else I64_EQZ)
         code += self._when(zero, self._elsewhere)
-        quotient = self._get(one, machine) + self._get(other, machine) + opcode
+        quotient = self._get(one, machine) + self._get(other, machine)
+        quotient += calculate(machine, node.operator, signed=is_signed(node.type))
         if node.operator == "%" or not is_signed(node.type):
             return code + quotient
-        minus = self._get(other, machine) + constant(machine, -1) + bytes((COMPARE[machine]["=="],))
-        negated = constant(machine, 0) + self._get(one, machine) + bytes((CALCULATE[machine]["-"],))
-        return code + minus + IF + bytes((machine,)) + negated + ELSE + quotient + END
+        minus = self._get(other, machine) + constant(machine, -1) + compare(machine, "==")
+        negated = constant(machine, 0) + self._get(one, machine) + calculate(machine, "-")
+        return code + minus + if_result(machine) + negated + ELSE + quotient + END
 
     def _unary(self, node: nodes.Unary) -> bytes:
         machine, value = machine_type(node.type), self._value(node.value)
         if machine in (F32, F64):
-            return value + bytes(((ABS if node.operator == "abs" else NEG)[machine],))
+            return value + (_ABS if node.operator == "abs" else _NEG)[machine]
         if node.operator == "~":
-            return value + constant(machine, -1) + bytes((CALCULATE[machine]["^"],))
+            return value + constant(machine, -1) + calculate(machine, "^")
         kept = f"kept {machine}"
         code = value + self._set(kept, machine)
-        negated = constant(machine, 0) + self._get(kept, machine) + bytes((CALCULATE[machine]["-"],))
+        negated = constant(machine, 0) + self._get(kept, machine) + calculate(machine, "-")
         if node.operator == "-":
             return code + negated
         if not is_signed(node.type):
             return code + self._get(kept, machine)
-        negative = self._get(kept, machine) + constant(machine, 0) + bytes((COMPARE[machine]["<"],))
+        negative = self._get(kept, machine) + constant(machine, 0) + compare(machine, "<")
         return code + negated + self._get(kept, machine) + negative + SELECT
 
     def _compare(self, node: nodes.Compare) -> bytes:
         machine = machine_type(node.left.type)
-        opcode = COMPARE[machine][node.operator]
-        if node.operator not in ("==", "!=") and not is_signed(node.left.type):
-            opcode += 1
-        return self._value(node.left) + self._value(node.right) + bytes((opcode,))
+        values = self._value(node.left) + self._value(node.right)
+        return values + compare(machine, node.operator, signed=is_signed(node.left.type))
 
     def _logical(self, node: nodes.Logical) -> bytes:
         yes, no = self._nested(node.right), constant(I32, node.operator == "or")
         branches = (yes, no) if node.operator == "and" else (no, yes)
-        return self._value(node.left) + IF + bytes((I32,)) + branches[0] + ELSE + branches[1] + END
+        return self._value(node.left) + if_result(I32) + branches[0] + ELSE + branches[1] + END
 
     def _nested(self, node: nodes.Expression) -> bytes:
         self._depth += 1
@@ -132,21 +181,21 @@ class Arithmetic(Parts):
         return code
 
     def _not(self, node: nodes.Not) -> bytes:
-        return self._value(node.value) + b"\x45"
+        return self._value(node.value) + I32_EQZ
 
     def _conditional(self, node: nodes.Conditional) -> bytes:
-        kind = bytes((machine_type(node.type),))
+        kind = machine_type(node.type)
         yes, no = self._nested(node.yes), self._nested(node.no)
-        return self._value(node.test) + IF + kind + yes + ELSE + no + END
+        return self._value(node.test) + if_result(kind) + yes + ELSE + no + END
 
     def _question(self, argument: nodes.Expression, operator: str) -> bytes:
         """Compare the size of a number with infinity."""
         machine = machine_type(argument.type)
         if machine not in (F32, F64):
             raise NotScalarError(str(argument.type))
-        size = self._value(argument) + bytes((ABS[machine],))
-        compared = size + constant(machine, inf) + bytes((COMPARE[machine][operator.strip("!")],))
-        return compared + (b"\x45" if operator.startswith("!") else b"")
+        size = self._value(argument) + _ABS[machine]
+        compared = size + constant(machine, inf) + compare(machine, operator.strip("!"))
+        return compared + (I32_EQZ if operator.startswith("!") else b"")
 
     def _least(self, node: nodes.Call) -> bytes:
         """`std::min` and `std::max`: the second if it is less, or greater; `fmin` and `fmax`: or the first is NaN."""
@@ -156,18 +205,19 @@ class Arithmetic(Parts):
             self._value(argument) + self._set(name, machine)
             for name, argument in zip((one, other), node.arguments, strict=True)
         )
-        opcode = COMPARE[machine]["<" if "min" in node.function else ">"] + (not is_signed(node.type))
-        test = self._get(other, machine) + self._get(one, machine) + bytes((opcode,))
+        operator = "<" if "min" in node.function else ">"
+        test = self._get(other, machine) + self._get(one, machine)
+        test += compare(machine, operator, signed=is_signed(node.type))
         if node.function not in ("h_min", "h_max"):
-            none = self._get(one, machine) + self._get(one, machine) + bytes((COMPARE[machine]["!="],))
-            test += none + b"\x72"
+            none = self._get(one, machine) + self._get(one, machine) + compare(machine, "!=")
+            test += none + I32_OR
         return code + self._get(other, machine) + self._get(one, machine) + test + SELECT
 
     # Times and durations, which are nanoseconds in 64 bits
 
     def _moment(self, node: nodes.Moment) -> bytes:
         both = self._value(node.left) + self._value(node.right)
-        return self._limited(node.type, both + bytes((CALCULATE[I64][node.operator],)))
+        return self._limited(node.type, both + calculate(I64, node.operator))
 
     def _moment_of(self, node: nodes.MomentOf) -> bytes:
         return self._limited(
@@ -179,16 +229,10 @@ class Arithmetic(Parts):
         code, names = b"", [f"{part} {len(self._locals)}" for part in ("seconds", "nanoseconds")]
         for name, value, most in zip(names, (seconds, nanoseconds), (1 << 32, 1 << 61), strict=True):
             code += value + self._set(name, I64)
-            wide = self._get(name, I64) + constant(I64, most) + b"\x7c" + constant(I64, 2 * most) + b"\x56"
+            wide = self._get(name, I64) + constant(I64, most) + I64_ADD + constant(I64, 2 * most) + I64_GT_U
             code += self._when(wide, self._elsewhere)
-        return (
-            code
-            + self._get(names[0], I64)
-            + constant(I64, BILLION)
-            + b"\x7e"
-            + self._get(names[1], I64)
-            + b"\x7c"
-        )
+        code += self._get(names[0], I64) + constant(I64, BILLION) + I64_MUL
+        return code + self._get(names[1], I64) + I64_ADD
 
     def _limited(self, kind: Type, code: bytes) -> bytes:
         """A time or duration, elsewhere if it is none."""
@@ -197,7 +241,7 @@ class Arithmetic(Parts):
         )
         name = f"moment {len(self._locals)}"
         code += self._set(name, I64)
-        for limit, opcode in ((least, b"\x53"), (most, b"\x55")):
+        for limit, opcode in ((least, I64_LT_S), (most, I64_GT_S)):
             code += self._when(self._get(name, I64) + constant(I64, limit) + opcode, self._elsewhere)
         return code + self._get(name, I64)
 
@@ -207,7 +251,7 @@ class Arithmetic(Parts):
         assert isinstance(part, nodes.Literal)  # noqa: S101  the name of a part
         value = self._value(new)
         if machine_type(new.type) == I32:
-            value += b"\xac" if is_signed(new.type) else b"\xad"
+            value += I64_EXTEND_I32_S if is_signed(new.type) else I64_EXTEND_I32_U
         old = self._value(moment)
         if part.value == b"sec":
             return self._limited(node.type, self._of_parts(value, old + self._nanoseconds()))
@@ -217,20 +261,14 @@ class Arithmetic(Parts):
         """The part of a moment: not less than nothing."""
         code, value = self._set("moment", I64), self._get("moment", I64)
         whole = self._get("whole", I64)
-        code += value + constant(I64, BILLION) + b"\x81" + self._set("whole", I64)
-        more = whole + constant(I64, BILLION) + b"\x7c" + self._set("whole", I64)
-        return code + self._when(whole + constant(I64, 0) + b"\x53", lambda: more) + whole
+        code += value + constant(I64, BILLION) + I64_REM_S + self._set("whole", I64)
+        more = whole + constant(I64, BILLION) + I64_ADD + self._set("whole", I64)
+        return code + self._when(whole + constant(I64, 0) + I64_LT_S, lambda: more) + whole
 
     def _seconds(self) -> bytes:
         rest = self._nanoseconds() + self._set("rest", I64)
-        return (
-            rest
-            + self._get("moment", I64)
-            + self._get("rest", I64)
-            + b"\x7d"
-            + constant(I64, BILLION)
-            + b"\x7f"
-        )
+        whole = self._get("moment", I64) + self._get("rest", I64) + I64_SUB
+        return rest + whole + constant(I64, BILLION) + I64_DIV_S
 
     def _in_seconds(self) -> bytes:
         """A moment as a double, rounded once: what has more than 53 bits is divided by 5^9 with 40 bits behind the
@@ -238,34 +276,33 @@ class Arithmetic(Parts):
         """
         code, value = self._set("moment", I64), self._get("moment", I64)
         size = self._get("whole", I64)
-        negative = value + constant(I64, 0) + b"\x53"
-        code += constant(I64, 0) + value + b"\x7d" + value + negative + SELECT + self._set("whole", I64)
-        short = size + b"\xb9" + constant(F64, 1e9) + b"\xa3"
+        negative = value + constant(I64, 0) + I64_LT_S
+        code += constant(I64, 0) + value + I64_SUB + value + negative + SELECT + self._set("whole", I64)
+        short = size + F64_CONVERT_I64_S + constant(F64, 1e9) + F64_DIV
         over = constant(I64, 5**9)
-        rest = size + over + b"\x82" + constant(I64, 40) + b"\x86" + self._set("rest", I64)
-        left = self._get("rest", I64) + over + b"\x82\x50\x45\xad"
-        behind = (
-            self._get("rest", I64) + over + b"\x80" + left + b"\x84\xb9" + constant(F64, 2.0**-40) + b"\xa2"
-        )
-        long = rest + size + over + b"\x80\xb9" + behind + b"\xa0" + constant(F64, 2.0**-9) + b"\xa2"
-        code += size + constant(I64, 1 << 53) + b"\x54" + IF + bytes((F64,)) + short + ELSE + long + END
+        rest = size + over + I64_REM_U + constant(I64, 40) + I64_SHL + self._set("rest", I64)
+        left = self._get("rest", I64) + over + I64_REM_U + I64_EQZ + I32_EQZ + I64_EXTEND_I32_U
+        behind = self._get("rest", I64) + over + I64_DIV_U + left + I64_OR + F64_CONVERT_I64_S
+        behind += constant(F64, 2.0**-40) + F64_MUL
+        long = rest + size + over + I64_DIV_U + F64_CONVERT_I64_S + behind + F64_ADD
+        long += constant(F64, 2.0**-9) + F64_MUL
+        code += size + constant(I64, 1 << 53) + I64_LT_U + if_result(F64) + short + ELSE + long + END
         code += self._set("in seconds", F64)
         result = self._get("in seconds", F64)
-        return code + result + bytes((NEG[F64],)) + result + negative + SELECT
+        return code + result + F64_NEG + result + negative + SELECT
 
     def _parts_of(self, kind: Type, moment: bytes) -> tuple[bytes, bytes]:
         """What divides nanoseconds into seconds and the rest; the two as they stand."""
         code = self._limited(kind, moment) + self._seconds() + self._set("whole", I64)
-        low = self._get("whole", I64) + constant(I64, 0xFFFFFFFF) + b"\x83"
-        return code, low + self._get("rest", I64) + constant(I64, 32) + b"\x86\x84"
+        low = self._get("whole", I64) + constant(I64, 0xFFFFFFFF) + I64_AND
+        return code, low + self._get("rest", I64) + constant(I64, 32) + I64_SHL + I64_OR
 
 
 def to_floating(source: int, target: int, *, signed: bool) -> bytes:
     """A number as a floating-point number."""
     if source in (F32, F64):
-        return b"" if source == target else b"\xb6" if target == F32 else b"\xbb"
-    first = 0xB2 if target == F32 else 0xB7
-    return bytes((first + 2 * (source == I64) + (not signed),))
+        return b"" if source == target else F32_DEMOTE_F64 if target == F32 else F64_PROMOTE_F32
+    return _CONVERT[target, source, signed]
 
 
 def _narrowed(target: value_types.Integer) -> bytes:
@@ -273,5 +310,5 @@ def _narrowed(target: value_types.Integer) -> bytes:
     if target.bits >= 32:
         return b""
     if target.signed:
-        return b"\xc0" if target.bits == 8 else b"\xc1"
-    return constant(I32, target.most) + b"\x71"
+        return I32_EXTEND8_S if target.bits == 8 else I32_EXTEND16_S
+    return constant(I32, target.most) + I32_AND
