@@ -10,7 +10,33 @@ from contextlib import contextmanager
 from rosmop.fast.abi import REST
 from rosmop.fast.arithmetic import Arithmetic
 from rosmop.fast.memory_layout import NotScalarError, machine_type
-from rosmop.fast.wasm import I32, I64, LOAD, constant, unsigned
+from rosmop.fast.wasm import (
+    I32,
+    I32_ADD,
+    I32_EQZ,
+    I32_MUL,
+    I32_WRAP_I64,
+    I64,
+    I64_ADD,
+    I64_EXTEND_I32_S,
+    I64_EXTEND_I32_U,
+    I64_GE_U,
+    I64_GT_U,
+    I64_LT_U,
+    I64_MUL,
+    I64_SUB,
+    constant,
+    f32_load,
+    f64_load,
+    i32_load,
+    i32_load8_s,
+    i32_load8_u,
+    i32_load16_s,
+    i32_load16_u,
+    i32_store,
+    i64_load,
+    load,
+)
 from rosmop.form import nodes
 from rosmop.runtime.times import BILLION
 from rosmop.runtime.values import struct_code, struct_size
@@ -21,6 +47,11 @@ from rosmop.types.value_types import Type
 MOST_TEXTS = 256
 """Strings of an array that is read; one of more is left."""
 
+_LOADS = {
+    "?": i32_load8_u, "b": i32_load8_s, "B": i32_load8_u, "h": i32_load16_s, "H": i32_load16_u,
+    "i": i32_load, "I": i32_load, "q": i64_load, "Q": i64_load, "f": f32_load, "d": f64_load,
+}  # fmt: skip
+
 
 class Places(Arithmetic):
     """Writes what looks at the message."""
@@ -28,40 +59,41 @@ class Places(Arithmetic):
     def _position(self, at: nodes.Spot) -> bytes:
         """A position, in 64 bits: the lengths in a message are not to be trusted."""
         offset = constant(I64, at.offset)
-        return offset if at.base is None else self._get(at.base, I64) + offset + b"\x7c"
+        return offset if at.base is None else self._get(at.base, I64) + offset + I64_ADD
 
     def _length(self) -> bytes:
         """The bytes of all of the message, in 64 bits."""
-        return self._get("size") + b"\xad" + self._cell(0x29, REST) + b"\x7c"
+        return self._get("size") + I64_EXTEND_I32_U + load(I64, REST) + I64_ADD
 
     def _within(self, at: nodes.Spot, size: int) -> bytes:
         """A fault unless so many bytes of the message stand there."""
-        short = self._get("size") + b"\xad" + self._position(at.plus(size)) + b"\x54"
+        short = self._get("size") + I64_EXTEND_I32_U + self._position(at.plus(size)) + I64_LT_U
         return self._when(short, self._elsewhere)
 
-    def _at(self, at: nodes.Spot, opcode: int) -> tuple[bytes, bytes]:
-        """What stands before and in an access of the message at a position that is within it."""
-        base = self._get("at") + (b"" if at.base is None else self._get(at.base, I64) + b"\xa7\x6a")
-        return base, bytes((opcode, 0)) + unsigned(at.offset)
+    def _length_at(self, at: nodes.Spot) -> bytes:
+        """Load the 32 bits at a position within the message, as 64 bits."""
+        base = self._get("at") + (
+            b"" if at.base is None else self._get(at.base, I64) + I32_WRAP_I64 + I32_ADD
+        )
+        return base + i32_load(at.offset) + I64_EXTEND_I32_U
 
     def _after_text(self, node: nodes.AfterText) -> bytes:
-        length = b"".join(self._at(node.at, 0x28)) + b"\xad"
-        end = self._position(node.at.plus(4)) + length + b"\x7c"
+        end = self._position(node.at.plus(4)) + self._length_at(node.at) + I64_ADD
         return self._within(node.at, 4) + end + self._set(node.name, I64)
 
     def _count(self, node: nodes.Count) -> bytes:
         """The number of elements, in 64 bits; a fault if so many are not there."""
-        code = self._within(node.at, 4) + b"".join(self._at(node.at, 0x28)) + b"\xad"
+        code = self._within(node.at, 4) + self._length_at(node.at)
         number = self._get(node.name, I64)
-        room = self._get("size") + b"\xad" + self._position(node.at.plus(4)) + b"\x7d"
-        least = number + constant(I64, node.least) + b"\x7e"
+        room = self._get("size") + I64_EXTEND_I32_U + self._position(node.at.plus(4)) + I64_SUB
+        least = number + constant(I64, node.least) + I64_MUL
         if not node.least:
             least, room = number, constant(I64, MAX_EMPTY)
-        return code + self._set(node.name, I64) + self._when(least + room + b"\x56", self._elsewhere)
+        return code + self._set(node.name, I64) + self._when(least + room + I64_GT_U, self._elsewhere)
 
     def _after_elements(self, node: nodes.AfterElements) -> bytes:
         count = constant(I64, node.count) if isinstance(node.count, int) else self._get(node.count, I64)
-        end = self._position(node.at) + count + constant(I64, node.size) + b"\x7e\x7c"
+        end = self._position(node.at) + count + constant(I64, node.size) + I64_MUL + I64_ADD
         return end + self._set(node.name, I64)
 
     def _read_numbers(self, node: nodes.ReadNumbers) -> bytes:
@@ -69,7 +101,7 @@ class Places(Arithmetic):
         code = self._within(node.at, end)
         for name, kind, offset in node.fields:
             place = self._get("at")
-            place += b"" if node.at.base is None else self._get(node.at.base, I64) + b"\xa7\x6a"
+            place += b"" if node.at.base is None else self._get(node.at.base, I64) + I32_WRAP_I64 + I32_ADD
             code += loaded(place, node.at.offset + offset, kind) + self._set(name, machine_type(kind))
         return code
 
@@ -77,8 +109,9 @@ class Places(Arithmetic):
         place, count, start = f"place of {node.name}", f"count of {node.name}", node.at
         if isinstance(node.type, value_types.Record):
             size = self._layout.size(node.type)
-            code = self._within(start, size) + self._get("at") + self._position(start) + b"\xa7\x6a"
-            return code + self._set(place) + self._position(start.plus(size)) + self._set(node.end, I64)
+            code = self._within(start, size) + self._get("at") + self._position(start)
+            code += I32_WRAP_I64 + I32_ADD + self._set(place)
+            return code + self._position(start.plus(size)) + self._set(node.end, I64)
         element, size = self._layout.element(node.type)
         if isinstance(element, value_types.String):
             return self._read_texts(node)
@@ -87,7 +120,7 @@ class Places(Arithmetic):
             code += constant(I64, node.type.length) + self._set(count, I64)
         else:
             code, start = self._count(nodes.Count(node.site, count, start, size)), start.plus(4)
-        code += self._get("at") + self._position(start) + b"\xa7\x6a" + self._set(place)
+        code += self._get("at") + self._position(start) + I32_WRAP_I64 + I32_ADD + self._set(place)
         return code + self._after_elements(nodes.AfterElements(node.site, node.end, start, count, size))
 
     def _read_texts(self, node: nodes.ReadValue) -> bytes:
@@ -101,21 +134,23 @@ class Places(Arithmetic):
         )
         table = constant(I32, self._layout.take(4 * MOST_TEXTS))
         code = self._count(nodes.Count(node.site, count, node.at, 4))
-        many = self._get(count, I64) + constant(I64, MOST_TEXTS) + b"\x56"
+        many = self._get(count, I64) + constant(I64, MOST_TEXTS) + I64_GT_U
         code += self._when(many, self._elsewhere) + self._get(count, I64) + self._set(left, I64)
         code += self._position(node.at.plus(4)) + self._set(node.end, I64) + table + self._set(entry)
-        each = self._get(entry) + self._get("at") + self._get(node.end, I64) + b"\xa7\x6a\x36\x00\x00"
+        begin = self._get("at") + self._get(node.end, I64) + I32_WRAP_I64 + I32_ADD
+        each = self._get(entry) + begin + i32_store(0)
         each += self._after_text(nodes.AfterText(node.site, node.end, nodes.Spot(node.end, 0)))
-        beyond = self._get(node.end, I64) + self._get("size") + b"\xad\x56"
+        beyond = self._get(node.end, I64) + self._get("size") + I64_EXTEND_I32_U + I64_GT_U
         each += self._when(beyond, self._elsewhere)
-        each += self._get(entry) + constant(I32, 4) + b"\x6a" + self._set(entry)
+        each += self._get(entry) + constant(I32, 4) + I32_ADD + self._set(entry)
         return code + self._times(left, each) + table + self._set(f"place of {node.name}")
 
     def _text_at(self, entry: bytes) -> tuple[bytes, bytes, bytes]:
         """The string that begins where an entry of a table says, as `_elements`."""
         name = f"text {len(self._locals)}"
-        first = entry + b"\x28\x00\x00" + self._set(name)
-        return first, self._get(name) + constant(I32, 4) + b"\x6a", self._get(name) + b"\x28\x00\x00\xad"
+        first = entry + i32_load(0) + self._set(name)
+        length = self._get(name) + i32_load(0) + I64_EXTEND_I32_U
+        return first, self._get(name) + constant(I32, 4) + I32_ADD, length
 
     def _elements(self, node: nodes.Expression) -> tuple[bytes, bytes, bytes]:
         """What comes first; the address of the first element of a string or vector, and how many there are (i64)."""
@@ -123,7 +158,7 @@ class Places(Arithmetic):
             first, place, count = self._elements(node.value)
             element, size = self._layout.element(node.type)
             machine_type(element)
-            return first + self._allocated(count + constant(I64, size) + b"\x7e"), place, count
+            return first + self._allocated(count + constant(I64, size) + I64_MUL), place, count
         if (
             isinstance(node.type, value_types.String)
             and isinstance(node, nodes.Call)
@@ -148,7 +183,7 @@ class Places(Arithmetic):
             return self._place(node.value)
         if isinstance(node, nodes.Item):
             first, place = self._place(node.base)
-            return first, place + constant(I32, self._layout.offset(node.base.type, node.number)) + b"\x6a"
+            return first, place + constant(I32, self._layout.offset(node.base.type, node.number)) + I32_ADD
         if isinstance(node, nodes.Call) and node.function == "l_element":
             name, code = f"element {len(self._locals)}", self._address_of(node)
             return code + self._set(name), self._get(name)
@@ -179,9 +214,9 @@ class Places(Arithmetic):
         first, place, count = self._elements(values)
         with self._apart(values):
             code = first + self._value(index) + self._set("index", I64)
-        past = self._get("index", I64) + count + b"\x5a"
+        past = self._get("index", I64) + count + I64_GE_U
         code += self._when(past, self._elsewhere)
-        return code + place + self._get("index", I64) + b"\xa7" + constant(I32, size) + b"\x6c\x6a"
+        return code + place + self._get("index", I64) + I32_WRAP_I64 + constant(I32, size) + I32_MUL + I32_ADD
 
     def _element_at(self, node: nodes.Call) -> bytes:
         code = self._address_of(node) + self._set("element")
@@ -197,11 +232,11 @@ def loaded(place: bytes, offset: int, kind: Type) -> bytes:
     """A number or time so many bytes behind a place."""
     codes = struct_code(kind) or ""
     if len(codes) == 2:
-        extend = b"\xad" if codes[0] == "I" else b"\xac"
-        seconds, rest = (place + b"\x28\x00" + unsigned(offset + more) + extend for more in (0, 4))
-        return seconds + constant(I64, BILLION) + b"\x7e" + rest + b"\x7c"
-    code = place + bytes((LOAD[codes], 0)) + unsigned(offset)
-    return code + (b"\x45\x45" if codes == "?" else b"")
+        extend = I64_EXTEND_I32_U if codes[0] == "I" else I64_EXTEND_I32_S
+        seconds, rest = (place + i32_load(offset + more) + extend for more in (0, 4))
+        return seconds + constant(I64, BILLION) + I64_MUL + rest + I64_ADD
+    code = place + _LOADS[codes](offset)
+    return code + (I32_EQZ + I32_EQZ if codes == "?" else b"")
 
 
 def root_of(node: nodes.Expression) -> str:
