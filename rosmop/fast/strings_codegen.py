@@ -13,23 +13,55 @@ from rosmop.fast.abi import MOST_KEPT, Cells
 from rosmop.fast.codegen_access import Places
 from rosmop.fast.memory_layout import Layout, NotScalarError
 from rosmop.fast.wasm import (
-    COMPARE,
+    BLOCK,
     ELSE,
     END,
     I32,
+    I32_ADD,
+    I32_AND,
+    I32_EQ,
+    I32_EQZ,
+    I32_LE_U,
+    I32_LT_U,
+    I32_MUL,
+    I32_NE,
+    I32_SUB,
+    I32_WRAP_I64,
     I64,
+    I64_DIV_U,
+    I64_EQ,
+    I64_EXTEND_I32_U,
+    I64_GT_U,
+    I64_LT_U,
+    I64_NE,
     IF,
+    LOOP,
+    MEMORY_COPY,
     NOTHING,
     SELECT,
+    br,
+    br_if,
+    compare,
     constant,
+    function,
+    i32_load,
+    i32_load8_u,
+    i32_load16_u,
+    i64_load,
+    i64_load8_u,
+    i64_load32_u,
+    if_result,
     load,
-    row,
+    local_get,
+    local_set,
     store,
-    unsigned,
 )
 from rosmop.form import nodes
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION
 from rosmop.types import value_types
+
+_LOADS = {1: (I32, i32_load8_u), 2: (I32, i32_load16_u), 4: (I32, i32_load), 8: (I64, i64_load)}
+"""The type and the instruction that loads so many bytes."""
 
 
 class Texts(Places):
@@ -51,7 +83,7 @@ class Texts(Places):
             return self._chosen(node)
         if isinstance(node, nodes.Read) and node.name in self._layout.shared:
             at = self._layout.variable(node.name, node.type)
-            code = self._cell(0x28, at) + self._cell(0x35, at + 4)
+            code = load(I32, at) + constant(I32, 0) + i64_load32_u(at + 4)
             return self._noted(code, MOST_KEPT)
         return super()._elements(node)
 
@@ -60,7 +92,7 @@ class Texts(Places):
         place, count = (f"{what} {len(self._locals)}" for what in ("place", "count"))
         code = span + self._set(count, I64) + self._set(place)
         if most is not None:
-            code += self._when(self._get(count, I64) + constant(I64, most) + b"\x56", self._elsewhere)
+            code += self._when(self._get(count, I64) + constant(I64, most) + I64_GT_U, self._elsewhere)
         return code, self._get(place), self._get(count, I64)
 
     def _chosen(self, node: nodes.Conditional) -> tuple[bytes, bytes, bytes]:
@@ -87,38 +119,38 @@ class Texts(Places):
         at = self._layout.variable(node.name, node.type)
         code, place, count = self._noted(first + place + count, MOST_KEPT)
         self._assigned.add(node.name)
-        return code + self._cell(0x36, at, place) + self._cell(0x36, at + 4, count + b"\xa7")
+        return code + store(I32, at, place) + store(I32, at + 4, count + I32_WRAP_I64)
 
     def _compare_texts(self, node: nodes.CompareTexts) -> bytes:
         given, known = (
             (node.right, node.left) if isinstance(node.left, nodes.Literal) else (node.left, node.right)
         )
         if node.operator in ("==", "!=") and node.short and isinstance(known, nodes.Literal):
-            return self._is_constant(given, known) + (b"\x45" if node.operator == "!=" else b"")
+            return self._is_constant(given, known) + (I32_EQZ if node.operator == "!=" else b"")
         code, place, count = self._noted(b"".join(self._elements(node.left)))
         first, other, length = self._noted(b"".join(self._elements(node.right)))
         code += first
         if not node.short:
-            long = count + constant(I64, nodes.SHORT) + b"\x56"
+            long = count + constant(I64, nodes.SHORT) + I64_GT_U
             if isinstance(node.right, nodes.Read):
-                long += length + constant(I64, nodes.SHORT) + b"\x56\x71"
-            spent = count + constant(I64, BYTES_PER_INSTRUCTION) + b"\x80"
+                long += length + constant(I64, nodes.SHORT) + I64_GT_U + I32_AND
+            spent = count + constant(I64, BYTES_PER_INSTRUCTION) + I64_DIV_U
             code += self._when(long, lambda: self._spend(spent))
         if not any(self._is_bounded(side) for side in (node.left, node.right)):
             self._brief = False
         call = self._routine(3, mismatch)
         if node.operator in ("==", "!="):
-            same = place + other + count + b"\xa7" + call + b"\xad" + count + b"\x51"
-            alike = count + length + b"\x51" + IF + bytes((I32,)) + same + ELSE + constant(I32, 0) + END
-            return code + alike + (b"\x45" if node.operator == "!=" else b"")
+            same = place + other + count + I32_WRAP_I64 + call + I64_EXTEND_I32_U + count + I64_EQ
+            alike = count + length + I64_EQ + if_result(I32) + same + ELSE + constant(I32, 0) + END
+            return code + alike + (I32_EQZ if node.operator == "!=" else b"")
         number = len(self._locals)
         least, at = f"least {number}", f"mismatch {number}"
-        code += count + length + count + length + b"\x54" + SELECT + b"\xa7" + self._set(least)
+        code += count + length + count + length + I64_LT_U + SELECT + I32_WRAP_I64 + self._set(least)
         code += place + other + self._get(least) + call + self._set(at)
-        opcode = bytes((COMPARE[I64][node.operator] + 1,))  # without a sign
-        one, two = (side + self._get(at) + b"\x6a\x31\x00\x00" for side in (place, other))
-        ends = self._get(at) + self._get(least) + b"\x46" + IF + bytes((I32,))
-        return code + ends + count + length + opcode + ELSE + one + two + opcode + END
+        differs = compare(I64, node.operator, signed=False)
+        one, two = (side + self._get(at) + I32_ADD + i64_load8_u(0) for side in (place, other))
+        ends = self._get(at) + self._get(least) + I32_EQ + if_result(I32)
+        return code + ends + count + length + differs + ELSE + one + two + differs + END
 
     def _is_bounded(self, node: nodes.Expression) -> bool:
         return isinstance(node, nodes.Literal) or (
@@ -135,43 +167,33 @@ class Texts(Places):
         while at < len(known.value):
             size = max(size for size in (1, 2, 4, 8) if size <= len(known.value) - at)
             number = int.from_bytes(known.value[at : at + size], "little")
-            machine, opcode = {1: (I32, 0x2D), 2: (I32, 0x2F), 4: (I32, 0x28), 8: (I64, 0x29)}[size]
-            same += place + bytes((opcode, 0)) + unsigned(at) + constant(machine, number)
-            same += bytes((COMPARE[machine]["=="],)) + b"\x71"
+            machine, instruction = _LOADS[size]
+            same += place + instruction(at) + constant(machine, number)
+            same += compare(machine, "==") + I32_AND
             at += size
-        as_long = count + constant(I64, len(known.value)) + b"\x51"
-        return first + as_long + IF + bytes((I32,)) + same + ELSE + constant(I32, 0) + END
-
-
-def _function(made: int, *code: bytes) -> bytes:
-    """A function with so many local variables (i32)."""
-    whole = row([unsigned(made) + bytes((I32,))]) + b"".join(code) + END
-    return unsigned(len(whole)) + whole
+        as_long = count + constant(I64, len(known.value)) + I64_EQ
+        return first + as_long + if_result(I32) + same + ELSE + constant(I32, 0) + END
 
 
 def turns(leave: bytes, *turn: bytes) -> bytes:
     """A loop that ends when `leave` is true, or a turn leaves its block."""
-    return b"\x02\x40\x03\x40" + leave + b"\x0d\x01" + b"".join(turn) + b"\x0c\x00" + END + END
+    return BLOCK + LOOP + leave + br_if(1) + b"".join(turn) + br(0) + END + END
 
 
 def mismatch() -> bytes:
     """A function of two addresses and a length (i32): where the first byte is that differs, or the length."""
-    one, other, size, at = (b"\x20" + unsigned(local) for local in range(4))
+    one, other, size, at = (local_get(local) for local in range(4))
 
-    def compared(opcodes: bytes) -> bytes:
-        read, differs = opcodes[:1] + b"\x00\x00", opcodes[1:]
-        return one + at + b"\x6a" + read + other + at + b"\x6a" + read + differs + b"\x0d\x01"
+    def compared(read: bytes, differs: bytes) -> bytes:
+        return one + at + I32_ADD + read + other + at + I32_ADD + read + differs + br_if(1)
 
     def on(more: int) -> bytes:
-        return at + constant(I32, more) + b"\x6a\x21\x03"
+        return at + constant(I32, more) + I32_ADD + local_set(3)
 
-    few = size + at + b"\x6b" + constant(I32, 8) + b"\x49"
-    return _function(
-        1,
-        turns(few, compared(b"\x29\x52"), on(8)),
-        turns(at + size + b"\x46", compared(b"\x2d\x47"), on(1)),
-        at,
-    )
+    few = size + at + I32_SUB + constant(I32, 8) + I32_LT_U
+    long = turns(few, compared(i64_load(0), I64_NE), on(8))
+    short = turns(at + size + I32_EQ, compared(i32_load8_u(0), I32_NE), on(1))
+    return function([(1, I32)], long + short + at)
 
 
 def settling(layout: Layout, cells: Cells) -> bytes:
@@ -183,16 +205,17 @@ def settling(layout: Layout, cells: Cells) -> bytes:
     """
     cells.generation = layout.take(8)
     cells.texts = {at: layout.take(2 * MOST_KEPT) for at in cells.kept}
-    other, target = b"\x20\x00", b"\x20\x01"
-    flip = load(I32, cells.generation) + b"\x45\x21\x00"
+    other, target = local_get(0), local_get(1)
+    flip = load(I32, cells.generation) + I32_EQZ + local_set(0)
     code = []
     for address, begin in cells.texts.items():
         count = load(I32, address + 4)
         code += [
-            count, constant(I32, MOST_KEPT), b"\x4d", IF, NOTHING,
-            other, constant(I32, MOST_KEPT), b"\x6c", constant(I32, begin), b"\x6a\x21\x01",
-            target, load(I32, address), count, b"\xfc\x0a\x00\x00",
+            count, constant(I32, MOST_KEPT), I32_LE_U, IF, NOTHING,
+            other, constant(I32, MOST_KEPT), I32_MUL, constant(I32, begin), I32_ADD + local_set(1),
+            target, load(I32, address), count, MEMORY_COPY,
             store(I32, address, target),
             END,
         ]  # fmt: skip
-    return _function(2, flip, *code, store(I32, cells.generation, other), constant(I32, 0))
+    code += [store(I32, cells.generation, other), constant(I32, 0)]
+    return function([(2, I32)], flip + b"".join(code))
