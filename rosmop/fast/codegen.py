@@ -32,19 +32,70 @@ from rosmop.fast.deferred_output import BYTES, HEAD, Line, is_text
 from rosmop.fast.memory_layout import LINES, Layout, NotScalarError, is_signed, machine_type
 from rosmop.fast.strings_codegen import Texts, settling
 from rosmop.fast.wasm import (
-    COMPARE,
     DROP,
-    END,
     F32,
+    F32_ABS,
+    F32_CEIL,
+    F32_COPYSIGN,
+    F32_FLOOR,
+    F32_NEAREST,
+    F32_SQRT,
+    F32_TRUNC,
     F64,
+    F64_ABS,
+    F64_ADD,
+    F64_CEIL,
+    F64_CONVERT_I64_S,
+    F64_COPYSIGN,
+    F64_FLOOR,
+    F64_MUL,
+    F64_NEAREST,
+    F64_PROMOTE_F32,
+    F64_SQRT,
+    F64_TRUNC,
     I32,
+    I32_ADD,
+    I32_AND,
+    I32_EQZ,
+    I32_GT_U,
+    I32_MUL,
+    I32_OR,
+    I32_REINTERPRET_F32,
+    I32_SHL,
+    I32_WRAP_I64,
     I64,
-    MOVES,
+    I64_ADD,
+    I64_DIV_U,
+    I64_EQZ,
+    I64_EXTEND_I32_S,
+    I64_EXTEND_I32_U,
+    I64_GT_U,
+    I64_LE_S,
+    I64_LT_S,
+    I64_OR,
+    I64_REINTERPRET_F64,
+    I64_SHL,
+    I64_SHR_U,
+    I64_SUB,
+    I64_TRUNC_SAT_F64_S,
     RETURN,
     UNREACHABLE,
+    br,
+    call,
+    compare,
     constant,
-    row,
-    unsigned,
+    f64_store,
+    function,
+    i32_load,
+    i32_load8_u,
+    i32_load16_u,
+    i32_store,
+    i32_store8,
+    i32_store16,
+    i64_load,
+    i64_store,
+    load,
+    store,
 )
 from rosmop.form import nodes
 from rosmop.runtime.values import Values, struct_code, struct_size
@@ -52,8 +103,11 @@ from rosmop.runtime.wire import FEW
 from rosmop.types import value_types
 from rosmop.types.value_types import Type
 
-_LOADS = {I32: 0x28, I64: 0x29, F32: 0x2A, F64: 0x2B}
-_STORES = {I32: 0x36, I64: 0x37, F32: 0x38, F64: 0x39}
+_MOVES = {
+    8: (i64_load, i64_store), 4: (i32_load, i32_store), 2: (i32_load16_u, i32_store16), 1: (i32_load8_u, i32_store8),
+}  # fmt: skip
+"""Instructions that load and store so many bytes as they are."""
+
 HAPPENED, DROPPED, CHANGED, RESET = 1, 2, 4, 16
 
 EARLY = 16
@@ -174,12 +228,11 @@ class _Body(Texts):
         if self._is_handler:
             body += self._leave(nodes.Leave(-1, None))
         made = sorted(self._locals.values())[len(self._types) :]
-        whole = row([b"\x01" + bytes((machine,)) for _, machine in made]) + body + UNREACHABLE + END
         return Written(
             len(self._writer.written),
             self._types,
             self._result,
-            unsigned(len(whole)) + whole,
+            function([(1, machine) for _, machine in made], body + UNREACHABLE),
             frozenset(self._assigned.intersection(self._writer.shared)),
             self._writes,
             self._drops,
@@ -192,7 +245,7 @@ class _Body(Texts):
 
     def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
         number = self._writer.routine((write, *given), parameters, partial(write, *given))
-        return b"\x10" + unsigned(number)
+        return call(number)
 
     # Statements
 
@@ -249,16 +302,16 @@ class _Body(Texts):
             each = self._get(at) + self._set(f"place of {node.name}")
         else:
             each = loaded(self._get(at), 0, kind) + self._set(node.name, machine_type(kind))
-        following = self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
+        following = self._get(at) + constant(I32, size) + I32_ADD + self._set(at)
         code = first + place + self._set(at) + count + self._set(left, I64)
         with self._apart(node.values):
             return code + self._times(left, each + following, node.body)
 
     def _break(self, _node: nodes.Break) -> bytes:
-        return b"\x0c" + unsigned(self._depth - self._loops[-1] + 1)
+        return br(self._depth - self._loops[-1] + 1)
 
     def _continue(self, _node: nodes.Continue) -> bytes:
-        return b"\x0c" + unsigned(self._depth - self._loops[-1])
+        return br(self._depth - self._loops[-1])
 
     def _select(self, node: nodes.Select) -> bytes:
         machine = machine_type(node.value.type)
@@ -266,7 +319,7 @@ class _Body(Texts):
         code = self._value(node.value) + self._set(value, machine) + constant(I32, node.default)
         code += self._set(node.name)
         for wanted, index in node.table:
-            test = self._get(value, machine) + constant(machine, wanted) + bytes((COMPARE[machine]["=="],))
+            test = self._get(value, machine) + constant(machine, wanted) + compare(machine, "==")
             chosen = constant(I32, index) + self._set(node.name)
             code += self._when(test, lambda chosen=chosen: chosen)  # type: ignore[misc]  # the row of this turn
         return code
@@ -274,7 +327,7 @@ class _Body(Texts):
     def _leave(self, node: nodes.Leave) -> bytes:
         code = constant(I32, bool(node.happened))
         for name, shift in self._bits:
-            code += self._get(name) + constant(I32, shift) + b"\x74\x72"
+            code += self._get(name) + constant(I32, shift) + I32_SHL + I32_OR
         return code + RETURN
 
     def _charge(self, node: nodes.Charge) -> bytes:
@@ -284,7 +337,7 @@ class _Body(Texts):
         """Nothing is made here, but it costs the same."""
         if node.size is not None:
             return self._allocated(constant(I64, node.size))
-        many = self._length() + constant(I64, nodes.CHARGED) + b"\x56"
+        many = self._length() + constant(I64, nodes.CHARGED) + I64_GT_U
         return self._when(many, lambda: self._allocated(self._length()))
 
     def _pending(self, _node: nodes.Pending) -> bytes:
@@ -299,12 +352,12 @@ class _Body(Texts):
         return constant(I32, 1) + self._set("reset")
 
     def _require(self, node: nodes.Require) -> bytes:
-        test, leave = self._value(node.test) + b"\x45", nodes.Leave(node.site, False)
+        test, leave = self._value(node.test) + I32_EQZ, nodes.Leave(node.site, False)
         self._depends = True
         return self._when(test, lambda: self._leave(leave))
 
     def _not_past(self, node: nodes.NotPast) -> bytes:
-        past = self._get(node.count, I64) + constant(I64, node.index) + b"\x57"
+        past = self._get(node.count, I64) + constant(I64, node.index) + I64_LE_S
         self._depends = True
         return self._when(past, self._elsewhere)
 
@@ -313,9 +366,9 @@ class _Body(Texts):
         left, place = (f"{what} {len(self._locals)}" for what in ("left", "place"))
         code = count + self._set(left, I64) + self._position(node.at) + self._set(place, I64)
         if node.inner:
-            code += self._spend(self._get(left, I64) + constant(I64, 1) + b"\x7c")
+            code += self._spend(self._get(left, I64) + constant(I64, 1) + I64_ADD)
         else:
-            many = self._get(left, I64) + constant(I64, FEW) + b"\x56"
+            many = self._get(left, I64) + constant(I64, FEW) + I64_GT_U
             code += self._when(many, lambda: self._spend(self._get(left, I64)))
         if node.skipper is None:
             end = self._after_text(nodes.AfterText(node.site, place, nodes.Spot(place, 0)))
@@ -323,7 +376,7 @@ class _Body(Texts):
             given = {"at": I32, "size": I32, "p": I64}
             skipper = self._writer.function(node.skipper, given, I64, self._context)
             end = self._get("at") + self._get("size") + self._get(place, I64)
-            end += b"\x10" + unsigned(skipper.number) + self._set(place, I64)
+            end += call(skipper.number) + self._set(place, I64)
         code += self._times(left, end)
         return code + self._get(place, I64) + self._set(node.name, I64)
 
@@ -350,32 +403,33 @@ class _Body(Texts):
         code = b""
         if machine in (F32, F64):
             kept = f"kept {machine}"
-            none = self._get(kept, machine) + self._get(kept, machine) + bytes((COMPARE[machine]["!="],))
+            none = self._get(kept, machine) + self._get(kept, machine) + compare(machine, "!=")
             code = value + self._set(kept, machine) + self._when(none, self._elsewhere)
-            value = self._get(kept, machine) + (b"\xbc" if machine == F32 else b"\xbd")
+            value = self._get(kept, machine) + (
+                I32_REINTERPRET_F32 if machine == F32 else I64_REINTERPRET_F64
+            )
         elif len(codes) == 2:
             code, value = self._parts_of(write.value.type, value)
         self._writes += 1
-        base = b"" if write.at.base is None else self._get(write.at.base, I64) + b"\xa7\x6a"
+        base = b"" if write.at.base is None else self._get(write.at.base, I64) + I32_WRAP_I64 + I32_ADD
         return code + self._put_bits(self._get("at") + base, write.at.offset, size, value)
 
     def _put_bits(self, place: bytes, offset: int, size: int, bits: bytes) -> bytes:
         """Put so many bytes there if others stand there, which are noted."""
         whole = I64 if size == 8 else I32
-        load, store = (bytes((code, 0)) + unsigned(offset) for code in MOVES[size])
-        new, mask = f"new {whole}", constant(I32, (1 << 8 * size) - 1) + b"\x71" if size < 4 else b""
-        old = place + load
-        differs = old + self._get(new, whole) + mask + bytes((COMPARE[whole]["!="],))
+        get, overwrite = (instruction(offset) for instruction in _MOVES[size])
+        new, mask = f"new {whole}", constant(I32, (1 << 8 * size) - 1) + I32_AND if size < 4 else b""
+        old = place + get
+        differs = old + self._get(new, whole) + mask + compare(whole, "!=")
 
         def put() -> bytes:
-            entry, end = self._get("entry"), self._cell(0x28, UNDO) + self._set("entry")
-            note = entry + place + constant(I32, offset) + b"\x6a\x36\x00\x00"
-            note += entry + constant(I32, size) + b"\x36\x00\x04"
-            note += entry + old + (b"" if whole == I64 else b"\xad") + b"\x37\x00\x08"
-            note += self._cell(0x36, UNDO, entry + constant(I32, 16) + b"\x6a")
-            return (
-                end + note + place + self._get(new, whole) + store + constant(I32, 1) + self._set("changed")
-            )
+            entry, end = self._get("entry"), load(I32, UNDO) + self._set("entry")
+            note = entry + place + constant(I32, offset) + I32_ADD + i32_store(0)
+            note += entry + constant(I32, size) + i32_store(4)
+            note += entry + old + (b"" if whole == I64 else I64_EXTEND_I32_U) + i64_store(8)
+            note += store(I32, UNDO, entry + constant(I32, 16) + I32_ADD)
+            code = end + note + place + self._get(new, whole) + overwrite
+            return code + constant(I32, 1) + self._set("changed")
 
         return bits + self._set(new, whole) + self._when(differs, put)
 
@@ -392,7 +446,7 @@ class _Body(Texts):
         cells = self._writer.shared.get(node.name)
         if cells is None:
             return self._get(node.name, machine)
-        return self._cell(_LOADS[machine], self._writer.variable(node.name, node.type))
+        return load(machine, self._writer.variable(node.name, node.type))
 
     def _assigned_to(self, node: nodes.Assign) -> bytes:
         if isinstance(node.type, value_types.String):
@@ -406,7 +460,7 @@ class _Body(Texts):
         if cells is None:
             return value + self._set(node.name, machine)
         self._assigned.add(node.name)
-        return self._cell(_STORES[machine], self._writer.variable(node.name, node.type), value)
+        return store(machine, self._writer.variable(node.name, node.type), value)
 
     def _named_in_place(self, node: nodes.Assign) -> bytes:
         """Give a local variable a vector or message that is in the message at hand: it stays there."""
@@ -436,42 +490,43 @@ class _Body(Texts):
     def _noted_line(self, line: Line, cost: bytes) -> bytes:
         """Pay for a line of output, and begin it, where the local variable `line` says then."""
         known = self._layout.lines
-        code = self._cell(0x28, SAID) + self._set("line")
-        end = self._get("line") + constant(I32, line.size) + b"\x6a"
-        full = end + constant(I32, self._layout.said + LINES) + b"\x4b"
-        code += self._when(full, self._elsewhere) + self._spend(cost) + self._cell(0x36, SAID, end)
-        for offset, head in ((0, constant(I32, len(known))), (4, self._cell(0x28, POSITION))):
-            code += self._get("line") + head + b"\x36\x00" + unsigned(offset)
+        code = load(I32, SAID) + self._set("line")
+        end = self._get("line") + constant(I32, line.size) + I32_ADD
+        full = end + constant(I32, self._layout.said + LINES) + I32_GT_U
+        code += self._when(full, self._elsewhere) + self._spend(cost) + store(I32, SAID, end)
+        for offset, head in ((0, constant(I32, len(known))), (4, load(I32, POSITION))):
+            code += self._get("line") + head + i32_store(offset)
         known.append(line)
         return code
 
     def _slot(self, node: nodes.Expression, name: str, at: int) -> tuple[bytes, bytes, bytes]:
         """What comes first; what puts a value into the line (of a string: its place and length); its cost."""
-        line, to = self._get("line"), unsigned(at)
+        line = self._get("line")
         if is_text(node):
             first, place, count = self._elements(node)
             first += place + self._set(name) + count + self._set(f"count of {name}", I64)
             length = self._get(f"count of {name}", I64)
-            put = (
-                line + self._get(name) + b"\x36\x00" + to + line + length + b"\xa7\x36\x00" + unsigned(at + 4)
-            )
-            return first, put, length + constant(I64, BYTES) + b"\x80\x7c"
+            put = line + self._get(name) + i32_store(at)
+            put += line + length + I32_WRAP_I64 + i32_store(at + 4)
+            return first, put, length + constant(I64, BYTES) + I64_DIV_U + I64_ADD
         machine = machine_type(node.type)
         first, value = self._value(node) + self._set(name, machine), self._get(name, machine)
         if machine in (F32, F64):
-            return first, line + value + (b"\xbb" if machine == F32 else b"") + b"\x39\x00" + to, b""
-        wide = (b"\xac" if is_signed(node.type) else b"\xad") if machine == I32 else b""
-        return first, line + value + wide + b"\x37\x00" + to, b""
+            value += F64_PROMOTE_F32 if machine == F32 else b""
+            return first, line + value + f64_store(at), b""
+        wide = (I64_EXTEND_I32_S if is_signed(node.type) else I64_EXTEND_I32_U) if machine == I32 else b""
+        return first, line + value + wide + i64_store(at), b""
 
     def _throttle(self, node: nodes.Throttle) -> bytes:
         """Output that is not due yet; Python puts out what is, and notes when."""
         seconds = self._value(node.seconds) + to_floating(
             machine_type(node.seconds.type), F64, signed=is_signed(node.seconds.type)
         )
-        last, now = self._cell(0x29, self._writer.throttle(self._context, node.site)), self._cell(0x29, NOW)
-        until = last + b"\xb9" + seconds + constant(F64, 1e9) + b"\xa2\xa0\x9b\xfc\x06"
-        waits = last + now + b"\x57" + now + until + b"\x53\x71"
-        return self._when(waits + b"\x45", self._elsewhere) + constant(I32, 0)
+        last, now = load(I64, self._writer.throttle(self._context, node.site)), load(I64, NOW)
+        until = last + F64_CONVERT_I64_S + seconds + constant(F64, 1e9) + F64_MUL + F64_ADD
+        until += F64_CEIL + I64_TRUNC_SAT_F64_S
+        waits = last + now + I64_LE_S + now + until + I64_LT_S + I32_AND
+        return self._when(waits + I32_EQZ, self._elsewhere) + constant(I32, 0)
 
     def _accumulate(self, node: nodes.Accumulate) -> bytes:
         kind, size = self._writer.element(node.vector.type)
@@ -483,10 +538,11 @@ class _Body(Texts):
             code += self._value(node.start) + self._set(total, machine_type(node.type))
             code += self._value(node.first) + self._set(left, I64)
             code += self._value(node.last) + self._set(last, I64)
-        outside = self._get(left, I64) + self._get(last, I64) + b"\x56" + self._get(last, I64) + count
-        code += self._when(outside + b"\x56\x72", self._elsewhere)
-        code += place + self._get(left, I64) + b"\xa7" + constant(I32, size) + b"\x6c\x6a" + self._set(at)
-        code += self._get(last, I64) + self._get(left, I64) + b"\x7d" + self._set(left, I64)
+        outside = self._get(left, I64) + self._get(last, I64) + I64_GT_U + self._get(last, I64) + count
+        code += self._when(outside + I64_GT_U + I32_OR, self._elsewhere)
+        code += place + self._get(left, I64) + I32_WRAP_I64 + constant(I32, size) + I32_MUL + I32_ADD
+        code += self._set(at)
+        code += self._get(last, I64) + self._get(left, I64) + I64_SUB + self._set(left, I64)
         code += self._spend(self._get(left, I64))
         one, other = (
             nodes.Convert(node.wide, nodes.Read(*part)) for part in ((node.type, total), (kind, each))
@@ -495,7 +551,7 @@ class _Body(Texts):
         span = nodes.Assign(node.type, total, added)
         summed = loaded(self._get(at), 0, kind) + self._set(each, machine_type(kind))
         summed += self._evaluate(nodes.Evaluate(node.site, span))
-        summed += self._get(at) + constant(I32, size) + b"\x6a" + self._set(at)
+        summed += self._get(at) + constant(I32, size) + I32_ADD + self._set(at)
         self._brief = False
         code += self._times(left, summed)
         return code + self._get(total, machine_type(node.type))
@@ -522,7 +578,7 @@ class _Body(Texts):
         if node.function not in _OF_MOMENTS:
             raise NotScalarError(node.function)
         code = self._value(argument) + _OF_MOMENTS[node.function](self)
-        return code + b"\xa7" if machine_type(node.type) == I32 else code
+        return code + I32_WRAP_I64 if machine_type(node.type) == I32 else code
 
     def _sequence(self, node: nodes.Sequence) -> bytes:
         chosen = node.chosen % len(node.items)
@@ -575,13 +631,13 @@ class _Body(Texts):
             self._assigned |= called.assigned
         self._brief = self._brief and called.brief
         self._says = self._says or called.says
-        return code + b"\x10" + unsigned(called.number), called.references
+        return code + call(called.number), called.references
 
     def _return(self, node: nodes.Return) -> bytes:
         kind, code, answer = node.value.type, b"", constant(I32, 0)
         if _has_place(kind):
             code, place, count = self._noted(b"".join(self._elements(node.value)))
-            answer = place + b"\xad" + count + constant(I64, 32) + b"\x86\x84"
+            answer = place + I64_EXTEND_I32_U + count + constant(I64, 32) + I64_SHL + I64_OR
         elif kind != value_types.VOID:
             name = f"answer {machine_type(kind)}"
             code, answer = (
@@ -591,11 +647,11 @@ class _Body(Texts):
         for name in node.references:
             at = self._references.setdefault(name, self._writer.reference())
             if f"count of {name}" in self._locals:
-                code += self._cell(0x36, at, self._get(f"place of {name}"))
-                code += self._cell(0x36, at + 4, self._get(f"count of {name}", I64) + b"\xa7")
+                code += store(I32, at, self._get(f"place of {name}"))
+                code += store(I32, at + 4, self._get(f"count of {name}", I64) + I32_WRAP_I64)
             elif name in self._locals:
                 machine = self._locals[name][1]
-                code += self._cell(_STORES[machine], at, self._get(name, machine))
+                code += store(machine, at, self._get(name, machine))
             else:
                 raise NotScalarError("a message by reference")
         return code + answer + RETURN
@@ -615,17 +671,17 @@ class _Body(Texts):
         for number, (reference, at) in enumerate(references, 1):
             kind = kinds_of[reference].type
             if _has_place(kind):
-                code += self._cell(0x29, at) + self._put_span(f"{name} {number}")
+                code += load(I64, at) + self._put_span(f"{name} {number}")
             else:
                 machine = machine_type(kind)
-                code += self._cell(_LOADS[machine], at) + self._set(f"{name} {number}", machine)
+                code += load(machine, at) + self._set(f"{name} {number}", machine)
         return code
 
     def _put_span(self, name: str) -> bytes:
         """An address and length (32 bits each, from the stack) in local variables."""
-        code = self._set("span", I64) + self._get("span", I64) + b"\xa7" + self._set(f"place of {name}")
+        code = self._set("span", I64) + self._get("span", I64) + I32_WRAP_I64 + self._set(f"place of {name}")
         return (
-            code + self._get("span", I64) + constant(I64, 32) + b"\x88" + self._set(f"count of {name}", I64)
+            code + self._get("span", I64) + constant(I64, 32) + I64_SHR_U + self._set(f"count of {name}", I64)
         )
 
     def _handed_back(self, node: nodes.Invoke) -> tuple[bytes, bytes, bytes]:
@@ -659,15 +715,18 @@ def _part_of(node: nodes.Item) -> nodes.Read:
     return nodes.Read(node.type, f"{node.base.name} {node.number}")
 
 
-_EXACT = {"fabs": 0x99, "ceil": 0x9B, "floor": 0x9C, "trunc": 0x9D, "rint": 0x9E, "nearbyint": 0x9E, "sqrt": 0x9F,
-          "copysign": 0xA6}  # fmt: skip
+_EXACT = {
+    "fabs": (F32_ABS, F64_ABS), "ceil": (F32_CEIL, F64_CEIL), "floor": (F32_FLOOR, F64_FLOOR),
+    "trunc": (F32_TRUNC, F64_TRUNC), "rint": (F32_NEAREST, F64_NEAREST), "nearbyint": (F32_NEAREST, F64_NEAREST),
+    "sqrt": (F32_SQRT, F64_SQRT), "copysign": (F32_COPYSIGN, F64_COPYSIGN),
+}  # fmt: skip
 _OPCODES = {
-    **{(f"h_{name}", F64): bytes((code,)) for name, code in _EXACT.items()},
-    **{(f"h_{name}f", F32): bytes((code - 14,)) for name, code in _EXACT.items()},
-    ("m_is_zero", I64): b"\x50",
+    **{(f"h_{name}", F64): double for name, (_, double) in _EXACT.items()},
+    **{(f"h_{name}f", F32): single for name, (single, _) in _EXACT.items()},
+    ("m_is_zero", I64): I64_EQZ,
     ("m_whole", I64): b"",
-    ("k_after", I64): b"\x7c",
-    ("k_before", I64): b"\x7d",
+    ("k_after", I64): I64_ADD,
+    ("k_before", I64): I64_SUB,
 }
 _SPECIAL: Mapping[str, Callable[[_Body, nodes.Call], bytes]] = MappingProxyType(
     {
@@ -676,7 +735,7 @@ _SPECIAL: Mapping[str, Callable[[_Body, nodes.Call], bytes]] = MappingProxyType(
         "l_element": _Body._element_at,
     }
 )
-_OF_COUNTS = {"l_len": b"", "l_empty": b"\x50", "l_last": constant(I64, 1) + b"\x7d"}
+_OF_COUNTS = {"l_len": b"", "l_empty": I64_EQZ, "l_last": constant(I64, 1) + I64_SUB}
 _QUESTIONS = {"h_isinf": "==", "h_isfinite": "<", "h_isnan": "!<="}
 _OF_MOMENTS: Mapping[str, Callable[[_Body], bytes]] = MappingProxyType(
     {"m_nsec": _Body._nanoseconds, "m_sec": _Body._seconds, "m_seconds": _Body._in_seconds}
