@@ -41,19 +41,61 @@ from rosmop.fast.codegen import CHANGED, DROPPED, HAPPENED, RESET, Writer, Writt
 from rosmop.fast.function_parts import ELSEWHERE
 from rosmop.fast.memory_layout import NotScalarError
 from rosmop.fast.wasm import (
+    BLOCK,
+    DROP,
     ELSE,
     END,
     I32,
+    I32_ADD,
+    I32_AND,
+    I32_EQ,
+    I32_EQZ,
+    I32_GE_U,
+    I32_GT_U,
+    I32_LT_S,
+    I32_LT_U,
+    I32_MUL,
+    I32_NE,
+    I32_OR,
+    I32_SHL,
+    I32_SHR_S,
+    I32_SHR_U,
+    I32_SUB,
+    I32_WRAP_I64,
     I64,
+    I64_ADD,
+    I64_AND,
+    I64_EQ,
+    I64_EQZ,
+    I64_EXTEND_I32_U,
+    I64_GE_S,
+    I64_GT_S,
+    I64_LT_S,
+    I64_NE,
+    I64_OR,
+    I64_SHL,
+    I64_SHR_U,
+    I64_SUB,
+    I64_XOR,
     IF,
+    LOOP,
     NOTHING,
     RETURN,
     SELECT,
+    br,
+    br_if,
+    call,
     constant,
+    function,
+    i32_load,
+    i32_load16_s,
+    i32_store,
+    i64_load,
+    i64_store,
     load,
-    row,
+    local_get,
+    local_set,
     store,
-    unsigned,
 )
 from rosmop.fast.wasm_assembler import PAGE, assembled
 from rosmop.form import nodes
@@ -72,9 +114,6 @@ MAX_TABLES = 8 << 20
 """Bytes that the tables of all properties of a set may take."""
 
 _SLACK = 16  # bytes behind the frames that may be looked at
-_ADD, _SUB, _AND, _EQZ = b"\x6a", b"\x6b", b"\x71", b"\x45"
-_AND64, _OR64, _XOR64, _SHL64, _SHR64, _EQZ64 = b"\x83", b"\x84", b"\x85", b"\x86", b"\x88", b"\x50"
-_BR, _BR_IF, _LOOP, _BLOCK = b"\x0c", b"\x0d", b"\x03\x40", b"\x02\x40"
 
 
 @dataclass(frozen=True)
@@ -176,12 +215,8 @@ _SIZE, _NEXT, _WHO, _LAST, _FIRST = range(5, 10)
 _PARAMETERS = (I32, I32, I64)
 
 
-def _get(local: int) -> bytes:
-    return b"\x20" + unsigned(local)
-
-
 def _set(local: int, value: bytes) -> bytes:
-    return value + b"\x21" + unsigned(local)
+    return value + local_set(local)
 
 
 class WalkWriter:
@@ -306,14 +341,15 @@ class WalkWriter:
 
     def code(self) -> bytes:
         """The function."""
-        here = _get(_AT) + b"\xad" + load(I32, EFFECT) + constant(I32, self._effects) + _SUB
-        here += constant(I32, 4) + b"\x76\xad" + constant(I64, 32) + _SHL64 + _OR64
+        here = local_get(_AT) + I64_EXTEND_I32_U + load(I32, EFFECT) + constant(I32, self._effects) + I32_SUB
+        here += constant(I32, 4) + I32_SHR_U + I64_EXTEND_I32_U + constant(I64, 32) + I64_SHL + I64_OR
         if self.verdicts:
-            here += _get(self._telling + 2) + b"\xad" + constant(I64, TOLD.bit_length() - 1) + _SHL64 + _OR64
-        settle = b"\x10" + unsigned(self._cells.settle) + b"\x1a" if self._settles else b""
+            told = constant(I64, TOLD.bit_length() - 1) + I64_SHL
+            here += local_get(self._telling + 2) + I64_EXTEND_I32_U + told + I64_OR
+        settle = call(self._cells.settle) + DROP if self._settles else b""
         over = store(I32, POSITION, constant(I32, 0))
         body = [
-            store(I64, NOW, _get(_NOW)),
+            store(I64, NOW, local_get(_NOW)),
             store(I32, EFFECT, constant(I32, self._effects)),
             store(I32, SAID, constant(I32, self._writer.said)) if self._says else b"",
             _set(_TOLD, load(I64, self._cells.source + 8)),
@@ -321,23 +357,23 @@ class WalkWriter:
             *(_set(local, load(I32, self._state(number))) for number, local in self._states.items()),
             *(_set(local, load(I64, at)) for _, local, at in self._clock_cells()),
             _set(self._telling + 1, load(I64, self._cells.source + 24)) if self.verdicts else b"",
-            self._begin(), _BLOCK, _BLOCK, _LOOP,
+            self._begin(), BLOCK, BLOCK, LOOP,
             self._frame(),
-            _BLOCK, _BLOCK,
+            BLOCK, BLOCK,
             *(self._event(number) for number in range(len(self._events))),
             self._changed() if any(written.writes for written in self._written) else b"",
-            _BR + b"\x01", END,
+            br(1), END,
             self._dropped(), END,
             self._done(),
-            _BR + b"\x00", END, END,
-            settle, over, here, _get(self._sooner), b"\xad", constant(I64, 61), _SHL64, _OR64, RETURN, END,
-            over, here, constant(I64, LEFT), _OR64, END,
+            br(0), END, END,
+            settle, over, here, local_get(self._sooner), I64_EXTEND_I32_U, constant(I64, 61), I64_SHL, I64_OR,
+            RETURN, END,
+            over, here, constant(I64, LEFT), I64_OR,
         ]  # fmt: skip
         numbered = [I32] * (len(self._events) + len(self._states) + 3)
         made = [I64, I64, I32, I32, I64, I32, *numbered, *[I64] * (3 * len(self._clocks) + 2)]
         made += [I32] * (4 + len(self.verdicts))  # see `_handle`
-        whole = row([b"\x01" + bytes((machine,)) for machine in made]) + b"".join(body)
-        return unsigned(len(whole)) + whole
+        return function([(1, machine) for machine in made], b"".join(body))
 
     def _state(self, number: int) -> int:
         return self._cells.base + 8 * number
@@ -351,48 +387,39 @@ class WalkWriter:
 
     def _begin(self) -> bytes:
         """Nothing has happened to the frame at hand: the runtime stops, if it does, at calls and where loops begin."""
-        code = store(I32, POSITION, _get(_AT)) + store(I32, UNDO, constant(I32, self._log))
+        code = store(I32, POSITION, local_get(_AT)) + store(I32, UNDO, constant(I32, self._log))
         code += store(I32, SURE, load(I32, SAID)) if self._says else b""
         return code + b"".join(store(I64, kept, load(I64, address)) for address, kept in self._undo)
 
     def _frame(self) -> bytes:
         """Leave unless the whole frame is there, and a place for an effect."""
-        room = _get(_END) + _get(_AT) + _SUB
-        stop = _BR_IF + b"\x01"
-        code = room + constant(I32, 4) + b"\x49" + stop
-        code += (
-            _set(_SIZE, _get(_AT) + b"\x28\x00\x00")
-            + _get(_SIZE)
-            + room
-            + constant(I32, 4)
-            + _SUB
-            + b"\x4b"
-            + stop
-        )
+        room = local_get(_END) + local_get(_AT) + I32_SUB
+        stop = br_if(1)
+        code = room + constant(I32, 4) + I32_LT_U + stop
+        code += _set(_SIZE, local_get(_AT) + i32_load(0))
+        code += local_get(_SIZE) + room + constant(I32, 4) + I32_SUB + I32_GT_U + stop
         full = constant(I32, self._effects + 16 * MAX_EFFECTS)
-        code += load(I32, EFFECT) + full + b"\x4f" + stop
-        code += _set(_NEXT, _get(_AT) + _get(_SIZE) + _ADD + constant(I32, 4) + _ADD) + _set(
-            _WHO, constant(I64, 0)
-        )
+        code += load(I32, EFFECT) + full + I32_GE_U + stop
+        code += _set(_NEXT, local_get(_AT) + local_get(_SIZE) + I32_ADD + constant(I32, 4) + I32_ADD)
+        code += _set(_WHO, constant(I64, 0))
         code += b"".join(store(I64, budget, constant(I64, BUDGET)) for budget in self._budgets)
         return code + b"".join(_set(_FIRST + number, constant(I32, 0)) for number in range(len(self._events)))
 
     def _event(self, number: int) -> bytes:
         """Blocks from here: the `if`, dropped (1), done (2), the loop (3), out (4), left (5)."""
         event, written, bits = self._events[number], self._written[number], _FIRST + number
-        left = _BR_IF + b"\x05"
-        code = (
-            _get(_ENABLED) + constant(I64, 1 << event.specification) + _AND64 + _EQZ64 + _EQZ + IF + NOTHING
-        )
-        code += _set(
-            bits, _get(_AT) + constant(I32, 4) + _ADD + _get(_SIZE) + b"\x10" + unsigned(written.number)
-        )
+        left = br_if(5)
+        enabled = local_get(_ENABLED) + constant(I64, 1 << event.specification) + I64_AND
+        code = enabled + I64_EQZ + I32_EQZ + IF + NOTHING
+        message = local_get(_AT) + constant(I32, 4) + I32_ADD + local_get(_SIZE)
+        code += _set(bits, message + call(written.number))
         code += self._is(bits, ELSEWHERE) + left
         if written.writes:
-            loud = _get(_TOLD) + constant(I64, 0) + b"\x53"
-            changed = self._is(bits, CHANGED) + b"\x41\x00\x47"
-            code += changed + loud + _AND + left
-            code += _set(_WHO, _get(_WHO) + changed + b"\xad" + constant(I64, number) + _SHL64 + _OR64)
+            loud = local_get(_TOLD) + constant(I64, 0) + I64_LT_S
+            changed = self._is(bits, CHANGED) + constant(I32, 0) + I32_NE
+            code += changed + loud + I32_AND + left
+            which = changed + I64_EXTEND_I32_U + constant(I64, number) + I64_SHL
+            code += _set(_WHO, local_get(_WHO) + which + I64_OR)
         if written.drops:
             code += self._drop(number, self._is(bits, DROPPED))
         gone = self._telling + 3
@@ -404,40 +431,38 @@ class WalkWriter:
         if steps:
             code += self._is(bits, HAPPENED) + IF + NOTHING + b"".join(steps) + END
         if any(written.drops for advance in event.advances for _, written in self._handled(advance)):
-            code = _set(gone, constant(I32, 0)) + code + self._drop(number, _get(gone))
+            code = _set(gone, constant(I32, 0)) + code + self._drop(number, local_get(gone))
         return code + END
 
     def _drop(self, number: int, condition: bytes) -> bytes:
         """The way of the message ends where a condition is not 0 (dropped: 1, left: 5)."""
-        dropped = condition + b"\x41\x00\x47"
-        hidden = _get(_TOLD) + constant(I64, 1 << number) + _AND64 + _EQZ64
-        code = dropped + hidden + _EQZ + _AND + _BR_IF + b"\x05"
-        return code + self._count(len(self._events) + number, dropped) + condition + _BR_IF + b"\x01"
+        dropped = condition + constant(I32, 0) + I32_NE
+        hidden = local_get(_TOLD) + constant(I64, 1 << number) + I64_AND + I64_EQZ
+        code = dropped + hidden + I32_EQZ + I32_AND + br_if(5)
+        return code + self._count(len(self._events) + number, dropped) + condition + br_if(1)
 
     def _is(self, bits: int, which: int) -> bytes:
-        return _get(bits) + constant(I32, which) + _AND
+        return local_get(bits) + constant(I32, which) + I32_AND
 
     def _advance(self, advance: nodes.Advance, table: int) -> bytes:
-        left = b"\x06"
+        left = 6  # the block that is left
         if advance.property is None:
-            return _BR + left
+            return br(left)
         if advance.clock is not None:
             return self._advance_clock(advance.property, advance.clock, advance.event, table)
         state = self._states[advance.property]
         following, room = self._following, self._following + 1
-        code = _set(following, _get(state) + constant(I32, 1) + b"\x74\x2e\x00" + unsigned(table)) + _get(
-            following
-        )
-        code += constant(I32, 0) + b"\x48" + _BR_IF + left
-        code += _get(following) + _get(state) + b"\x47" + IF + NOTHING
-        code += _set(room, _get(state) + constant(I32, ENTRY.size) + b"\x6c")
+        code = _set(following, local_get(state) + constant(I32, 1) + I32_SHL + i32_load16_s(table))
+        code += local_get(following) + constant(I32, 0) + I32_LT_S + br_if(left)
+        code += local_get(following) + local_get(state) + I32_NE + IF + NOTHING
+        code += _set(room, local_get(state) + constant(I32, ENTRY.size) + I32_MUL)
         kind = constant(I64, (SEQ if self._stamped else NO_NUMBER) << 24 | advance.event)
         exits = self._cells.exits[advance.property]
-        for offset, value in ((0, _get(_NOW)), (8, load(I64, self._cells.source) + kind + _OR64)):
-            code += _get(room) + value + b"\x37\x00" + unsigned(exits + offset)
+        for offset, value in ((0, local_get(_NOW)), (8, load(I64, self._cells.source) + kind + I64_OR)):
+            code += local_get(room) + value + i64_store(exits + offset)
         if self._stamped:
-            code += _get(room) + _get(_AT) + b"\x28\x00\x04\x36\x00" + unsigned(exits + 16)
-        code += _set(state, _get(following)) + END
+            code += local_get(room) + local_get(_AT) + i32_load(4) + i32_store(exits + 16)
+        code += _set(state, local_get(following)) + END
         return code + self._handle(advance, state) if self._handled(advance) else code
 
     def _handle(self, advance: nodes.Advance, state: int) -> bytes:
@@ -452,20 +477,21 @@ class WalkWriter:
             for each in states:
                 masks[each] |= 1 << verdict
         table = self._known_tables.address(tuple(masks), "q")
-        code = _set(which, _get(state) + constant(I32, 3) + b"\x74\x29\x00" + unsigned(table))
-        code += _get(which) + _EQZ64 + _EQZ + IF + NOTHING
-        code += _get(which) + _get(counted) + _AND64 + _get(which) + b"\x52" + _BR_IF + b"\x07"
+        code = _set(which, local_get(state) + constant(I32, 3) + I32_SHL + i64_load(table))
+        code += local_get(which) + I64_EQZ + I32_EQZ + IF + NOTHING
+        code += local_get(which) + local_get(counted) + I64_AND + local_get(which) + I64_NE + br_if(7)
         code += _set(anew, constant(I32, 0)) + _set(some, constant(I32, 1))
-        bits, message = self._following, _get(_AT) + constant(I32, 4) + _ADD + _get(_SIZE)
+        bits, message = self._following, local_get(_AT) + constant(I32, 4) + I32_ADD + local_get(_SIZE)
         for verdict, written in handlers:
-            code += _get(which) + constant(I64, 1 << verdict) + _AND64 + _EQZ64 + _EQZ + IF + NOTHING
-            code += _set(bits, message + b"\x10" + unsigned(written.number))
-            code += self._is(bits, ELSEWHERE) + _BR_IF + b"\x08"
+            entered = local_get(which) + constant(I64, 1 << verdict) + I64_AND
+            code += entered + I64_EQZ + I32_EQZ + IF + NOTHING
+            code += _set(bits, message + call(written.number))
+            code += self._is(bits, ELSEWHERE) + br_if(8)
             for kept, bit in ((gone, DROPPED), (anew, RESET)):
-                code += _set(kept, _get(kept) + self._is(bits, bit) + b"\x72")
+                code += _set(kept, local_get(kept) + self._is(bits, bit) + I32_OR)
             count = some + 1 + verdict
-            code += _set(count, _get(count) + constant(I32, 1) + _ADD) + END
-        again = _get(anew) + IF + NOTHING + _set(state, constant(I32, advance.initial)) + END
+            code += _set(count, local_get(count) + constant(I32, 1) + I32_ADD) + END
+        again = local_get(anew) + IF + NOTHING + _set(state, constant(I32, advance.initial)) + END
         return code + again + END
 
     def _advance_clock(self, number: int, clock: nodes.Clock, event: int, table: int) -> bytes:
@@ -477,90 +503,70 @@ class WalkWriter:
         following, room, exits = self._following, self._following + 1, self._cells.exits[number]
 
         def slot(entries: int, size: int, shift: int) -> bytes:
-            place = _get(count) + constant(I64, shift) + _SHR64 + constant(I64, entries - 1) + _AND64
-            return _set(room, place + b"\xa7" + constant(I32, size) + b"\x6c")
+            place = local_get(count) + constant(I64, shift) + I64_SHR_U + constant(I64, entries - 1) + I64_AND
+            return _set(room, place + I32_WRAP_I64 + constant(I32, size) + I32_MUL)
 
-        code = _get(count) + constant(I64, KEPT - 1) + _AND64 + _EQZ64 + IF + NOTHING
+        code = local_get(count) + constant(I64, KEPT - 1) + I64_AND + I64_EQZ + IF + NOTHING
         code += slot(RUNS, 24, KEPT.bit_length() - 1)
-        for place, value in enumerate((_get(state) + b"\xad", _get(since), _get(now))):
-            code += _get(room) + value + b"\x37\x00" + unsigned(exits + 8 + 8 * place)
+        run = (local_get(state) + I64_EXTEND_I32_U, local_get(since), local_get(now))
+        for place, value in enumerate(run):
+            code += local_get(room) + value + i64_store(exits + 8 + 8 * place)
         code += END + slot(RING, ENTRY.size, 0)
         kind = constant(I64, (SEQ if self._stamped else NO_NUMBER) << 24 | event)
-        for place, value in enumerate((_get(_NOW), load(I64, self._cells.source) + kind + _OR64)):
-            code += _get(room) + value + b"\x37\x00" + unsigned(exits + 8 + 24 * RUNS + 8 * place)
-        seq = _get(_AT) + b"\x28\x00\x04" if self._stamped else constant(I32, 0)
-        code += _get(room) + seq + b"\x36\x00" + unsigned(exits + 8 + 24 * RUNS + 16)
-        code += _set(count, _get(count) + constant(I64, 1) + b"\x7c")
-        code += _set(now, _get(_NOW) + _get(now) + _get(_NOW) + _get(now) + b"\x55" + SELECT)
+        for place, value in enumerate((local_get(_NOW), load(I64, self._cells.source) + kind + I64_OR)):
+            code += local_get(room) + value + i64_store(exits + 8 + 24 * RUNS + 8 * place)
+        seq = local_get(_AT) + i32_load(4) if self._stamped else constant(I32, 0)
+        code += local_get(room) + seq + i32_store(exits + 8 + 24 * RUNS + 16)
+        code += _set(count, local_get(count) + constant(I64, 1) + I64_ADD)
+        both = local_get(_NOW) + local_get(now)
+        code += _set(now, both + both + I64_GT_S + SELECT)
         late, waits = (
             self._known_tables.address(*table) for table in ((clock.late, "h"), (clock.waits, "q"))
         )
-        is_late = _get(now) + _get(since) + b"\x7d" + constant(I64, clock.within) + b"\x55"
+        is_late = local_get(now) + local_get(since) + I64_SUB + constant(I64, clock.within) + I64_GT_S
         code += constant(I32, late) + constant(I32, table) + is_late + SELECT
-        code += _get(state) + constant(I32, 1) + b"\x74" + _ADD + b"\x2e\x00\x00"
-        code = _set(following, code) + _get(following) + constant(I32, 0) + b"\x48" + _BR_IF + b"\x06"
-        code += _get(following) + constant(I32, 1) + _AND + IF + NOTHING + _set(since, _get(now)) + END
-        code += _set(state, _get(following) + constant(I32, 1) + b"\x75")
-        wait = _get(state) + constant(I32, 3) + b"\x74\x29\x00" + unsigned(waits)
-        sooner = _get(since) + wait + b"\x7c" + load(I64, self._cells.until) + b"\x53"
-        code += wait + constant(I64, 0) + b"\x59" + sooner + _AND
+        code += local_get(state) + constant(I32, 1) + I32_SHL + I32_ADD + i32_load16_s(0)
+        code = _set(following, code) + local_get(following) + constant(I32, 0) + I32_LT_S + br_if(6)
+        code += local_get(following) + constant(I32, 1) + I32_AND
+        code += IF + NOTHING + _set(since, local_get(now)) + END
+        code += _set(state, local_get(following) + constant(I32, 1) + I32_SHR_S)
+        wait = local_get(state) + constant(I32, 3) + I32_SHL + i64_load(waits)
+        sooner = local_get(since) + wait + I64_ADD + load(I64, self._cells.until) + I64_LT_S
+        code += wait + constant(I64, 0) + I64_GE_S + sooner + I32_AND
         return code + IF + NOTHING + _set(self._sooner, constant(I32, 1)) + END
 
     def _count(self, place: int, more: bytes) -> bytes:
         address = self._counters + 8 * place
-        return store(I64, address, load(I64, address) + more + b"\xad\x7c")
+        return store(I64, address, load(I64, address) + more + I64_EXTEND_I32_U + I64_ADD)
 
     def _changed(self) -> bytes:
         """Note which events changed it. What several have changed may be as it was: that is left unless the first place
         that was written has other bytes. (Blocks: dropped, done, the loop, out, left.)
         """
         entry = self._log
-        size = (
-            constant(I64, 64)
-            + load(I64, entry)
-            + constant(I64, 32)
-            + _SHR64
-            + constant(I64, 3)
-            + _SHL64
-            + b"\x7d"
-        )
-        differs = load(I32, entry) + b"\x29\x00\x00" + load(I64, entry + 8) + _XOR64 + size + _SHL64
-        several = _get(_WHO) + _get(_WHO) + constant(I64, 1) + b"\x7d" + _AND64 + _EQZ64 + _EQZ
-        unsure = several + IF + NOTHING + differs + _EQZ64 + _BR_IF + b"\x06" + END
-        last, one = _get(_LAST), constant(I64, 1)
-        same = _set(_LAST, load(I32, EFFECT)) + last + b"\x29\x00\x00" + _get(_WHO) + b"\x51"
-        again = last + last + b"\x29\x00\x08" + one + b"\x7c\x37\x00\x08"
-        new = self._next_effect() + last + _get(_WHO) + b"\x37\x00\x00" + last + one + b"\x37\x00\x08"
+        size = constant(I64, 64) + load(I64, entry) + constant(I64, 32) + I64_SHR_U
+        size += constant(I64, 3) + I64_SHL + I64_SUB
+        differs = load(I32, entry) + i64_load(0) + load(I64, entry + 8) + I64_XOR + size + I64_SHL
+        several = local_get(_WHO) + local_get(_WHO) + constant(I64, 1) + I64_SUB + I64_AND + I64_EQZ + I32_EQZ
+        unsure = several + IF + NOTHING + differs + I64_EQZ + br_if(6) + END
+        last, one = local_get(_LAST), constant(I64, 1)
+        same = _set(_LAST, load(I32, EFFECT)) + last + i64_load(0) + local_get(_WHO) + I64_EQ
+        again = last + last + i64_load(8) + one + I64_ADD + i64_store(8)
+        new = self._next_effect() + last + local_get(_WHO) + i64_store(0) + last + one + i64_store(8)
         counted = same + IF + NOTHING + again + ELSE + new + END
-        return _get(_WHO) + _EQZ64 + _EQZ + IF + NOTHING + unsure + counted + END
+        return local_get(_WHO) + I64_EQZ + I32_EQZ + IF + NOTHING + unsure + counted + END
 
     def _next_effect(self) -> bytes:
-        more = _set(_LAST, _get(_LAST) + constant(I32, 16) + _ADD)
-        return more + store(I32, EFFECT, _get(_LAST))
+        more = _set(_LAST, local_get(_LAST) + constant(I32, 16) + I32_ADD)
+        return more + store(I32, EFFECT, local_get(_LAST))
 
     def _dropped(self) -> bytes:
         """Note which bytes do not go on, and take back the steps of what suppresses: the cells have what was before."""
-        last = _get(_LAST)
-        same = (
-            last
-            + b"\x29\x00\x00"
-            + constant(I64, -1)
-            + b"\x51"
-            + last
-            + b"\x28\x00\x0c"
-            + _get(_AT)
-            + b"\x46"
-            + _AND
-        )
-        new = (
-            self._next_effect()
-            + last
-            + constant(I64, -1)
-            + b"\x37\x00\x00"
-            + last
-            + _get(_AT)
-            + b"\x36\x00\x08"
-        )
+        last = local_get(_LAST)
+        same = last + i64_load(0) + constant(I64, -1) + I64_EQ
+        same += last + i32_load(12) + local_get(_AT) + I32_EQ + I32_AND
+        new = self._next_effect() + last + constant(I64, -1) + i64_store(0)
+        new += last + local_get(_AT) + i32_store(8)
         code = b"".join(
             _set(local, load(I32, self._state(number)))
             for number, local in self._states.items()
@@ -570,8 +576,8 @@ class WalkWriter:
             _set(local, load(I64, at)) for number, local, at in self._clock_cells()
             if number in self._suppressing and at != self._cells.clocks[number] + 8
         )  # fmt: skip
-        code += _set(_LAST, load(I32, EFFECT)) + same + _EQZ + IF + NOTHING + new + END
-        return code + last + _get(_NEXT) + b"\x36\x00\x0c"
+        code += _set(_LAST, load(I32, EFFECT)) + same + I32_EQZ + IF + NOTHING + new + END
+        return code + last + local_get(_NEXT) + i32_store(12)
 
     def _done(self) -> bytes:
         """What came of the message stays."""
@@ -579,17 +585,16 @@ class WalkWriter:
             self._count(number, self._is(_FIRST + number, HAPPENED)) for number in range(len(self._events))
         )
         code += b"".join(
-            store(I32, self._state(number), _get(local)) for number, local in self._states.items()
+            store(I32, self._state(number), local_get(local)) for number, local in self._states.items()
         )
-        code += b"".join(store(I64, at, _get(local)) for _, local, at in self._clock_cells())
+        code += b"".join(store(I64, at, local_get(local)) for _, local, at in self._clock_cells())
         if self.verdicts:
             _, _, ever, _, _, some = range(self._telling, self._telling + 6)
-            code += _get(some) + IF + NOTHING
+            code += local_get(some) + IF + NOTHING
             for verdict in range(len(self.verdicts)):
                 count = some + 1 + verdict
-                code += self._count(2 * len(self._events) + verdict, _get(count)) + _set(
-                    count, constant(I32, 0)
-                )
+                code += self._count(2 * len(self._events) + verdict, local_get(count))
+                code += _set(count, constant(I32, 0))
             code += _set(some, constant(I32, 0)) + _set(ever, constant(I32, 1)) + END
-        code += _set(_AT, _get(_NEXT)) + self._begin()
-        return code + (_get(self._sooner) + _BR_IF + b"\x01" if self._clocks else b"")
+        code += _set(_AT, local_get(_NEXT)) + self._begin()
+        return code + (local_get(self._sooner) + br_if(1) if self._clocks else b"")
