@@ -5,7 +5,30 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rosmop.fast.memory_layout import Layout, NotScalarError
-from rosmop.fast.wasm import ELSE, END, I32, I64, IF, NOTHING, RETURN, UNREACHABLE, constant, unsigned
+from rosmop.fast.wasm import (
+    BLOCK,
+    ELSE,
+    END,
+    I32,
+    I64,
+    I64_DIV_U,
+    I64_EQZ,
+    I64_GT_U,
+    I64_LT_S,
+    I64_SUB,
+    IF,
+    LOOP,
+    NOTHING,
+    RETURN,
+    UNREACHABLE,
+    br,
+    br_if,
+    constant,
+    load,
+    local_get,
+    local_set,
+    store,
+)
 from rosmop.form import nodes
 from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION, UNMEASURED
 
@@ -38,17 +61,17 @@ class Parts(ABC):
     def _routine(self, parameters: int, write: Callable[..., bytes], *given: Any) -> bytes:
         """A call of a function of so many addresses (i32), which `write` writes of what it is given."""
 
-    def _local(self, name: str, machine: int) -> bytes:
+    def _local(self, name: str, machine: int) -> int:
         number, known = self._locals.setdefault(name, (len(self._locals), machine))
         if known != machine:
             raise NotScalarError(name)
-        return unsigned(number)
+        return number
 
     def _get(self, name: str, machine: int = I32) -> bytes:
-        return b"\x20" + self._local(name, machine)
+        return local_get(self._local(name, machine))
 
     def _set(self, name: str, machine: int = I32) -> bytes:
-        return b"\x21" + self._local(name, machine)
+        return local_set(self._local(name, machine))
 
     def _when(self, test: bytes, yes: Callable[[], bytes], no: Callable[[], bytes] | None = None) -> bytes:
         self._depth += 1
@@ -59,25 +82,21 @@ class Parts(ABC):
     def _elsewhere(self) -> bytes:
         return constant(I32, ELSEWHERE) + RETURN if self._answers else UNREACHABLE
 
-    def _cell(self, opcode: int, address: int, value: bytes = b"") -> bytes:
-        """Load or store at an address."""
-        return constant(I32, 0) + value + bytes((opcode, 0)) + unsigned(address)
-
     def _spend(self, instructions: bytes) -> bytes:
         budget = self._layout.budget(self._context)
-        left = self._cell(0x37, budget, self._cell(0x29, budget) + instructions + b"\x7d")
-        return left + self._when(self._cell(0x29, budget) + constant(I64, 0) + b"\x53", self._elsewhere)
+        left = store(I64, budget, load(I64, budget) + instructions + I64_SUB)
+        return left + self._when(load(I64, budget) + constant(I64, 0) + I64_LT_S, self._elsewhere)
 
     def _allocated(self, size: bytes) -> bytes:
         """Charge for so many bytes (i64) that would be made; elsewhere if what the specification holds is measured."""
-        many = size + constant(I64, UNMEASURED) + b"\x56"
-        spent = size + constant(I64, BYTES_PER_INSTRUCTION) + b"\x80"
+        many = size + constant(I64, UNMEASURED) + I64_GT_U
+        spent = size + constant(I64, BYTES_PER_INSTRUCTION) + I64_DIV_U
         return self._when(many, self._elsewhere) + self._spend(spent)
 
     def _times(self, left: str, each: bytes, body: Sequence[nodes.Statement] = ()) -> bytes:
         """A loop that is run as often as a local variable says, which counts down."""
-        over = self._get(left, I64) + b"\x50\x0d\x01"
-        less = self._get(left, I64) + constant(I64, 1) + b"\x7d" + self._set(left, I64)
+        over = self._get(left, I64) + I64_EQZ + br_if(1)
+        less = self._get(left, I64) + constant(I64, 1) + I64_SUB + self._set(left, I64)
         return self._repeated(over + less + each, body)
 
     def _repeated(self, before: bytes, body: Sequence[nodes.Statement]) -> bytes:
@@ -87,4 +106,4 @@ class Parts(ABC):
         code = before + self._block(body)
         self._loops.pop()
         self._depth -= 2
-        return b"\x02\x40\x03\x40" + code + b"\x0c\x00" + END + END
+        return BLOCK + LOOP + code + br(0) + END + END
