@@ -14,12 +14,12 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+import msgspec
 import structlog
 
 from appliance.base.input_files import read_given_text
-from appliance.base.withdrawal import require_awaited, take_effect
+from appliance.base.withdrawal import take_effect
 from appliance.channel import admin
 from appliance.channel.answers import policy_answers as answers
 from appliance.channel.answers.policy_answers import Loaded
@@ -31,12 +31,11 @@ from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
 from appliance.signing.fingerprints import fingerprint
 from appliance.signing.site_keys import read_signature, signer
-from appliance.store.revisions import Trial, UnknownRevisionError, wanted
+from appliance.store.revisions import DISK, Revisions
 from appliance.store.state_file import RevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
 _log = structlog.get_logger()
-_DISK = "disk"
 _KEPT = (
     "this is revision {0.revision}, which {0.who} brought into force while the appliance ran. To give it up, start with"
     " the version and configuration that took it, say `rosrv policy reload` there, and start anew"
@@ -66,8 +65,11 @@ class RevisionChangedError(Exception):
         super().__init__(f"revision {found} is in force, not {expected}: look at it before you change it")
 
 
-class Policies:
+class Policies(Revisions[RevisionRow]):
     """Keeps the policy in force. What operators ask of it is answered by the method that takes the request."""
+
+    refusal = PolicyRefusedError
+    outdated = RevisionChangedError
 
     def __init__(
         self,
@@ -87,19 +89,16 @@ class Policies:
         the relays have done what they were told. Where there are `site_keys`, whatever comes into force is signed with
         one of them.
         """
+        nothing = RevisionRow(0, "", "", 0.0, "", "")
+        super().__init__(store, store.revisions, store.save_revision, nothing, "confirm")
         self.file = file
-        self.store = store
         self._trail = trail
         self._robot = robot
         self._hosts = hosts
         self._changed = changed
         self._carried_out = carried_out
-        self._one_change = asyncio.Lock()
         self._site_keys = site_keys
         self._current: Policy | None = None
-        self.trial = Trial(store, "confirm", self._go_back, (PolicyRefusedError,))
-        self.revision = 0
-        self.in_force = RevisionRow(0, "", "", 0.0, "", "")  # until `start`
 
     @property
     def current(self) -> Policy:
@@ -107,11 +106,6 @@ class Policies:
         if self._current is None:
             raise RuntimeError("no policy is loaded yet")
         return self._current
-
-    @property
-    def confirm_by(self) -> float | None:
-        """When it goes back by itself unless confirmed, in seconds since the epoch."""
-        return self.trial.confirm_by
 
     @property
     def differs_from_file(self) -> bool:
@@ -127,33 +121,26 @@ class Policies:
         After a crash of control (`restarted`) it is the one that was in force. At the appliance's start it is the
         file, unless an operator's own revision (a rollback, REST) was in force when it stopped.
         """
-        revisions = self.store.revisions()
-        last = revisions[0] if revisions else None
-        self.revision = last.revision if last is not None else 0  # what comes has a greater one
-        if last is not None and (restarted or last.who != _DISK):
+        if self._find_last(restarted=restarted):
+            last = self.in_force
             try:
                 policy = self._judged(last.text, last.signature, last.file, self.known)
             except PolicyRefusedError as error:
                 raise PolicyRefusedError([*error.findings, _KEPT.format(last)]) from error
-            self._enforce(policy, last)
-            self.trial.resume()
-            return
-        text, signature = self._read()
-        policy = self._judged(text, signature, str(self.file), self.known)
-        if last is not None and (last.text, last.signature) == (text, signature):
-            self._enforce(policy, last)
-            self.trial.resume()
         else:
-            self.trial.end()
-            self._keep(policy, signature, who=_DISK, note="read at start")
+            text, signature = self._read()
+            policy = self._judged(text, signature, str(self.file), self.known)
+            if not self.revision or (self.in_force.text, self.in_force.signature) != (text, signature):
+                self._end_limit()
+                self._keep(policy, signature, who=DISK, note="read at start")
+                return
+        self._enforce(policy)
+        self._resume()
 
     @contextlib.asynccontextmanager
-    async def _changing(self, expected: int | None) -> AsyncIterator[None]:
+    async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
         """Around an operator's change; it is on the disk and carried out afterwards."""
-        async with self._one_change:
-            require_awaited()
-            if expected not in (None, self.revision):
-                raise RevisionChangedError(expected, self.revision)
+        async with super()._changing(expected):
             yield
             await self.store.settled()
             await self._carried_out()
@@ -164,14 +151,10 @@ class Policies:
         Raises `PolicyRefusedError`, and `RevisionChangedError` when another revision came into force meanwhile. The
         revision is the disk's, whoever asked for it: `who` is for the record.
         """
-        by, within = _DISK if who == "operator" else who, request.confirm_within
+        by, within = DISK if who == "operator" else who, request.confirm_within
         async with self._changing(request.expected):
-            before = self.revision
             policy, signature = await self._prepared(self._read, str(self.file), by)
-            take_effect()
-            self.trial.announce(before, within)
-            revoked = self._keep(policy, signature, who=_DISK, note="reloaded from disk", by=by)
-            return self._answer(policy, before, revoked, within)
+            return self._keep(policy, signature, who=DISK, note="reloaded from disk", by=by, within=within)
 
     async def load(self, request: admin.PolicyLoad, who: str) -> Loaded:
         """Bring a text that is not the file's into force, as `reload` does.
@@ -182,16 +165,11 @@ class Policies:
         """
         given, within = (request.text, request.signature), request.confirm_within
         async with self._changing(request.expected):
-            before, now = self.revision, self.in_force
-            if now.who != _DISK and (now.text, now.signature) == given:
-                return Loaded(
-                    before, before, [str(warning) for warning in self.current.warnings], 0, self.confirm_by
-                )
+            now = self.in_force
+            if now.who != DISK and (now.text, now.signature) == given:
+                return self._loaded(self.revision, 0)
             policy, signature = await self._prepared(lambda: given, f"revision {self.revision + 1}", who)
-            take_effect()
-            self.trial.announce(before, within)
-            revoked = self._keep(policy, signature, who=who, note=request.note or "posted")
-            return self._answer(policy, before, revoked, within)
+            return self._keep(policy, signature, who=who, note=request.note or "posted", within=within)
 
     def hosts_changed(self) -> int:
         """Compile the policy in force again, for hosts were enrolled or revoked; how much was taken back."""
@@ -213,60 +191,41 @@ class Policies:
 
         Raises `PolicyRefusedError`, and `RevisionChangedError` when another came into force while it was read.
         """
-        before = self.revision
-        rows = await asyncio.to_thread(self.store.revisions)
-        if self.revision != before:
-            raise RevisionChangedError(before, self.revision)
-        try:
-            row = wanted(rows, revision, before)
-        except UnknownRevisionError as error:
-            raise PolicyRefusedError([str(error)]) from error
+        row = await self._wanted(revision)
         policy = self._judged(row.text, row.signature, row.file, self.known)
-        revoked = self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
-        return self._answer(policy, before, revoked, None)
+        return self._keep(policy, row.signature, who=who, note=f"rolled back to revision {row.revision}")
 
     async def confirm(self, request: admin.PolicyConfirm, who: str) -> answers.PolicyConfirmed:
         """Keep an unconfirmed change, if there is one. Raises `RevisionChangedError`."""
         async with self._changing(request.expected):
             waited = self.confirm_by is not None
             if waited:
-                self.trial.end()
+                self._end_limit()
                 self._trail.happened("policy confirmed", f"revision {self.revision} was confirmed", who=who)
             return answers.PolicyConfirmed(waited, self.revision)
 
     async def revisions(self, _request: admin.PolicyRevisions) -> answers.PolicyRevisionList:
         """The kept revisions."""
-        rows = await asyncio.to_thread(self.store.revisions)
-        return answers.PolicyRevisionList([answers.PolicyRevision(**self._described(row)) for row in rows])
+        rows = [self._described(row) for row in await self._kept()]
+        return answers.PolicyRevisionList(msgspec.convert(rows, list[answers.PolicyRevision]))
 
     async def text(self, request: admin.PolicyWanted) -> answers.PolicyKnown:
         """A revision, and with what its text is judged. Raises `UnknownThingError`."""
-        return await asyncio.to_thread(self._text, request.revision, self.known)
-
-    def _text(self, revision: int | None, known: Known) -> answers.PolicyKnown:
-        now = revision is None or revision == self.revision
-        row = (
-            self.in_force
-            if now
-            else next(filter(lambda row: row.revision == revision, self.store.revisions()), None)
-        )
+        number = self.revision if request.revision is None else request.revision
+        row = self.in_force if number == self.revision else await self._find(number)
         if row is None:
-            raise UnknownThingError(f"there is no revision {revision}")
+            raise UnknownThingError(f"there is no revision {number}")
+        return await asyncio.to_thread(self._text, row, self.known)
+
+    def _text(self, row: RevisionRow, known: Known) -> answers.PolicyKnown:
         return answers.PolicyKnown(
             **self._described(row),
-            text=row.text,
-            signature=row.signature,
             policy_file=str(self.file),
             differs_from_file=self.differs_from_file,
             warnings=[str(warning) for warning in self.current.warnings],
             confirm_by=self.confirm_by,
             **self.with_cases(known).fields(),
         )
-
-    def _described(self, row: RevisionRow) -> dict[str, Any]:
-        """The fields of `PolicyRevision`."""
-        known = {name: getattr(row, name) for name in ("revision", "file", "loaded", "who", "note")}
-        return known | {"in_force": row.revision == self.revision}
 
     @property
     def known(self) -> Known:
@@ -328,15 +287,24 @@ class Policies:
         except PolicyError as error:
             raise PolicyRefusedError([str(finding) for finding in error.findings]) from error
 
-    def _keep(self, policy: Policy, signature: str, *, who: str, note: str, by: str | None = None) -> int:
+    def _keep(
+        self,
+        policy: Policy,
+        signature: str,
+        *,
+        who: str,
+        note: str,
+        by: str | None = None,
+        within: float | None = None,
+    ) -> Loaded:
         take_effect()
-        number = self.revision + 1
-        row = RevisionRow(number, policy.text, policy.file, time.time(), who, note, signature)
-        self.store.save_revision(row)
-        revoked = self._enforce(policy, row)
+        before = self.revision
+        row = RevisionRow(before + 1, policy.text, policy.file, time.time(), who, note, signature)
+        self._put_in_force(row, within)
+        revoked = self._enforce(policy)
         self._trail.happened(
             "policy loaded",
-            f"revision {number} is in force: {note}",
+            f"revision {row.revision} is in force: {note}",
             who=by or who,
             file=policy.file,
             sha256=fingerprint(policy.text),
@@ -344,18 +312,16 @@ class Policies:
             revoked=revoked,
             warnings=[str(warning) for warning in policy.warnings][:100],
         )
-        return revoked
+        return self._loaded(before, revoked)
 
-    def _enforce(self, policy: Policy, row: RevisionRow) -> int:
-        before, self._current, self.in_force = self._current, policy, row
-        self.revision = self._trail.revision = row.revision
+    def _enforce(self, policy: Policy) -> int:
+        before, self._current = self._current, policy
+        self._trail.revision = self.revision
         return 0 if before is None else self._changed(before, policy)
 
-    def _answer(self, policy: Policy, before: int, revoked: int, confirm_within: float | None) -> Loaded:
-        self.trial.changed(before, confirm_within)
-        return Loaded(
-            self.revision, before, [str(warning) for warning in policy.warnings], revoked, self.confirm_by
-        )
+    def _loaded(self, before: int, revoked: int) -> Loaded:
+        warnings = [str(warning) for warning in self.current.warnings]
+        return Loaded(self.revision, before, warnings, revoked, self.confirm_by)
 
     async def _go_back(self, revision: int) -> None:
         await self.rollback(revision, who="not confirmed in time")

@@ -1,19 +1,16 @@
 """Revisions of the specifications as the store keeps them; each with the switches that its monitors had last."""
 
 from collections.abc import Awaitable, Callable, Sequence
-from typing import Any
 
 import msgspec
 
 from appliance.specifications.rollout import Switch
 from appliance.specifications.specification_files import Checked, Sources, SpecificationsRefusedError
+from appliance.store.revisions import DISK
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 
 Check = Callable[[Sources, Sequence[str]], Awaitable[Checked]]
 """What these are, with the keys of the site. Raises `SpecificationsRefusedError`."""
-
-DISK = "disk"
-"""Who brought a revision into force that is the folder's."""
 
 NOTHING = MonitorRevisionRow(0, "{}", 0.0, DISK, "")
 """Stands for the one before the first."""
@@ -40,12 +37,6 @@ def sources_of(row: MonitorRevisionRow) -> Sources:
     return msgspec.json.decode(row.sources, type=Sources)
 
 
-def described(row: MonitorRevisionRow, present: int) -> dict[str, Any]:
-    """The fields of `MonitorRevision`; `present` is the revision in force."""
-    known = {name: getattr(row, name) for name in ("revision", "loaded", "who", "note")}
-    return known | {"in_force": row.revision == present, "names": list(sources_of(row).files)}
-
-
 async def check_kept(check: Check, row: MonitorRevisionRow, site_keys: Sequence[str]) -> Checked:
     """Compile what was in force. A newer version of the appliance may refuse it; then there is a way back."""
     try:
@@ -63,8 +54,8 @@ def forget_revision(store: StateStore, now: float) -> int | None:
 
     For an appliance that does not run.
     """
-    last = store.monitor_revision()
-    if last is None or last.who == DISK:
+    last = next(iter(store.monitor_revisions(1)), NOTHING)
+    if last.who == DISK:
         return None
     note = f"revision {last.revision} was given up"
     store.save_monitor_revision(MonitorRevisionRow(last.revision + 1, "{}", now, DISK, note))

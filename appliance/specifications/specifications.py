@@ -5,7 +5,7 @@ Larger than most files because each order is a few lines, and all of them change
 Invariants:
 
 1. The folder is the baseline and only read; what is loaded, replaced or removed while the robot runs is a revision in
-   the store (`revisions.py`) and survives a restart, as the switches (`switches.py`) do.
+   the store (`specification_revisions.py`) and survives a restart, as the switches (`switches.py`) do.
 2. New specifications are compiled before anything changes, by the process that `check` asks; bad ones change nothing
    and say everything that is wrong with them. The relays are given what was compiled, and have the last word.
 3. What is loaded joins monitors in shadow mode that it shares variables with; no load and no switch takes a monitor
@@ -19,19 +19,18 @@ Invariants:
 """
 
 import asyncio
-import contextlib
 import datetime
 import json
 import time
-from collections.abc import AsyncIterator, Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import structlog
 
 from appliance.audit.record import Severity
-from appliance.base.withdrawal import WithdrawnError, require_awaited, take_effect
+from appliance.base.withdrawal import WithdrawnError, take_effect
 from appliance.channel import admin, messages
 from appliance.channel.answers import monitor_answers as answers
 from appliance.channel.answers.monitor_answers import Replaced, Switched
@@ -45,18 +44,16 @@ from appliance.specifications.returns import LONGEST, Returns
 from appliance.specifications.rollout import TRIAL, Parts, Revision, Rollout, Switch
 from appliance.specifications.specification_files import Checked, Sources, SpecificationsRefusedError
 from appliance.specifications.specification_revisions import (
-    DISK,
     NOTHING,
     Check,
     Kept,
     check_kept,
-    described,
     kept_in,
     sources_of,
     text_of,
 )
 from appliance.specifications.switches import Switches, require_whole
-from appliance.store.revisions import Trial, UnknownRevisionError, wanted
+from appliance.store.revisions import DISK, Revisions
 from appliance.store.state_file import MonitorRevisionRow, StateStore
 from appliance.telemetry.audit_trail import AuditTrail
 
@@ -97,13 +94,16 @@ class MonitorsChangedError(Exception):
         self.tag = tag
 
 
-class Monitors:
+class Monitors(Revisions[MonitorRevisionRow]):
     """Keeps specifications and switches. What operators ask of them is answered by the method that takes the request.
 
     `published()` is called when monitors may publish other topics; each of `told` hears of every event that a relay
     reports. Where there are `site_keys`, whatever comes into force is signed with one of them. Changes are made one at
     a time.
     """
+
+    refusal = SpecificationsRefusedError
+    outdated = MonitorsChangedError
 
     def __init__(
         self,
@@ -125,24 +125,23 @@ class Monitors:
         live: Callable[[], Published],
     ) -> None:
         """`check` compiles for an order, `try_out` for a dry run; `live()` is what nodes publish now."""
+        super().__init__(
+            store, store.monitor_revisions, store.save_monitor_revision, NOTHING, "confirm monitors"
+        )
         self.folder = folder
         self._folder = SpecificationFolder(folder)
         self.site_keys = site_keys
         self._check = check
         self._try_out = try_out
         self._live = live
-        self._store = store
         self._trail = trail
         self.switches = Switches(enable)
         self.rollout = Rollout(
             allocation, trail, on_fault, self.switches.states_of, relays, slices=slices, parts=parts
         )
         self._acts = 0  # switches and resumptions, ever
-        self._one_change = asyncio.Lock()
         self._attempting: set[str] = set()  # who has a dry run under way
-        self._trial = Trial(store, "confirm monitors", self._go_back, (SpecificationsRefusedError,))
         self.returns = Returns(store, self._come_back)
-        self.in_force = NOTHING  # until `start`
         self.sources = Sources()
         self.checked = Checked()
         self.records = MonitorRecords(trail, lambda topic, data: self.checked.fields(topic, data), told)  # noqa: PLW0108 - of whatever is in force then
@@ -156,24 +155,22 @@ class Monitors:
         As with the policy: after a crash of control those that were in force; at the appliance's start the folder's,
         unless an operator's own revision was in force when it stopped.
         """
-        settings = self._store.settings()
+        settings = self.store.settings()
         self.switches.said = json.loads(settings.get(_SWITCHES, "{}"))
         self._acts = int(settings.get(_ACTS, "0"))
-        last = self._store.monitor_revision()
-        if last is not None:
-            self.in_force = last
-        if last is not None and (restarted or last.who != DISK):
-            self._enforce(sources_of(last), await check_kept(self._check, last, self.site_keys), last)
-            self._trial.resume()
+        if self._find_last(restarted=restarted):
+            last = self.in_force
+            self._enforce(sources_of(last), await check_kept(self._check, last, self.site_keys))
+            self._resume()
         else:
             sources = self._folder.read()
             checked = await self._check(sources, self.site_keys)
-            if last is not None and sources_of(last) == sources:
-                self._enforce(sources, checked, last)
-                self._trial.resume()
+            if self.revision and sources_of(self.in_force) == sources:
+                self._enforce(sources, checked)
+                self._resume()
             else:
-                self._trial.end()
-                if sources.files or last is not None:
+                self._end_limit()
+                if sources.files or self.revision:
                     self._keep(sources, checked, who=DISK, note="read at start")
         now = self._revision(self.revision, self.sources, self.checked)
         await self.rollout.start(now, restarted=restarted, kept=settings.get(ALLOCATION, ""))
@@ -192,19 +189,9 @@ class Monitors:
         return f"{self.revision}.{self._acts}"
 
     @property
-    def revision(self) -> int:
-        """The number of what is in force; 0 for nothing."""
-        return self.in_force.revision
-
-    @property
     def differs_from_folder(self) -> bool:
         """Whether what is in force is something else than the folder has now; not where there is no folder."""
         return self.folder is not None and self._folder.looked_at() != self.sources
-
-    @property
-    def confirm_by(self) -> float | None:
-        """When what is in force goes back by itself unless confirmed, in seconds since the epoch."""
-        return self._trial.confirm_by
 
     def names(self) -> list[str]:
         """All monitors, in the order in which they see messages."""
@@ -220,34 +207,22 @@ class Monitors:
 
     async def revisions(self, _request: admin.MonitorRevisions) -> answers.MonitorRevisionList:
         """All kept revisions, the newest first."""
-        rows = await self._kept_rows()
-        return answers.MonitorRevisionList(
-            [answers.MonitorRevision(**described(row, self.revision)) for row in rows]
-        )
+        rows = [self._described(row) for row in await self._kept()]
+        return answers.MonitorRevisionList(msgspec.convert(rows, list[answers.MonitorRevision]))
 
     async def texts(self, request: admin.MonitorRevisionWanted) -> answers.RevisionTexts:
         """A revision with its texts. Raises `UnknownMonitorError`."""
-        for row in await self._kept_rows():
-            if row.revision == request.revision:
-                return answers.RevisionTexts(
-                    **described(row, self.revision), **msgspec.structs.asdict(sources_of(row))
-                )
-        raise UnknownMonitorError(f"there is no revision {request.revision} of the specifications")
+        row = await self._find(request.revision)
+        if row is None:
+            raise UnknownMonitorError(f"there is no revision {request.revision} of the specifications")
+        texts = msgspec.structs.asdict(sources_of(row))
+        return msgspec.convert(self._described(row) | texts, answers.RevisionTexts)
 
     def statement(self, relay: int) -> messages.SpecificationsStated:
         """What a relay is told before anything else."""
         return self.rollout.statement(relay)
 
     # --- changing ---
-
-    @contextlib.asynccontextmanager
-    async def _changing(self, expected: str | None) -> AsyncIterator[None]:
-        """Around a change that is meant for this tag. Raises `MonitorsChangedError`."""
-        async with self._one_change:
-            require_awaited()
-            if expected is not None and expected != self.tag:
-                raise MonitorsChangedError(expected, self.tag)
-            yield
 
     async def load(self, request: admin.MonitorLoad, who: str) -> Replaced:
         """Add these files, or replace those of the same name. Raises `SpecificationsRefusedError`.
@@ -346,12 +321,7 @@ class Monitors:
         A monitor that comes back is switched as it was when it went. Raises `SpecificationsRefusedError`.
         """
         async with self._changing(request.expected):
-            row = NOTHING
-            if request.revision != 0:
-                try:
-                    row = wanted(await self._kept_rows(), request.revision, self.revision)
-                except UnknownRevisionError as error:
-                    raise SpecificationsRefusedError([str(error)]) from error
+            row = NOTHING if request.revision == 0 else await self._wanted(request.revision)
             note, switches = f"rolled back to revision {row.revision}", kept_in(row).switches
             return await self._change(sources_of(row), who, who, note, switches=switches, forced=True)
 
@@ -360,7 +330,7 @@ class Monitors:
         async with self._changing(request.expected):
             waited = self.confirm_by is not None
             if waited:
-                self._trial.end()
+                self._end_limit()
                 self._trail.happened(
                     "specifications confirmed",
                     f"revision {self.revision} of the specifications was confirmed",
@@ -368,7 +338,7 @@ class Monitors:
                     resource="",
                     who=who,
                 )
-                await self._store.settled()
+                await self.store.settled()
             return answers.MonitorsConfirmed(waited, self.revision, self.tag)
 
     async def switch(self, request: admin.MonitorSwitch, who: str) -> Switched:
@@ -456,8 +426,8 @@ class Monitors:
             if not retried:
                 self.rollout.tell(name, messages.MonitorSwitched(name, to is True))
             self._say_switched(name, to, who)
-        self._store.save_setting(_SWITCHES, json.dumps(switches.said))
-        await self._store.settled()
+        self.store.save_setting(_SWITCHES, json.dumps(switches.said))
+        await self.store.settled()
         await self.rollout.carried_out()
         return changed
 
@@ -528,9 +498,12 @@ class Monitors:
         trials = frozenset(name for name, state in states.items() if state == TRIAL)
         return Revision(number, sources, checked, trials)
 
-    async def _kept_rows(self) -> list[MonitorRevisionRow]:
-        await self._store.settled()
-        return await asyncio.to_thread(self._store.monitor_revisions)
+    async def _kept(self) -> list[MonitorRevisionRow]:
+        await self.store.settled()
+        return await super()._kept()
+
+    def _described(self, row: MonitorRevisionRow) -> dict[str, Any]:
+        return super()._described(row) | {"names": list(sources_of(row).files)}
 
     def _unknown(self, names: list[str]) -> str:
         known = ", ".join(self.checked.monitors) or "none is loaded"
@@ -543,8 +516,8 @@ class Monitors:
 
     async def _count(self) -> None:
         """The tag is another when this returns; kept before anybody sees it, so that no crash brings one back."""
-        self._store.save_setting(_ACTS, str(self._acts + 1))
-        await self._store.settled()
+        self.store.save_setting(_ACTS, str(self._acts + 1))
+        await self.store.settled()
         self._acts += 1
 
     async def _go_back(self, revision: int) -> None:
@@ -595,12 +568,19 @@ class Monitors:
             )
             raise SpecificationsRefusedError(findings) from error
         began = self.rollout.began(checked.monitors)
-        self._trial.announce(before, confirm_within)
-        self._keep(sources, checked, who=keeper, note=note, by=who, began=began, warnings=warnings)
+        self._keep(
+            sources,
+            checked,
+            who=keeper,
+            note=note,
+            by=who,
+            within=confirm_within,
+            began=began,
+            warnings=warnings,
+        )
         for name in put:
             self._say_switched(name, TRIAL, who, ", as it was loaded")
-        self._trial.changed(before, confirm_within)
-        await self._store.settled()
+        await self.store.settled()
         await self.rollout.all_taken()
         self._published()
         began = self.rollout.began(checked.monitors)  # by those that have it only now, too
@@ -645,16 +625,17 @@ class Monitors:
         who: str,
         note: str,
         by: str | None = None,
+        within: float | None = None,
         began: Sequence[str] = (),
         warnings: Sequence[str] = (),
     ) -> None:
         last, before = self.in_force, sources_of(self.in_force)
         if last.revision:
             ended = Kept(before.files, before.definitions, before.signatures, self.switches.said)
-            self._store.save_monitor_revision(last._replace(sources=text_of(ended)))
+            self.store.save_monitor_revision(last._replace(sources=text_of(ended)))
         row = MonitorRevisionRow(last.revision + 1, text_of(sources), time.time(), who, note)
-        self._store.save_monitor_revision(row)
-        self._enforce(sources, checked, row)
+        self._put_in_force(row, within)
+        self._enforce(sources, checked)
         added, changed, removed = sources.difference(before)
         self._trail.happened(
             "specifications loaded",
@@ -675,12 +656,12 @@ class Monitors:
             warnings=[*checked.warnings, *warnings][:100],
         )
 
-    def _enforce(self, sources: Sources, checked: Checked, row: MonitorRevisionRow) -> None:
-        self.sources, self.checked, self.in_force = sources, checked, row
+    def _enforce(self, sources: Sources, checked: Checked) -> None:
+        self.sources, self.checked = sources, checked
         for name in self.switches.enforce(checked):
-            self._say_switched(name, TRIAL, row.who, ": it shares variables with one that is")
+            self._say_switched(name, TRIAL, self.in_force.who, ": it shares variables with one that is")
         self.returns.keep(self._disabled())
-        self._store.save_setting(_SWITCHES, json.dumps(self.switches.said))
+        self.store.save_setting(_SWITCHES, json.dumps(self.switches.said))
 
 
 def _moment(seconds: float) -> str:

@@ -1,111 +1,187 @@
-"""What the revisions of the policy and of the specifications have in common: a way back, and a time limit on it."""
+"""Keep revisions: list them, go back to one, and limit the time of a change that is not confirmed."""
 
 import asyncio
+import contextlib
 import time
-from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from abc import ABC, abstractmethod
+from collections.abc import AsyncIterator, Callable
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import structlog
 
+from appliance.base.withdrawal import require_awaited
 from appliance.store.state_file import StateStore
 from appliance.store.writer_thread import StoreError
 
 _log = structlog.get_logger()
 _AGAIN_SECONDS = 5.0
 
+DISK = "disk"
+"""The `who` of a revision that was read from the disk."""
 
-class Numbered(Protocol):
-    """A revision that is kept."""
+
+class Row(Protocol):
+    """A kept revision."""
 
     @property
     def revision(self) -> int:
-        """Its number."""
+        """Its number; 0 before the first."""
+
+    @property
+    def who(self) -> str:
+        """The operator who brought it into force, or `DISK`."""
+
+    def _asdict(self) -> dict[str, Any]: ...
 
 
-N = TypeVar("N", bound=Numbered)
+R = TypeVar("R", bound=Row)
 
 
-class UnknownRevisionError(Exception):
-    """There is no such revision; the text says which there are."""
+class Revisions(ABC, Generic[R]):
+    """Keep the revisions of one thing, and change the one in force one change at a time.
 
-
-def wanted(rows: Sequence[N], revision: int | None, present: int) -> N:
-    """A kept revision (None: the one before the present). Raises `UnknownRevisionError`."""
-    known = {row.revision: row for row in rows}
-    number = revision if revision is not None else max((node for node in known if node < present), default=0)
-    if number not in known:
-        kept = ", ".join(map(str, sorted(known))) or "none"
-        asked = "before this one" if revision is None else revision
-        raise UnknownRevisionError(f"there is no revision {asked}; kept are: {kept}")
-    return known[number]
-
-
-@dataclass(slots=True)
-class Trial:
-    """A change that goes back by itself unless it is confirmed, over restarts of control and of the appliance.
-
-    `setting` is the name under which the store has it. `go_back(revision)` brings that revision into force; where it
-    raises one of `refusals`, it is called again after `_AGAIN_SECONDS`: nobody is there who could do it by hand.
+    A change can have a time limit: it goes back automatically unless it is confirmed, over restarts of control and of
+    the appliance. Where going back raises `refusal`, it is tried again after `_AGAIN_SECONDS`, because no person may be
+    there to do it.
     """
 
-    store: StateStore
-    setting: str
-    go_back: Callable[[int], Awaitable[object]]
-    refusals: tuple[type[Exception], ...]
-    task: asyncio.Task[None] | None = None
-    confirm_by: float | None = None  # seconds since the epoch
-    _back_to: int = 0  # the last revision that needed no confirmation
+    refusal: ClassVar[type[Exception]]
+    """The error for a revision that cannot come into force; it takes findings."""
+    outdated: ClassVar[type[Exception]]
+    """The error for a change that was meant for another tag; it takes that tag and the present one."""
 
-    def announce(self, present: int, within: float | None) -> None:
-        """A change comes; it is in the store before the revision is: control may die while the change is made."""
-        if within is not None:
-            self._save(self._target(present), time.time() + within, within)
+    def __init__(
+        self,
+        store: StateStore,
+        rows: Callable[..., list[R]],
+        save: Callable[[R], None],
+        nothing: R,
+        setting: str,
+    ) -> None:
+        """Read revisions with `rows(limit)`, the newest first, and write them with `save`.
 
-    def changed(self, before: int, within: float | None) -> None:
-        """The change is made: `before` was in force. Without `within` seconds nothing waits any more."""
-        back_to = self._target(before)
-        self.end()
-        if within is not None:
-            self._await(back_to, time.time() + within, within)
+        `nothing` is in force until the start. The store has the time limit under the name `setting`.
+        """
+        self.store = store
+        self._rows = rows
+        self._save = save
+        self._setting = setting
+        self._one_change = asyncio.Lock()
+        self._back_to = 0  # the last revision that needed no confirmation
+        self.in_force = nothing
+        self.confirm_by: float | None = None  # seconds since the epoch
+        self.going_back: asyncio.Task[None] | None = None
 
-    def end(self) -> None:
-        """What is in force stays."""
-        if self.task is not None and self.task is not asyncio.current_task():
-            self.task.cancel()
-        self.task = self.confirm_by = None
-        self.store.save_setting(self.setting, "")
+    @property
+    def revision(self) -> int:
+        """The number of the revision in force; 0 for none."""
+        return self.in_force.revision
 
-    def resume(self) -> None:
-        """Go on waiting after a start."""
-        kept = self.store.settings().get(self.setting, "")
+    @property
+    def tag(self) -> int | str:
+        """Names the state that a change is meant for: `expected` of a request."""
+        return self.revision
+
+    @abstractmethod
+    async def _go_back(self, revision: int) -> None:
+        """Bring a revision into force again that was not confirmed in time."""
+
+    # --- start ---
+
+    def _find_last(self, *, restarted: bool) -> bool:
+        """Set the last revision in force; return whether the start takes it whatever the disk has.
+
+        After a crash of control (`restarted`) it does. At the appliance's start it does so for an operator's own
+        revision (a rollback, REST).
+        """
+        self.in_force = next(iter(self._rows(1)), self.in_force)
+        return self.revision > 0 and (restarted or self.in_force.who != DISK)
+
+    def _resume(self) -> None:
+        """Resume the time limit after a start."""
+        kept = self.store.settings().get(self._setting, "")
         if kept:
             back_to, deadline, length = (*kept.split(), "inf")[:3]  # up to 0.1.0 the length was not kept
             within = float(length)
             # Not later than after its whole length: the clock may have been set back since.
-            self._await(int(back_to), min(float(deadline), time.time() + within), within)
+            self._limit(int(back_to), min(float(deadline), time.time() + within), within)
 
-    def _target(self, present: int) -> int:
-        return present if self.confirm_by is None else self._back_to
+    # --- reading ---
 
-    def _save(self, back_to: int, deadline: float, within: float) -> None:
-        self.store.save_setting(self.setting, f"{back_to} {deadline} {within}")
+    async def _kept(self) -> list[R]:
+        """Return all kept revisions, the newest first."""
+        return await asyncio.to_thread(self._rows)
 
-    def _await(self, back_to: int, deadline: float, within: float) -> None:
+    def _described(self, row: R) -> dict[str, Any]:
+        """Return the fields of a revision for an answer."""
+        return row._asdict() | {"in_force": row.revision == self.revision}
+
+    async def _find(self, revision: int) -> R | None:
+        return next((row for row in await self._kept() if row.revision == revision), None)
+
+    async def _wanted(self, revision: int | None) -> R:
+        """Return the kept revision to go back to (None: the one before the present).
+
+        Raises `refusal` if there is none, and `outdated` if another came into force while they were read.
+        """
+        before = self.revision
+        known = {row.revision: row for row in await self._kept()}
+        if self.revision != before:
+            raise self.outdated(before, self.revision)
+        previous = max((number for number in known if number < before), default=0)
+        row = known.get(previous if revision is None else revision)
+        if row is None:
+            kept = ", ".join(map(str, sorted(known))) or "none"
+            asked = "before this one" if revision is None else revision
+            raise self.refusal([f"there is no revision {asked}; kept are: {kept}"])
+        return row
+
+    # --- changing ---
+
+    @contextlib.asynccontextmanager
+    async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
+        """Wait for other changes, then make one that is meant for this tag. Raises `outdated`."""
+        async with self._one_change:
+            require_awaited()
+            if expected not in (None, self.tag):
+                raise self.outdated(expected, self.tag)
+            yield
+
+    def _put_in_force(self, row: R, within: float | None = None) -> None:
+        """Keep a revision that comes into force; unless confirmed, it goes back after `within` seconds."""
+        if within is not None:  # first, because control may die while the change is made
+            back_to = self.revision if self.confirm_by is None else self._back_to
+            self._limit(back_to, time.time() + within, within)
+        self._save(row)
+        self.in_force = row
+        if within is None:
+            self._end_limit()
+
+    def _end_limit(self) -> None:
+        """Leave the revision in force for good."""
+        self._stop_waiting()
+        self.store.save_setting(self._setting, "")
+
+    def _stop_waiting(self) -> None:
+        if self.going_back is not None and self.going_back is not asyncio.current_task():
+            self.going_back.cancel()
+        self.going_back = self.confirm_by = None
+
+    def _limit(self, back_to: int, deadline: float, within: float) -> None:
+        self.store.save_setting(self._setting, f"{back_to} {deadline} {within}")
+        self._stop_waiting()
         self._back_to, self.confirm_by = back_to, deadline
-        self._save(back_to, deadline, within)
-        self.task = asyncio.get_running_loop().create_task(self._run(back_to, deadline))
+        self.going_back = asyncio.get_running_loop().create_task(self._run(back_to, deadline))
 
     async def _run(self, back_to: int, deadline: float) -> None:
         await asyncio.sleep(max(0.0, deadline - time.time()))
         while True:
             try:
-                await self.go_back(back_to)
-            except self.refusals as error:
+                await self._go_back(back_to)
+            except self.refusal as error:
                 _log.error("an unconfirmed change cannot go back yet", revision=back_to, error=str(error))
                 await asyncio.sleep(_AGAIN_SECONDS)
+                continue
             except StoreError as error:
                 _log.error("an unconfirmed change went back, and this is not kept", reason=str(error))
-                return
-            else:
-                return
+            return

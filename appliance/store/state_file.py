@@ -242,11 +242,12 @@ class StateStore:
         self.database.put("policy_signature", row.revision, row.signature)
         self.database.put("policy_revision", *row[:-1])
 
-    def revisions(self) -> list[RevisionRow]:
-        """All kept revisions, the newest first."""
+    def revisions(self, limit: int = -1) -> list[RevisionRow]:
+        """Return kept revisions, the newest first: all, or the last `limit`."""
         rows = self.database.query(
             "SELECT policy_revision.*, coalesce(signature, '') FROM policy_revision"
-            " LEFT JOIN policy_signature USING (revision) ORDER BY revision DESC"
+            " LEFT JOIN policy_signature USING (revision) ORDER BY revision DESC LIMIT ?",
+            (limit,),
         )
         return [RevisionRow(*row) for row in rows]
 
@@ -254,15 +255,10 @@ class StateStore:
         """Keep specifications that come into force."""
         self.database.put("monitor_revision", *row)
 
-    def monitor_revisions(self) -> list[MonitorRevisionRow]:
-        """All kept revisions of the specifications, the newest first."""
-        rows = self.database.query("SELECT * FROM monitor_revision ORDER BY revision DESC")
+    def monitor_revisions(self, limit: int = -1) -> list[MonitorRevisionRow]:
+        """Return kept revisions of the specifications, the newest first: all, or the last `limit`."""
+        rows = self.database.query("SELECT * FROM monitor_revision ORDER BY revision DESC LIMIT ?", (limit,))
         return [MonitorRevisionRow(*row) for row in rows]
-
-    def monitor_revision(self) -> MonitorRevisionRow | None:
-        """The last that came into force; None when there never was one."""
-        rows = self.database.query("SELECT * FROM monitor_revision ORDER BY revision DESC LIMIT 1")
-        return MonitorRevisionRow(*rows[0]) if rows else None
 
     # --- tokens ---
 

@@ -75,8 +75,8 @@ class Appliance:
         try:
             yield policies
         finally:
-            if policies.trial.task is not None:
-                policies.trial.task.cancel()
+            if policies.going_back is not None:
+                policies.going_back.cancel()
             store.close()
 
 
@@ -250,9 +250,9 @@ async def test_nothing_waits_for_the_disk_on_the_loop(
     with Appliance(tmp_path).started() as policies:
         read, loop_thread, asked = policies.store.database.query, threading.get_ident(), []
 
-        def query(sql: str) -> list[tuple[Any, ...]]:
+        def query(*given: Any) -> list[tuple[Any, ...]]:
             asked.append(threading.get_ident())
-            return read(sql)
+            return read(*given)
 
         monkeypatch.setattr(policies.store.database, "query", query)
         assert (await policies.load(PolicyLoad(OTHER), "eve")).revision == 2

@@ -1,29 +1,109 @@
-"""Which kept revision somebody means who wants to go back."""
+"""Which kept revision a rollback takes, and what a time limit leaves in the store."""
 
-from typing import NamedTuple
+import time
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from appliance.store.revisions import UnknownRevisionError, wanted
+from appliance.store.revisions import Revisions
+from appliance.store.state_file import MonitorRevisionRow, StateStore
+
+pytestmark = pytest.mark.anyio
 
 
-class Row(NamedTuple):
-    """A kept revision."""
-
-    revision: int
+class RefusedError(Exception):
+    """A revision cannot come into force."""
 
 
-ROWS = [Row(7), Row(5), Row(4)]
+class ChangedError(Exception):
+    """Another revision is in force."""
 
 
-def test_without_a_number_it_is_the_one_before() -> None:
+def row(revision: int, who: str = "eve") -> MonitorRevisionRow:
+    """A revision of anything."""
+    return MonitorRevisionRow(revision, "{}", float(revision), who, "")
+
+
+class Keeper(Revisions[MonitorRevisionRow]):
+    """Revisions of nothing in particular."""
+
+    refusal = RefusedError
+    outdated = ChangedError
+
+    def __init__(self, store: StateStore) -> None:
+        super().__init__(store, store.monitor_revisions, store.save_monitor_revision, row(0), "limit")
+
+    async def _go_back(self, revision: int) -> None:
+        raise AssertionError(revision)
+
+    def change(self, to: MonitorRevisionRow, within: float | None = None) -> None:
+        """Bring a revision into force."""
+        self._put_in_force(to, within)
+
+    def started(self, *, restarted: bool) -> bool:
+        """Return whether a start takes the kept revision whatever the disk has."""
+        return self._find_last(restarted=restarted)
+
+    async def wanted(self, revision: int | None) -> MonitorRevisionRow:
+        """Return the revision that a rollback takes."""
+        return await self._wanted(revision)
+
+    def limit(self) -> list[str]:
+        """Return the time limit in the store: the revision to go back to, the deadline, the length."""
+        return self.store.settings()["limit"].split()
+
+
+@pytest.fixture
+def keeper(tmp_path: Path) -> Iterator[Keeper]:
+    """Revisions 4, 5 and 7."""
+    store = StateStore(tmp_path, failed=pytest.fail)
+    keeper = Keeper(store)
+    for number in (4, 5, 7):
+        keeper.change(row(number))
+    yield keeper
+    store.close()
+
+
+async def test_without_a_number_it_is_the_one_before(keeper: Keeper) -> None:
     """The last that is kept below the present one, also where numbers are missing."""
-    assert wanted(ROWS, None, 7) == Row(5)
-    assert wanted(ROWS, 4, 7) == Row(4)
+    assert await keeper.wanted(None) == row(5)
+    assert await keeper.wanted(4) == row(4)
 
 
 @pytest.mark.parametrize(("asked", "said"), [(None, "before this one"), (0, "0"), (6, "6")])
-def test_the_error_says_what_was_asked_for_and_what_there_is(asked: int | None, said: str) -> None:
+async def test_the_error_says_what_was_asked_for_and_what_there_is(
+    keeper: Keeper, asked: int | None, said: str
+) -> None:
     """Revision 0 is a number as any other."""
-    with pytest.raises(UnknownRevisionError, match=f"^there is no revision {said}; kept are: 4, 5, 7$"):
-        wanted(ROWS, asked, 4)
+    keeper.in_force = row(4)
+    with pytest.raises(RefusedError) as caught:
+        await keeper.wanted(asked)
+    assert caught.value.args == ([f"there is no revision {said}; kept are: 4, 5, 7"],)
+
+
+async def test_a_change_on_a_change_goes_back_to_the_last_that_needed_no_confirmation(keeper: Keeper) -> None:
+    """The limit starts again with the second change; a change without a limit ends it."""
+    begun = time.time()
+    for number, within in ((8, 300.0), (9, 600.0)):
+        keeper.change(row(number), within)
+        back_to, deadline, length = keeper.limit()
+        assert (back_to, float(length)) == ("7", within)
+        assert begun + within <= float(deadline) <= time.time() + within
+        assert keeper.confirm_by == float(deadline)
+    keeper.change(row(10))
+    assert (keeper.limit(), keeper.confirm_by, keeper.going_back) == ([], None, None)
+
+
+@pytest.mark.parametrize(
+    ("who", "restarted", "taken"),
+    [("eve", False, True), ("eve", True, True), ("disk", True, True), ("disk", False, False)],
+)
+async def test_only_a_start_of_the_appliance_reads_the_disk_in_place_of_its_revision(
+    keeper: Keeper, who: str, restarted: bool, taken: bool
+) -> None:
+    """An operator's own revision survives every start."""
+    keeper.change(row(8, who))
+    again = Keeper(keeper.store)
+    assert again.started(restarted=restarted) is taken
+    assert again.in_force == row(8, who)

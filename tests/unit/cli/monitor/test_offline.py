@@ -33,7 +33,7 @@ def last(state: Path) -> MonitorRevisionRow | None:
     """The last revision."""
     store = StateStore(state / "control", failed=print)
     try:
-        return store.monitor_revision()
+        return next(iter(store.monitor_revisions(1)), None)
     finally:
         store.close()
 
