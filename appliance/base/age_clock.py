@@ -1,16 +1,16 @@
-"""The clock by which ages are counted: what is kept for so many days goes when these have passed.
+"""A clock for the age of kept data, robust against wrong system time.
 
-A machine's clock may be years off after a start, or set by mistake, until somebody or a time service puts it right.
-Whoever removes what is old would have removed everything by then.
+After a start the system clock may be years off until a person or a time service corrects it. A retention limit that
+trusted it would delete everything at once.
 
 Invariants:
 
-1. While the process runs, what passes is what the monotonic clock says: nothing that is set counts, and it never goes
-   back.
-2. How long it was off only the machine's clock says. Up to `_AT_ONCE` counts at once; more counts when the clock has
-   stood so far ahead for `_STANDS` of running, by the least that it was meanwhile. A clock that is behind counts for
-   nothing until it is put right.
-3. It goes on over restarts: its file is written every `_SAVE`, and what was lost of it counts as time off.
+1. While the process runs, the age clock follows the monotonic clock. It ignores changes of the system clock and never
+   goes back.
+2. Only the system clock tells how long the process was off. A gap of up to `_AT_ONCE` counts at once. A longer gap
+   counts after the system clock has been ahead for `_STANDS` of running time, by the smallest gap seen meanwhile. A
+   system clock that is behind adds nothing until it is corrected.
+3. The clock continues after a restart. Its file is written every `_SAVE`; time lost since then counts as time off.
 """
 
 import time
@@ -31,24 +31,24 @@ _log = structlog.get_logger()
 
 
 class _Kept(msgspec.Struct):
-    """All in nanoseconds."""
+    """Store the state of the clock; all fields are in nanoseconds."""
 
-    lived: int  # that the machine ran with the process
-    credited: int  # beside `lived`, what counts as passed: since the epoch
-    believed: int  # what the machine's clock said beyond `lived` when that was looked at last
-    sets: int = 0  # what of it was set while the process ran, and did not count
-    step: int = 0  # how far it stood from there at the start, as long as that does not count
-    since: int = 0  # `lived` when that was seen first
+    lived: int  # running time of the machine while the process ran
+    credited: int  # time since the epoch that counts in addition to `lived`
+    believed: int  # the system clock minus `lived`, when last read
+    sets: int = 0  # the part that was set while the process ran and did not count
+    step: int = 0  # the gap at the start, until it counts
+    since: int = 0  # `lived` when the gap was first seen
 
 
 def _monotonic() -> int:
-    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)  # a suspended machine's time passes, too
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)  # includes the time of a suspended machine
 
 
 class AgeClock:
-    """Nanoseconds since the epoch where the machine's clock was never wrong; kept in the file at `path`.
+    """Return nanoseconds since the epoch as if the system clock had never been wrong; keep them in the file at `path`.
 
-    Where there is no such file it begins at `begin()`, or now. Raises `OSError` where it cannot be read.
+    Without the file the clock starts at `begin()`, or now. Raises `OSError` if the file cannot be read.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class AgeClock:
         self._monotonic = monotonic
         self._seen = monotonic()
         self._saved = -_SAVE
-        self._open = True  # it is not known yet how long it was off
+        self._open = True  # whether the time off is still unknown
         try:
             self._kept = msgspec.json.decode(path.read_bytes(), type=_Kept)
         except (FileNotFoundError, msgspec.MsgspecError) as error:
@@ -74,7 +74,7 @@ class AgeClock:
             self._kept = _Kept(0, begin() or now, now)
 
     def __call__(self) -> int:
-        """What it is now."""
+        """Return the current time of this clock."""
         kept, seen = self._kept, self._monotonic()
         kept.lived += seen - self._seen
         self._seen = seen
@@ -87,12 +87,12 @@ class AgeClock:
             kept.sets += moved
         if bool(kept.step) is not stood or kept.lived - self._saved >= _SAVE:
             self._saved = kept.lived
-            with suppress(OSError):  # a full disk: it is tried again
+            with suppress(OSError):  # a full disk: the next save tries again
                 write_whole(self._path, msgspec.json.encode(kept), 0o600)
         return kept.lived + kept.credited
 
     def _was_off(self, ahead: int) -> None:
-        """By the machine's clock it was off for so long."""
+        """Count the gap of the system clock as time off, if it is credible."""
         kept, counts = self._kept, 0
         if abs(ahead) <= _AT_ONCE:
             kept.step, counts = 0, max(0, ahead)

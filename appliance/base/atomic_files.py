@@ -1,4 +1,4 @@
-"""Files that are there as a whole or not at all, whatever dies meanwhile."""
+"""Write files atomically: a crash leaves the old file or the new one, never a part."""
 
 import contextlib
 import os
@@ -9,22 +9,22 @@ import sys
 from pathlib import Path
 
 _UNFINISHED = re.compile(r".+\.[0-9a-f]{8}\.new(-journal)?")
-"""What `name_to_make` gives; beside a database there is a journal."""
+"""Matches the names that `name_to_make` returns, and the journal of a database with such a name."""
 
 
 class NotLastingError(OSError):
-    """The file is replaced, and may be as it was before after a power cut: the disk did not say that it has it."""
+    """Report a file that is replaced but not surely on the disk: after a power cut the old one may be back."""
 
 
 def name_to_make(path: Path) -> Path:
-    """Where a file is made that gets this name when it is whole: under one of its own, which nothing left has."""
+    """Return a unique temporary name beside `path`; the finished file is renamed to `path`."""
     return path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
 
 
 def remove_unfinished(folder: str, place: int) -> None:
-    """Take away what writers of a folder of `place` (a descriptor), and of those in it, were killed over.
+    """Remove the temporary files of killed writers in a folder of `place` (a descriptor) and in its subfolders.
 
-    None of them may be at work. What cannot be removed stays: it keeps nobody from writing.
+    No writer may be active. Files that cannot be removed stay; they block no writer.
     """
     with contextlib.suppress(OSError):
         for _path, _folders, files, inside in os.fwalk(folder, follow_symlinks=False, dir_fd=place):
@@ -36,8 +36,8 @@ def remove_unfinished(folder: str, place: int) -> None:
 def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | None = None) -> None:
     """Replace a file, on the disk when this returns. Raises `OSError`; the file before is then as it was.
 
-    It is of `owner` (user and group), or of who writes it, before it has its name. Of several who write it at once it
-    is one's, whole. Raises `NotLastingError` when it is replaced, but not surely on the disk.
+    The file gets its `owner` (user and group; default: the writer) before its name. Of several concurrent writers one
+    wins, with its whole file. Raises `NotLastingError` if the file is replaced, but not surely on the disk.
     """
     making = name_to_make(path)
     try:
@@ -48,7 +48,7 @@ def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | Non
             with os.fdopen(descriptor, "wb") as file:
                 if owner is not None:
                     os.fchown(descriptor, *owner)
-                os.fchmod(descriptor, mode)  # whatever the mask is: the folder says who comes by
+                os.fchmod(descriptor, mode)  # independent of the umask: the folder restricts access
                 file.write(data)
                 file.flush()
                 os.fsync(descriptor)
@@ -56,12 +56,12 @@ def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | Non
         except BaseException:
             making.unlink()
             raise
-    except OSError as error:  # a full disk: the system does not say of which file
+    except OSError as error:  # a full disk: the system does not name the file
         raise OSError(error.errno, error.strerror, str(path)) from error
     try:
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
-            os.fsync(folder)  # else the file before could come back with the power
+            os.fsync(folder)  # otherwise the old file could return after a power cut
         finally:
             os.close(folder)
     except OSError as error:
@@ -70,11 +70,11 @@ def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | Non
 
 
 def write_where_told(path: Path, data: bytes) -> None:
-    """Write what somebody wants at a place of his choice. Raises `OSError`.
+    """Write data to a path that a person chose. Raises `OSError`.
 
-    A file is replaced as a whole and keeps its mode and owner, also behind a link. What is no file (a pipe, a device),
-    or has an owner that this process cannot give it again, is written into; and so is what this process's own output
-    goes to (/dev/stdout), behind what it has said.
+    A regular file is replaced atomically and keeps its mode and owner, also behind a link. A pipe, a device, or a file
+    with an owner that this process cannot restore is written in place. The process's own output (/dev/stdout) gets the
+    data after its earlier output.
     """
     try:
         there = path.stat()
@@ -82,7 +82,7 @@ def write_where_told(path: Path, data: bytes) -> None:
         write_whole(path, data, 0o644)
         return
     for stream in filter(None, (sys.stdout, sys.stderr)):
-        with contextlib.suppress(OSError, ValueError):  # it is closed, or is no file
+        with contextlib.suppress(OSError, ValueError):  # the stream is closed or is not a file
             if os.path.samestat(there, os.fstat(stream.fileno())):
                 stream.flush()
                 with os.fdopen(os.dup(stream.fileno()), "wb") as output:

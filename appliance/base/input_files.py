@@ -1,7 +1,7 @@
-"""Reads files that a person names, or that are in a folder a person names: regular files, and never without a bound.
+"""Read files that a person names, or files in such a folder: regular files only, and with a size limit.
 
-A named pipe keeps its reader waiting for ever, a device can have no end, and a file may be larger than the memory. Each
-is an `OSError` here, whose text says what it is, so that it gets to the person as one that is missing does.
+A named pipe may block its reader for ever, a device may be endless, and a file may exceed the memory. Each raises an
+`OSError` that names the cause, so callers report it like a missing file.
 """
 
 import errno
@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 LONGEST = 64 << 20
-"""Bytes of a text, unless its reader says how many."""
+"""The default limit in bytes."""
 
 _NULL = os.makedev(1, 3)  # /dev/null: an empty file
 _KINDS = {
@@ -25,7 +25,7 @@ _KINDS = {
 
 
 def open_given(path: Path) -> io.BufferedReader:
-    """Open a regular file, or the pipe that a shell made of `<(command)` or `command |`. Raises `OSError`."""
+    """Open a regular file, or the pipe that a shell made for `<(command)` or `command |`. Raises `OSError`."""
     descriptor = os.open(os.fspath(path), os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     try:
         about = os.fstat(descriptor)

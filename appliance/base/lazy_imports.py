@@ -1,4 +1,4 @@
-"""Modules that are imported when they are first needed, as those of a process's start are."""
+"""Import modules on first use, without the cost of a garbage collection."""
 
 import gc
 import importlib
@@ -7,9 +7,9 @@ from typing import Any
 
 
 def load(name: str, prepare: str = "") -> Any:
-    """The module of this name, after its function `prepare` has made what each later call would.
+    """Return the module of this name; on the first call also run its function `prepare`, which fills its caches.
 
-    What a module makes stays: looking through it for garbage would be a tenth of its import, and of each later look.
+    A module's objects stay for good. A garbage collection over them would cost a tenth of the import, each time.
     """
     if name not in sys.modules:
         gc.disable()

@@ -1,7 +1,7 @@
-"""What is wrong with a value, in words: what it must be, and which known one was meant.
+"""Describe an invalid value for users: what it must be, and the nearest known value.
 
-Values are read by pydantic (configuration, command line, parameters of REST) and msgspec (bodies of REST); what those
-say of a value is for programmers, and reaches nobody.
+pydantic reads the configuration, the command line and REST parameters; msgspec reads REST bodies. Their own messages
+are for programmers and are never shown.
 """
 
 import difflib
@@ -38,7 +38,7 @@ _MUST_BE = {
     "too_long": "{max_length} at most in number",
     "too_short": "{min_length} at least in number",
 }
-"""What a value must be: by the kind of pydantic's errors, the first word of that, or a type in msgspec's."""
+"""Descriptions of valid values, by type or first word of pydantic's error type, or by msgspec's type name."""
 _BOUNDS = {">=": "at least", "<=": "at most", ">": "more than", "<": "less than"}
 _PARTS = {"str": "characters", "array": "entries", "object": "fields"}
 _BODY: dict[str, Callable[..., str]] = {
@@ -54,7 +54,7 @@ _BODY: dict[str, Callable[..., str]] = {
     r"(?s)Object contains unknown field `(.*)`": lambda name: f"there is no field `{name}`",
     r"Number out of range": lambda: "must be a smaller number",
 }
-"""What msgspec says of a value, and what is said of it here."""
+"""Patterns of msgspec's messages, and the messages for users."""
 
 
 _YAML = {
@@ -65,11 +65,11 @@ _YAML = {
     "end of stream": "close the quote",
     "cannot start any token|undefined alias": "put the text in quotes",
 }
-"""What to do about what the parser says of a text that is not YAML."""
+"""Advice for messages of the YAML parser."""
 
 
 def not_yaml(problem: object) -> str:
-    """`is not YAML: ` with what the parser says of it, and what to do."""
+    """Return `is not YAML: ` with the parser's message and advice."""
     said = " ".join(str(problem).split())
     return "; ".join(
         [f"is not YAML: {said}", *[do for what, do in _YAML.items() if re.search(what, said)][:1]]
@@ -77,7 +77,7 @@ def not_yaml(problem: object) -> str:
 
 
 def nearest(word: str, candidates: Collection[str]) -> str | None:
-    """The candidate that `word` was most likely meant to be."""
+    """Return the candidate nearest to `word`."""
     if len(candidates) > _MAXIMUM_CANDIDATES or len(word) > 100:
         return None
     folded = {candidate.casefold(): candidate for candidate in candidates}
@@ -86,29 +86,29 @@ def nearest(word: str, candidates: Collection[str]) -> str | None:
 
 
 def meant(word: str, candidates: Collection[str]) -> str:
-    """`; did you mean X?` for the nearest candidate, or nothing."""
+    """Return `; did you mean X?` for the nearest candidate, or an empty string."""
     found = nearest(word, candidates)
     return f"; did you mean {found}?" if found else ""
 
 
 def must_be(error: Mapping[str, Any]) -> str:
-    """What a value must be, of one of pydantic's `errors()`."""
+    """Return what a value must be, from one of pydantic's `errors()`."""
     kind, context = str(error["type"]), error.get("ctx") or {}
     wanted = _MUST_BE.get(kind) or _MUST_BE.get(kind.partition("_")[0]) or f"of another form ({kind})"
     return wanted.format(**{name: _plain(value) for name, value in context.items()})
 
 
 def refusal(error: Mapping[str, Any]) -> str:
-    """What is wrong with a value of the command line or of a query, of one of pydantic's `errors()`."""
+    """Return the error of a command line or query value, from one of pydantic's `errors()`."""
     if error["type"] == "missing":
         return "must be given"
-    if error["type"] == "value_error":  # a sentence of whoever reads it, which names the value
+    if error["type"] == "value_error":  # our own validator wrote the sentence, which names the value
         return str(error["ctx"]["error"])
     return f"must be {must_be(error)}, not {_cut(repr(error['input']))}"
 
 
 def body_refusal(text: str, choices: Collection[str] = ()) -> str:
-    """What is wrong with a part of a body, of the text of msgspec's `ValidationError` without its place.
+    """Return the error of a part of a body, from msgspec's `ValidationError` without its path.
 
     `choices`: the texts that the part may be, where it is one of a few.
     """
@@ -130,5 +130,5 @@ def _typed(types: str) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """A whole number without a fraction: libraries keep the bounds of a number as `1.0`."""
+    """Format a whole number without a fraction; libraries store bounds as `1.0`."""
     return int(value) if isinstance(value, float) and value.is_integer() else value

@@ -1,15 +1,15 @@
-"""Orders whose client does not wait for the answer any more: they are withdrawn before they take effect.
+"""Withdraw orders whose client no longer waits for the answer, before they take effect.
 
 Invariants:
 
-1. What carries out an order calls `take_effect` before it changes anything. It raises `WithdrawnError` when the client
-   gave up before (its time is over, it disconnected, it was killed): nothing is changed then, and nothing will be.
-2. After `take_effect` the order is carried out to its end, whatever its client does. So a client that was given no
-   answer knows that nothing begins any more, and the audit log has what did.
-3. What runs outside an order (a start, a signal, an automatic rollback) is never withdrawn; neither are tasks that an
-   order left behind.
+1. The code of an order calls `take_effect` before its first change. `take_effect` raises `WithdrawnError` if the client
+   gave up earlier (timeout, disconnection, kill). Nothing is changed then, and nothing will be.
+2. After `take_effect` the order runs to its end, whatever its client does. A client without an answer therefore knows
+   that nothing starts later; the audit log has every order that started.
+3. Work outside an order (a start, a signal, an automatic rollback) is never withdrawn, nor are tasks that outlive their
+   order.
 
-The order is a context variable: it is the same for everything that is awaited for one request, and for nothing else.
+The order is a context variable, shared by everything that is awaited for one request.
 """
 
 import contextlib
@@ -20,14 +20,14 @@ WITHDRAWN = "its client did not wait any longer, so the order was withdrawn befo
 
 
 class WithdrawnError(Exception):
-    """The client of an order gave up before the order took effect: nothing was changed."""
+    """Report that the client gave up before the order took effect; nothing was changed."""
 
     def __init__(self) -> None:
         super().__init__(WITHDRAWN)
 
 
 class _Order:
-    """`given_up()` says whether its client does not wait any more; `begun`: that does not matter any more."""
+    """Store `given_up()`, whether the client stopped waiting, and `begun`, after which that has no effect."""
 
     def __init__(self, given_up: Callable[[], bool]) -> None:
         self.given_up = given_up
@@ -39,25 +39,25 @@ _PRESENT: ContextVar[_Order | None] = ContextVar("order", default=None)
 
 @contextlib.contextmanager
 def awaited(given_up: Callable[[], bool]) -> Iterator[None]:
-    """Around what is done for one request; `given_up()` says whether its client does not wait any more."""
+    """Surround the work for one request; `given_up()` returns whether its client stopped waiting."""
     order = _Order(given_up)
     before = _PRESENT.set(order)
     try:
         yield
     finally:
-        order.begun = True  # tasks that it left behind have a copy of the variable
+        order.begun = True  # tasks that outlive it have a copy of the variable
         _PRESENT.reset(before)
 
 
 def require_awaited() -> None:
-    """Raise `WithdrawnError` if the order's client gave up, and the order has not taken effect."""
+    """Raise `WithdrawnError` if the client gave up before the order took effect."""
     order = _PRESENT.get()
     if order is not None and not order.begun and order.given_up():
         raise WithdrawnError
 
 
 def take_effect() -> None:
-    """The order takes effect now, or raise `WithdrawnError`."""
+    """Mark the order as taking effect now. Raises `WithdrawnError` if the client gave up."""
     require_awaited()
     order = _PRESENT.get()
     if order is not None:

@@ -1,7 +1,7 @@
-"""What the audit log has of the texts that came into force: hashes by which they are known again.
+"""Hash the texts that come into force, so that the audit log identifies them.
 
-The hash of several texts is that of the lines that `sha256sum` prints for their files, in the order of their names:
-whoever has the files can make it with `sha256sum` alone.
+The hash of several texts is the hash of the lines that `sha256sum` prints for their files, sorted by name. `sha256sum`
+alone can compute it from the files.
 """
 
 import hashlib
@@ -10,17 +10,17 @@ from urllib.parse import quote
 
 
 def fingerprint(text: str | bytes) -> str:
-    """SHA-256 of a text, or of bytes, in hexadecimal."""
+    """Return SHA-256 of a text, or of bytes, in hexadecimal."""
     return hashlib.sha256(text.encode() if isinstance(text, str) else text).hexdigest()
 
 
 def fingerprint_of_all(texts: Mapping[str, str]) -> str:
-    """SHA-256 of named texts: no other names or texts have the same."""
+    """Return SHA-256 of named texts; other names or texts have another hash."""
     lines = sorted((file_name(name), fingerprint(text)) for name, text in texts.items())
     return fingerprint("".join(f"{digest}  {name}\n" for name, digest in lines))
 
 
 def file_name(name: str) -> str:
-    """A name as that of a file below a folder, whatever is in it: what is unusual in a path is percent-encoded."""
+    """Return any name as a relative file path, with unusual characters percent-encoded."""
     parts = name.split("/")
     return "/".join(quote(part) if part.strip(".") else part.replace(".", "%2E") or "%" for part in parts)

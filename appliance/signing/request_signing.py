@@ -1,16 +1,15 @@
-"""Two keys that are derived from an access token, and the proof of an order that is made with one. No I/O, no clock.
+"""Derive two keys from an access token, and sign orders with one of them. No I/O, no clock.
 
-Whoever holds a token need not show it. He derives from it, and from nothing else:
+The holder of a token need not send it. The client derives two keys from the token alone:
 
-- the *reading key*, a text that stands in the token's place in `Authorization: Bearer`. It opens what the token may
-  look at, and changes nothing.
-- the *signing key* (Ed25519), which never leaves him. It signs each order: the HTTP request as it is sent, under a
-  challenge that control gave and takes once.
+- the *reading key* replaces the token in `Authorization: Bearer`. It permits all reads of the token and no changes.
+- the *signing key* (Ed25519) never leaves the client. It signs each order: the HTTP request as sent, with a challenge
+  that control issued and accepts once.
 
 Invariants:
 
 1. The appliance keeps SHA-256 of the reading key and the public half of the signing key (`TokenKeys`). Neither key
-   can be made from them: who reads the state, a backup, or all that the api sees of such a client can order nothing.
+   can be derived from them. A reader of the state, of a backup, or of all such traffic in the api can order nothing.
 2. The signed text has seven lines, each a whole part of the request, and no part may have a control character: no
    two requests have the same text.
 3. A change of anything here is another version in the first line, in the derivations and in `docs/rest.md`.
@@ -33,42 +32,42 @@ _PROOF_FORM = re.compile(r"([!-~]{1,200}) ([A-Za-z0-9_-]{86})")
 
 
 class BadProofError(ValueError):
-    """A proof or a request that none can be made for; the text says why."""
+    """Report an invalid proof, or a request that cannot be signed; the text has the reason."""
 
 
 class TokenKeys(NamedTuple):
-    """What is kept of a token's keys: SHA-256 of the reading key, the public half of the signing key; 32 bytes each."""
+    """Store the verifiers of a token's keys: SHA-256 of the reading key, and the public signing key, each 32 bytes."""
 
     reading: bytes
     verifying: bytes
 
 
 def keys_of(token: str) -> TokenKeys:
-    """What is kept of the keys of a token `rosrv_ID_SECRET`."""
+    """Return the verifiers of a token `rosrv_ID_SECRET`."""
     return TokenKeys(reading_hash(reading_key(token)), _signing_key(token).public_key().public_bytes_raw())
 
 
 def reading_key(token: str) -> str:
-    """The text that a holder shows in the token's place: `rosrv-read_ID_KEY`."""
+    """Return the reading key of a token: `rosrv-read_ID_KEY`."""
     token_id = token.split("_")[1]
     return f"rosrv-read_{token_id}_{_text(hmac.digest(token.encode('ascii'), _READING, hashlib.sha256))}"
 
 
 def reading_id(shown: str) -> str | None:
-    """The id in the form of a reading key; None when it is none."""
+    """Return the id in a reading key, or None for any other text."""
     found = _READING_FORM.fullmatch(shown)
     return None if found is None else found[1]
 
 
 def reading_hash(key: str) -> bytes:
-    """What is kept of a reading key. It has 256 bits that nobody can guess: a fast hash is enough."""
+    """Return the stored hash of a reading key. The key has 256 random bits, so a fast hash is enough."""
     return hashlib.sha256(key.encode("ascii")).digest()
 
 
 def statement(
     challenge: str, *, method: str, target: str, if_match: str, content_type: str, body: bytes
 ) -> bytes:
-    """The text that is signed. `target` is path and query as sent; a header that is missing is empty.
+    """Return the text to sign. `target` is path and query as sent; a missing header is empty.
 
     Raises `BadProofError` for a part with a control character.
     """
@@ -80,12 +79,12 @@ def statement(
 
 
 def proof_of(token: str, challenge: str, stated: bytes) -> str:
-    """The value of the header for a statement made with this challenge."""
+    """Return the header value for a statement with this challenge."""
     return f"{challenge} {_text(_signing_key(token).sign(stated))}"
 
 
 def parse_proof(header: str) -> tuple[str, bytes]:
-    """Challenge and signature. Raises `BadProofError`."""
+    """Return challenge and signature. Raises `BadProofError`."""
     found = _PROOF_FORM.fullmatch(header)
     if found is None:
         raise BadProofError(f"{HEADER} is not `CHALLENGE SIGNATURE`")

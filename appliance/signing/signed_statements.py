@@ -1,22 +1,22 @@
-"""What the signer signs of the audit log, and who reads it again: checkpoints, and removals of old records. No I/O.
+"""Write and parse the statements about the audit log that the signer signs: checkpoints and removals. No I/O.
 
 Invariants:
 1. A checkpoint names the log, its own number, the sequence, the hash at that sequence, the time, the hash of the
    checkpoint before it, and up to which record the log's beginning is removed. Checkpoints of version 1 do not say what
    is removed.
 2. A removal names the checkpoint up to which records go and the limit of the settings that it follows from.
-3. There is one text of each: what is written otherwise, by a zero in front of a number, is none.
+3. Each statement has exactly one text. Any other spelling, such as a leading zero, is invalid.
 """
 
 import hashlib
 import re
 from typing import NamedTuple
 
-NO_CHECKPOINT = "0" * 64  # stands for the hash of the one before the first
+NO_CHECKPOINT = "0" * 64  # the hash before the first checkpoint
 
 
 class Checkpoint(NamedTuple):
-    """The state of the chain at one moment; `time` in nanoseconds since the epoch, hashes in hexadecimal."""
+    """Describe the chain at one time; `time` is in nanoseconds since the epoch, hashes in hexadecimal."""
 
     log: str
     number: int
@@ -54,12 +54,12 @@ def parse_checkpoint(text: bytes) -> Checkpoint:
 
 
 def checkpoint_hash(text: bytes) -> str:
-    """The hash that the next checkpoint carries as `previous`."""
+    """Return the hash that the next checkpoint stores as `previous`."""
     return hashlib.sha256(text).hexdigest()
 
 
 class Removal(NamedTuple):
-    """The removal of all records up to a checkpoint: its number, sequence, the hash there, and its own hash.
+    """Describe the removal of all records up to a checkpoint: its number, sequence, hash there, and own hash.
 
     `limit` is the setting that it follows from, as the signer writes it.
     """
@@ -83,7 +83,7 @@ _LIMIT = re.compile(rb"\nlimit ([0-9][0-9.e+-]{0,31} (?:days|bytes))\n\Z")
 
 
 def limit_of_removal(text: bytes) -> str:
-    """The limit in a removal's text. Raises `ValueError` where there is none."""
+    """Return the limit in a removal's text. Raises `ValueError` if there is none."""
     match = _LIMIT.search(text)
     if match is None:
         raise ValueError("not the text of a removal")

@@ -1,4 +1,4 @@
-"""Signatures of the site: whether a text was signed with one of the keys that its configuration names.
+"""Sign texts, and verify signatures by the keys that the site's configuration names.
 
 A signature is a text of its own in OpenSSH's format (SSHSIG, its PROTOCOL.sshsig): what `ssh-keygen -Y sign -n rosrv`
 writes to FILE.sig. A key is a line of `ssh-ed25519`, as `ssh-keygen -t ed25519` writes it to KEY.pub.
@@ -6,7 +6,7 @@ writes to FILE.sig. A key is a line of `ssh-ed25519`, as `ssh-keygen -t ed25519`
 Invariants:
 1. A signature counts only for the text it was made of, under the namespace `rosrv`, with a key that is given: the key
    that the signature itself carries says which of them, and is trusted for nothing else.
-2. Where no key is given nothing is asked for, and no signature is looked at.
+2. Without a configured key no signature is required or checked.
 """
 
 import base64
@@ -25,33 +25,33 @@ if TYPE_CHECKING:
 _NAMESPACE = b"rosrv"
 _ED25519 = b"ssh-ed25519"
 _MAGIC = b"SSHSIG"
-_HASHES = (b"sha512", b"sha256")  # those that the format has
+_HASHES = (b"sha512", b"sha256")  # those of the format
 _ARMOUR = re.compile(
     r"\s*-----BEGIN SSH SIGNATURE-----\n([A-Za-z0-9+/=\n]{1,4000})\n-----END SSH SIGNATURE-----\s*"
 )
-_LONGEST = 8192  # characters of a file that has one signature
+_LONGEST = 8192  # characters of a signature file
 _HOW = "sign it (rosrv sign FILE --key KEY) and leave FILE.sig beside it, or send that along"
 
 
 class UnsignedError(Exception):
-    """A text is not signed by the site; the message says what is wrong and what to do."""
+    """Report a text without a valid signature of the site; the message has the reason and the remedy."""
 
 
 def checked_key(line: str) -> str:
-    """A line `ssh-ed25519 BASE64 COMMENT`. Raises `ValueError`, which says what is wrong."""
+    """Return the line if it is `ssh-ed25519 BASE64 COMMENT`. Raises `ValueError` with the reason."""
     _public(line)
     return line
 
 
 def name_of(line: str) -> str:
-    """What records call a key: its fingerprint as `ssh-keygen -l` shows it, and its comment."""
+    """Return the name of a key in records: its fingerprint as `ssh-keygen -l` shows it, and its comment."""
     digest = hashlib.sha256(_wire(_ED25519, _public(line))).digest()
     comment = " ".join(line.split()[2:])
     return f"SHA256:{base64.b64encode(digest).decode().rstrip('=')}" + (f" ({comment})" if comment else "")
 
 
 def read_signature(file: Path) -> str:
-    """What FILE.sig has; empty where there is none that can be read."""
+    """Return the content of FILE.sig, or an empty string if it cannot be read."""
     try:
         with open_given(file.with_name(f"{file.name}.sig")) as opened:
             return opened.read(_LONGEST).decode("ascii", "replace")
@@ -60,10 +60,10 @@ def read_signature(file: Path) -> str:
 
 
 def signer(keys: Sequence[str], text: str, signature: str) -> str:
-    """The name of the key that signed this text; empty where there are no keys. Raises `UnsignedError`."""
+    """Return the name of the key that signed this text; empty without keys. Raises `UnsignedError`."""
     if not keys:
         return ""
-    from cryptography.exceptions import InvalidSignature  # noqa: PLC0415  not for those who check nothing
+    from cryptography.exceptions import InvalidSignature  # noqa: PLC0415  only if a signature is checked
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey  # noqa: PLC0415  as above
 
     if not signature:
@@ -90,7 +90,7 @@ def signer(keys: Sequence[str], text: str, signature: str) -> str:
 
 
 def sign(text: str, key: "Ed25519PrivateKey") -> str:
-    """The signature of a text, byte for byte as `ssh-keygen -Y sign -n rosrv` makes it."""
+    """Return the signature of a text, byte for byte as `ssh-keygen -Y sign -n rosrv` does."""
     raw = key.sign(_message(text, _HASHES[0]))
     public = _wire(_ED25519, key.public_key().public_bytes_raw())
     fields = _wire(public, _NAMESPACE, b"", _HASHES[0], _wire(_ED25519, raw))
@@ -100,7 +100,7 @@ def sign(text: str, key: "Ed25519PrivateKey") -> str:
 
 
 def public_line(key: "Ed25519PrivateKey") -> str:
-    """The line of a key for `site_keys`, without a comment."""
+    """Return the line of a key for `site_keys`, without a comment."""
     return f"ssh-ed25519 {base64.b64encode(_wire(_ED25519, key.public_key().public_bytes_raw())).decode()}"
 
 
@@ -118,7 +118,7 @@ def _public(line: str) -> bytes:
 
 
 def _read(signature: str) -> tuple[bytes, bytes, bytes, bytes]:
-    """Public key, namespace, name of the hash and signature. Raises `ValueError`."""
+    """Return public key, namespace, hash name and signature. Raises `ValueError`."""
     found = _ARMOUR.fullmatch(signature.replace("\r\n", "\n"))
     try:
         blob = base64.b64decode(found[1].replace("\n", ""), validate=True) if found else b""
@@ -148,7 +148,7 @@ def _wire(*strings: bytes) -> bytes:
 
 
 def _strings(data: bytes, count: int) -> list[bytes]:
-    """The strings that these bytes are made of. Raises `ValueError` where they are not so many, and nothing else."""
+    """Split bytes into exactly `count` strings. Raises `ValueError` for any other content."""
     found = []
     while data:
         length = int.from_bytes(data[:4])
