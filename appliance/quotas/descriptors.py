@@ -1,9 +1,9 @@
-"""Descriptors: what all shares together need of them, and how many connections a process may have with those it has."""
+"""Limit the connections of a process by its file descriptors."""
 
 import resource
 
 
 def connections_within(wanted: int) -> int:
-    """So many connections, and no more than half of what this process may open; the rest is for all else it does."""
+    """Return the number of connections, at most half of the descriptors that this process may open."""
     allowed, _hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     return wanted if allowed == resource.RLIM_INFINITY else max(1, min(wanted, allowed // 2))

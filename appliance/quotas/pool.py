@@ -1,18 +1,18 @@
-"""A finite thing, counted by host, so that nobody can use up what others need.
+"""Limit a finite resource by host, so that no host can exhaust it.
 
-`Pool` is arithmetic without I/O: it says whether a host may have more, and keeps count of what it has. Whoever owns
-the thing asks before it gives.
+`Pool` is arithmetic without I/O: it decides whether a host may have more, and counts its holdings. The owner of the
+resource asks the pool before each allocation.
 
 Invariants, for a pool with `Bounds(whole, host, strangers, kept)`:
 
 1. All hosts together hold at most `whole`; one host at most `host`.
 2. All strangers together hold at most `strangers`, however many addresses they have.
-3. All hosts without a registration together hold at most `whole - kept`: so much is there for the robot's own nodes
-   when everybody else has come first.
-4. Who holds nothing takes no memory.
+3. All hosts without a registration together hold at most `whole - kept`. The rest remains for the robot's own nodes,
+   however many other hosts came first.
+4. A host without holdings takes no memory.
 
-A host's standing may change while it holds something. It is looked up again at each call for that host, and what the
-host holds moves with it; no call looks at other hosts.
+A host's standing may change while it holds something. Each call for a host reads its present standing and moves its
+holdings to it. No call checks other hosts.
 """
 
 from collections.abc import Callable, Hashable, Iterator
@@ -24,21 +24,21 @@ Holder = TypeVar("Holder", bound=Hashable)
 
 
 class Standing(IntEnum):
-    """What the policy and the registry know of a host; a higher one makes room later."""
+    """Rank a host by policy and registry; a host of higher rank is evicted later."""
 
     STRANGER = 0
-    """No rule of the policy names its address."""
+    """No policy rule names its address."""
 
     NAMED = 1
-    """A rule names its address; it has no registration now."""
+    """A rule names its address, and it has no registration now."""
 
     REGISTERED = 2
-    """It has a registration, or what only a registered node can have (a grant of the relay)."""
+    """It has a registration, or a relay grant, which only registered nodes get."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """How much of a pool each may hold, in the unit of the pool. Raises ValueError where a part is beyond the whole."""
+    """Limit each share of a pool, in its unit. Raises ValueError if a part exceeds the whole."""
 
     whole: int
     """All hosts together."""
@@ -50,7 +50,7 @@ class Bounds:
     """All strangers together."""
 
     kept: int
-    """Of the whole, what only registered hosts may hold."""
+    """The part of the whole for registered hosts only."""
 
     def __post_init__(self) -> None:
         if min(self.whole, self.host, self.strangers, self.kept) < 0:
@@ -61,10 +61,10 @@ class Bounds:
             )
 
     def sized(self, whole: int, host: int | None = None) -> "Bounds":
-        """With another whole and another share of a host (None: the same part), as an operator has set them.
+        """Return bounds for the operator's whole and share of a host (None: in proportion).
 
-        The strangers' share and what is kept are the same parts of the whole as before, rounded down; one at least for
-        strangers that had a share, so that a small pool turns nobody away who is told why.
+        The strangers' share and the kept part stay in proportion to the whole, rounded down. Strangers that had a share
+        keep at least one, so that a small pool still gives them a reason for a refusal.
         """
         host = self.host * whole // self.whole if host is None else host
         strangers = self.strangers * whole // self.whole
@@ -75,10 +75,10 @@ class Bounds:
 
 
 class Pool(Generic[Holder]):
-    """Counts what each host holds of one finite thing.
+    """Count the holdings of each host in one finite resource.
 
-    `what` is the noun of refusals, with its unit: "connections", "bytes of parameters". `standing` says what is known
-    of a host now; a machine that may have many addresses (IPv6) is one holder if its network is given as the host.
+    `what` is the noun of refusals, with its unit: "connections", "bytes of parameters". `standing` returns the
+    present standing of a host. For a machine with many addresses (IPv6), give its network as the host.
     """
 
     def __init__(self, what: str, bounds: Bounds, standing: Callable[[Holder], Standing]) -> None:
@@ -89,7 +89,7 @@ class Pool(Generic[Holder]):
         self._by_standing = [0 for _ in Standing]
 
     def refusal(self, host: Holder, amount: int = 1) -> str:
-        """Why `host` may not have `amount` more, in words; empty when it may."""
+        """Return why `host` may not have `amount` more; empty if it may."""
         return self._refusal(host, amount, *self._look_up(host))
 
     def _refusal(self, host: Holder, amount: int, standing: Standing, mine: int) -> str:
@@ -113,7 +113,7 @@ class Pool(Generic[Holder]):
         return ""
 
     def take(self, host: Holder, amount: int = 1) -> str:
-        """Give `host` so much if it may have it; else nothing is given. Returns the reason as `refusal` does."""
+        """Give `host` the whole amount or nothing. Return the reason as `refusal` does."""
         standing, mine = self._look_up(host)
         reason = self._refusal(host, amount, standing, mine)
         if not reason:
@@ -121,36 +121,36 @@ class Pool(Generic[Holder]):
         return reason
 
     def charge(self, host: Holder, amount: int = 1) -> None:
-        """Count what `host` has, without asking: what it has already, or what cannot be refused any more."""
+        """Count an amount without a check: `host` has it already, or it can no longer be refused."""
         standing, mine = self._look_up(host)
         self._set(host, standing, mine, mine + amount)
 
     def give_back(self, host: Holder, amount: int = 1) -> None:
-        """`host` has so much less. Raises ValueError when that is more than it has."""
+        """Take an amount from `host`. Raises ValueError if it has less."""
         standing, mine = self._look_up(host)
         if amount > mine:
             raise ValueError(f"{host} gives back {amount} {self.what} and has {mine}")
         self._set(host, standing, mine, mine - amount)
 
     def held(self, host: Holder) -> int:
-        """What `host` has."""
+        """Return the holdings of `host`."""
         return self._held.get(host, _NOTHING)[1]
 
     def held_by(self, standing: Standing) -> int:
-        """What hosts of this standing have, each as it was counted last."""
+        """Return the holdings of all hosts of this standing, as last counted."""
         return self._by_standing[standing]
 
     @property
     def total(self) -> int:
-        """What all hosts have."""
+        """Return the holdings of all hosts."""
         return sum(self._by_standing)
 
     def holders(self) -> Iterator[tuple[Holder, int]]:
-        """Every host that holds something, and how much."""
+        """Yield every host with holdings, and their amount."""
         return ((host, amount) for host, (_, amount) in self._held.items())
 
     def _look_up(self, host: Holder) -> tuple[Standing, int]:
-        """The host's standing now, and what it has; what it has is counted under that standing from now on."""
+        """Return the present standing and holdings of a host; count them under that standing."""
         standing = self._standing(host)
         counted_as, amount = self._held.get(host, _NOTHING)
         if amount and counted_as is not standing:
@@ -159,7 +159,7 @@ class Pool(Generic[Holder]):
         return standing, amount
 
     def _set(self, host: Holder, standing: Standing, before: int, amount: int) -> None:
-        """The host has `amount`, and had `before`, both counted under this standing."""
+        """Change the holdings of a host from `before` to `amount`, both under this standing."""
         self._by_standing[standing] += amount - before
         if amount:
             self._held[host] = standing, amount

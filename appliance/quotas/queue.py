@@ -1,4 +1,4 @@
-"""Who has waited longest, by what is known of his host: the order in which room is made in a pool."""
+"""Find the longest waiting member of each quota class, to evict it from a full pool."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
@@ -8,11 +8,11 @@ from appliance.quotas.pool import Standing
 
 Holder = TypeVar("Holder", bound=Hashable)
 Member = TypeVar("Member")
-_MOST_MOVED = 64  # members whose hosts' standing has changed that one search files anew
+_MOST_MOVED = 64  # members that one search may move to the present standing of their hosts
 
 
 class Queue(Generic[Holder, Member]):
-    """Members of hosts, in the order in which they were put in. `standing` says what is known of a host now."""
+    """Keep members of hosts in order of insertion. `standing` returns the present standing of a host."""
 
     def __init__(self, standing: Callable[[Holder], Standing]) -> None:
         self._standing = standing
@@ -20,11 +20,11 @@ class Queue(Generic[Holder, Member]):
         self._line_of: dict[Member, OrderedDict[Member, tuple[Holder, float]]] = {}
 
     def put(self, member: Member, host: Holder, since: float) -> None:
-        """The member waits since now, as the last one."""
+        """Append a member, which waits from `since`."""
         self._file(member, host, since, self._standing(host))
 
     def remove(self, member: Member) -> bool:
-        """The member waits no longer; whether it did."""
+        """Remove a member; return whether it was waiting."""
         line = self._line_of.pop(member, None)
         if line is None:
             return False
@@ -32,7 +32,7 @@ class Queue(Generic[Holder, Member]):
         return True
 
     def longest(self, standing: Standing) -> tuple[Member, Holder, float] | None:
-        """Who has waited longest of the hosts that have this standing now, his host, and since when."""
+        """Return the longest waiting member whose host has this standing now, its host, and the start of its wait."""
         for _ in range(_MOST_MOVED):
             found = next(iter(self._lines[standing].items()), None)
             if found is None:

@@ -1,9 +1,8 @@
-"""Every finite thing that hosts can use up: how much there is, each one's share, and what happens at the limit.
+"""Define every finite resource that hosts can exhaust: its size, the share of each host, and the effect of the limit.
 
-`SHARES` is the one list that docs/shares.md is generated from (`python -m distribution.shares_page`). Each row names
-the tests that attack it; `tests/unit/quotas/test_table.py` holds that they exist. A row has a name here, and whoever
-makes the pool takes its bounds from the row (`Pool("connections", RVMASTER_CONNECTIONS.bounds, …)`), so the page cannot
-differ from the code.
+docs/shares.md is generated from `SHARES` (`python -m distribution.shares_page`). Each row names the tests that attack
+it; `tests/unit/quotas/test_table.py` checks that they exist. Each row has a name here. The code takes the bounds of its
+pool from the row (`Pool("connections", RVMASTER_CONNECTIONS.bounds, …)`), so the page cannot differ from the code.
 """
 
 from typing import NamedTuple
@@ -12,12 +11,12 @@ from appliance.quotas.pool import Bounds
 
 
 class Share(NamedTuple):
-    """One row of the table.
+    """Describe one row of the table.
 
-    `thing` is what is finite, where, with its unit: "connections to RVMaster". `bounds` are as they are by default;
-    `at_limit` is what the host that is beyond its share sees, and what the others see; `alarm` the audit event and the
-    metric that tell of it. `shown_by` are the tests that use it up, as paths below tests/. `setting` says where an
-    operator changes the bounds ("limits.connections" of appliance.yaml); it is "" where nobody does.
+    `thing` is the resource with its unit: "connections to RVMaster". `bounds` are the defaults. `at_limit` is the
+    effect on the host beyond its share, and on others. `alarm` names the audit event and the metric. `shown_by` lists
+    the tests that exhaust the resource, as paths below tests/. `setting` is the key in appliance.yaml that changes the
+    bounds ("limits.connections"), or "" if there is none.
     """
 
     thing: str

@@ -1,4 +1,4 @@
-"""Makes audit records of what happens in control, and says when nothing may be answered because none can be made."""
+"""Make audit records of events in control, and block answers while no record can be made."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -11,13 +11,12 @@ from appliance.policy.model import Decision, Rule
 from appliance.quotas.pool import Standing
 from appliance.telemetry.metrics import Meter
 
-# What a caller is told. Where the log is and what is wrong with it is for those who operate the appliance: it is in its
-# output, in `rosrv status`, and in the log itself when that can be written again.
+# The text for callers. Operators find the path and the error in the output, in `rosrv status`, and later in the log.
 NOT_RECORDED = "the audit log cannot be written; nothing is granted until it can"
 
 
 class Asker(NamedTuple):
-    """Who made a call: his host, the `caller_id` he claims, when it arrived (monotonic, nanoseconds), at which node."""
+    """Describe a caller: host, claimed `caller_id`, arrival of the call (monotonic ns), and the target node."""
 
     host: str
     caller_id: str
@@ -26,15 +25,15 @@ class Asker(NamedTuple):
 
 
 Recordings = Callable[[str, str | None, Severity, str | None, int], dict[str, str]]
-"""Return what the record of an event says of its recording: `RecordingPlan.detail`."""
+"""Return the details of an event's recording for its record, as `RecordingPlan.detail`."""
 
 
 class AuditTrail:
     """Records decisions and events under the running policy revision.
 
-    `strict`: an answer waits until its record is on disk. `deny_when_failed`: while the log cannot be written,
-    every request is denied. What is refused to a host that no rule names is marked (`detail.stranger`), and what a
-    host beyond its share of the log causes without a call is counted, not recorded each time.
+    `strict`: an answer waits until its record is on disk. `deny_when_failed`: every request is denied while the log
+    cannot be written. Denials of unknown hosts are marked (`detail.stranger`). Events that a host beyond its quota of
+    the log causes without a call are only counted.
     """
 
     def __init__(
@@ -50,31 +49,31 @@ class AuditTrail:
 
     @property
     def obstacle(self) -> str | None:
-        """Why nothing can be granted now (the log cannot be written), or None; in words that a stranger may read."""
+        """Return why nothing can be granted now (the log cannot be written), or None; safe to show to unknown hosts."""
         if self._deny_when_failed and self._log.failed is not None:
             return NOT_RECORDED
         return None
 
     def shut_out(self, host: str) -> str:
-        """Why this host is granted nothing while its disk is nearly full; empty when that is no reason."""
+        """Return why a nearly full disk blocks this host; empty if it does not."""
         return self._log.budget.shut_out(host)
 
     def owing(self, host: str) -> str:
-        """Why this host must wait before more is recorded of it; empty when it need not."""
+        """Return why this host must wait before its next record; empty if it need not."""
         return self._log.budget.owing(host)
 
     async def still_owing(self, host: str) -> str:
-        """The same after the log has caught up: a record that turns out to be a repetition is not owed for."""
+        """Return `owing` after the log has caught up; repetitions then no longer count."""
         if self.owing(host):
             await self._log.wait_durable()
         return self.owing(host)
 
     def pause(self, host: str) -> float:
-        """For how many seconds this host's calls wait for that, then to be asked again; 0 when they need not."""
+        """Return the seconds for which calls of this host wait before the next check; 0 if they need not."""
         return self._log.budget.pause(host)
 
     async def durable(self) -> str | None:
-        """Wait until everything recorded so far is on disk; why not, when it cannot be and must be."""
+        """Wait until all records so far are on disk. Return the reason if they must be and cannot."""
         failure = await self._log.wait_durable()
         return failure if self._deny_when_failed else None
 
@@ -89,10 +88,10 @@ class AuditTrail:
         reads: bool = False,
         **asked_of: str,
     ) -> str:
-        """Record a decision; the id by which it is found, if it is more than counted.
+        """Record a decision, and return the id of its record, which exists unless the decision is only counted.
 
-        `asked_of` is what a command is about: a parameter, a node. `reads`: the call changes nothing, so that its
-        repetitions are counted when it is allowed.
+        `asked_of` is the object of a command: a parameter, a node. `reads`: the call changes nothing, so repetitions
+        are only counted if it is allowed.
         """
         word = decision.word
         detail: dict[str, Any] = {"call": method, **asked_of}
@@ -140,10 +139,10 @@ class AuditTrail:
         reads: bool = False,
         **detail: Any,
     ) -> str:
-        """Record an event that is no decision; the id, as of `decided`. `more` is detail whose names others choose.
+        """Record an event that is not a decision; return the id as `decided` does. `more` has further details.
 
-        `severity` is for an event that has not always the same (`audit/events.py`).
-        `reads`: it changed nothing, so that its repetitions are counted.
+        `severity` is for an event of varying severity (`audit/events.py`).
+        `reads`: the event changed nothing, so repetitions are only counted.
         """
         now, severity = time.time_ns(), severity or SEVERITIES.get(event, Severity.INFO)
         detail = {**(more or {}), **detail, **self._recordings(event, decision, severity, host, now)}
@@ -169,7 +168,7 @@ class AuditTrail:
         )
 
     def _marked(self, host: str | None, decision: str | None, detail: dict[str, Any]) -> bool:
-        """Whether this is about a stranger whom something is refused; the detail says so then."""
+        """Whether this denies an unknown host; if so, mark the detail."""
         stranger = (
             host is not None and decision == "deny" and self._log.budget.standing(host) is Standing.STRANGER
         )
@@ -179,5 +178,5 @@ class AuditTrail:
 
 
 def rule_reference(rule: Rule | None) -> RuleReference | None:
-    """The policy's rule as a record keeps it."""
+    """Return the policy's rule in the form of a record."""
     return None if rule is None else RuleReference(rule.section, rule.key, rule.file, rule.line)

@@ -1,9 +1,8 @@
-"""What is measured: every metric by name, and the counters that RVMaster keeps.
+"""Define every metric by name, and keep the counters of RVMaster.
 
-`METRICS` is the one list that `/metrics` is made from and docs/metrics.md is generated from
-(`python -m appliance.telemetry.metrics`). Counting is a few additions for each request; nothing is formatted there.
-Labels have few values: names of calls, categories and roles are ours; topics and services are those that are carried,
-and only so many of them by name (`appliance.control.measurements`).
+`/metrics` and docs/metrics.md are both generated from `METRICS` (`python -m appliance.telemetry.metrics`). Counting
+costs a few additions for each request, without formatting. Labels have few values: calls, categories and roles are
+fixed; topics and services are those on a relay, with a limit on the number of names (`appliance.control.measurements`).
 """
 
 import bisect
@@ -18,14 +17,14 @@ BOUNDS = (0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1,
 
 
 class Metric(NamedTuple):
-    """One metric; `name` as Prometheus shows it."""
+    """Describe one metric; `name` is the one in Prometheus."""
 
     name: str
     kind: Literal["counter", "gauge", "histogram"]
     labels: tuple[str, ...]
     help: str
     bounds: tuple[float, ...] = BOUNDS
-    """Of a histogram, in seconds."""
+    """The bounds of a histogram in seconds."""
 
 
 def _counter(name: str, help: str, *labels: str) -> Metric:  # noqa: A002  as Prometheus's own client calls it
@@ -143,23 +142,23 @@ METRICS = (
 
 @dataclass(slots=True)
 class Histogram:
-    """How many were at most so long; `counts` has one more place than `BOUNDS`, for those beyond."""
+    """Count durations by upper bound; `counts` has one entry more than `BOUNDS`, for longer ones."""
 
     counts: list[int] = field(default_factory=lambda: [0] * (len(BOUNDS) + 1))
     sum: float = 0.0
 
     def observe(self, seconds: float) -> None:
-        """Count one."""
+        """Count one duration."""
         self.counts[bisect.bisect_left(BOUNDS, seconds)] += 1
         self.sum += seconds
 
     def values(self) -> tuple[list[int], float]:
-        """The counts and the sum."""
+        """Return the counts and the sum."""
         return self.counts, self.sum
 
 
 class Meter:
-    """The counters of RVMaster, since it started."""
+    """Count events of RVMaster since its start."""
 
     def __init__(self) -> None:
         self.decisions: Counter[tuple[str, str]] = Counter()
@@ -167,12 +166,12 @@ class Meter:
         self.calls: dict[str, Histogram] = {}
 
     def decided(self, category: str, outcome: str, seconds: float) -> None:
-        """A decision was made."""
+        """Count a decision."""
         self.decisions[category, outcome] += 1
         self.decision_seconds.observe(seconds)
 
     def called(self, call: str, seconds: float) -> None:
-        """A call of the table was answered (`call` must not be a stranger's text)."""
+        """Count an answered call of the table; `call` must not be text from a client."""
         histogram = self.calls.get(call)
         if histogram is None:
             histogram = self.calls[call] = Histogram()
@@ -180,7 +179,7 @@ class Meter:
 
 
 def markdown() -> str:
-    """The generated part of the page on metrics."""
+    """Return the generated part of docs/metrics.md."""
     lines = ["| metric | kind | labels | meaning |", "|---|---|---|---|"]
     lines += [
         f"| `{row.name}` | {row.kind} | {', '.join(f'`{label}`' for label in row.labels) or '-'} | {row.help} |"
