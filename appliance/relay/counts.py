@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from appliance.relay.monitors.observation_points import Place
 
 if TYPE_CHECKING:
-    from rosmop.fast.wasm_runner import Walked, Walker
+    from rosmop.run.fast_path import FastLane, Walked
 
 
 class Count(NamedTuple):
@@ -28,7 +28,7 @@ class Told(NamedTuple):
 class Counts:
     """What walks at one place have done since it was last taken."""
 
-    def __init__(self, walker: Walker, place: Place) -> None:
+    def __init__(self, walker: FastLane, place: Place) -> None:
         self.walker = walker
         self.place = place
         self.begun = False

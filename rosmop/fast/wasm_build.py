@@ -7,6 +7,7 @@ from rosmop.certify.steps import check_steps
 from rosmop.fast.abi import FeedModule, Part
 from rosmop.fast.batch_codegen import WrittenModule, written
 from rosmop.fast.wasm_instance import translated
+from rosmop.fast.wasm_runner import WasmFastPath
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
 from rosmop.runtime.values import Values
@@ -24,9 +25,9 @@ def part_of(compiled: Compiled, names: Collection[str], trials: Collection[str])
     return Part(alone, _translated(module))
 
 
-def module_of(compiled: Compiled) -> FeedModule:
-    """The module of all of these specifications, which `MonitorSet.take_module` takes."""
-    return _translated(_written(compiled))
+def fast_path_of(compiled: Compiled) -> WasmFastPath:
+    """Return the fast path of all of these specifications, for `MonitorSet`."""
+    return WasmFastPath(_translated(_written(compiled)))
 
 
 def _written(compiled: Compiled) -> WrittenModule:

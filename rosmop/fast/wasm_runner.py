@@ -6,7 +6,7 @@ Invariants:
   time of the walk: bytes, variables, states of properties, which events happened.
 - The state of specifications that share topics or variables is in one place: in the module's memory from a walk on
   (`Home.enter`), in Python until then, and again before Python looks at it (`Home.leave`).
-- Frames that were received into the module's memory (`Walks.area`) are looked at and changed where they stand. Of
+- Frames that were received into the module's memory (`Lanes.area`) are looked at and changed where they stand. Of
   one that stands elsewhere the beginning is copied, and back if it was changed: what looks further leaves the message.
 """
 
@@ -14,7 +14,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 from rosmop.fast.abi import (
     AREA,
@@ -37,6 +37,7 @@ from rosmop.fast.wasm_instance import Machine, MachineTrap
 from rosmop.form.compiled import Compiled
 from rosmop.form.specification_groups import groups
 from rosmop.run.explain import ClockedSteps, Exits
+from rosmop.run.fast_path import MESSAGE_FUEL, Due, Lanes, Prepared, Walked
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import CellNames, Monitor, RunningProperty
 from rosmop.run.outcomes import Outcome, Verdict
@@ -50,9 +51,6 @@ FUEL = FUEL_PER_SECOND // 1000
 """Instructions of one call at most: about a millisecond. What a call leaves is for the next ones: setting it costs a
 quarter of a call. Where it ends, the walk pauses before the message at hand.
 """
-
-MESSAGE_FUEL = 10 * FUEL
-"""Instructions of one message at most, unless a caller of `walk_one` has others."""
 
 BEGINNING = 8192
 """Bytes that are looked at of a frame that was not received into the module's memory."""
@@ -69,45 +67,6 @@ _PREPARED = struct.Struct("<4q")
 _TIME = struct.Struct("<q")
 _CLOCK = struct.Struct("<qq")
 _NEVER = (1 << 63) - 1  # comes after every time, so that output is due
-
-
-class Walked(NamedTuple):
-    """What a walk has done.
-
-    `position` is where the first message begins that is left; `run` where what goes on in its buffer begins (behind the
-    last dropped message). `dropped` are counts for each of the walker's events, if any was, `told` for each of its
-    verdicts, if there was any. `sooner`: something is due earlier than it was. `output` are the lines that were put
-    out, in order, each with where the frame begins of the message that it is about.
-    `paused`: the walk used up its fuel, and the message at `position` may be walked next.
-    """
-
-    position: int
-    run: int
-    dropped: Sequence[int]
-    told: Sequence[int] = ()
-    sooner: bool = False
-    output: Sequence[tuple[int, LogLine]] = ()
-    paused: bool = False
-
-
-class Prepared(NamedTuple):
-    """What holds for all walks of a topic until the engine, or anything else, has done something: the sender of
-    the messages; bits of `told` (and whether no message may be changed), `enabled` and `counted`, as the module takes
-    them; and where walks add up how many messages a set of events (see `Walker.writers`) has changed.
-    """
-
-    source: int
-    told: int
-    enabled: int
-    counted: int
-    changed: dict[int, int]
-
-
-class Due(Protocol):
-    """Says when the next tick or deadline is due (ns; None: nothing is waited for)."""
-
-    def __call__(self, *, anew: bool) -> int | None:
-        """`anew`: find out, as there may be an earlier deadline."""
 
 
 class Home:
@@ -256,7 +215,7 @@ def _cell(kind: Type) -> str:
 
 
 class Walker:
-    """The walk of one topic, or part of a service."""
+    """Runs the module for one topic, or part of a service; implements `FastLane`."""
 
     def __init__(
         self,
@@ -267,13 +226,9 @@ class Walker:
         events: Sequence[str],
     ) -> None:
         self.events = tuple((name,) for name in events)
-        """For each event: what outcomes have as `events` where only it happens."""
         self.monitors = tuple(monitor.name for monitor in monitors)
-        """For each event: the name of its monitor."""
         self.drops = feed.drops
-        """Whether messages may be dropped."""
         self.changes = feed.changes
-        """Whether messages may be changed."""
         self._lines = [(line, home.named(line.context)) for line in module.lines] if feed.says else []
         self._said = module.said
         self._monitors = tuple(dict.fromkeys(monitors))
@@ -288,7 +243,6 @@ class Walker:
         self.verdicts = tuple(
             _verdict(monitors[event], place, category) for event, place, category in feed.verdicts
         )
-        """The verdicts that it may come to, not explained."""
         self._counts = struct.Struct(f"<{len(events)}q")
         self._none = (0,) * len(events)
         self._later = struct.Struct(f"<{len(events) + len(feed.verdicts)}q")
@@ -297,17 +251,17 @@ class Walker:
         self._settle = home.machine.function(feed.settle) if feed.settle else None
 
     def writers(self, who: int) -> tuple[str, ...]:
-        """What outcomes have as `changed_by`, from a set of events: bit N stands for event N."""
+        """See `FastLane`."""
         return tuple(name for number, (name,) in enumerate(self.events) if who >> number & 1)
 
     def happened(self) -> Sequence[int]:
-        """How often each event has happened since this was last asked."""
+        """See `FastLane`."""
         counts: Sequence[int] = self._counts.unpack_from(self._memory, self._feed.counters)
         self._counts.pack_into(self._memory, self._feed.counters, *self._none)
         return counts
 
     def ready(self) -> bool:
-        """Whether no monitor waits for its first message, or holds its topics."""
+        """See `FastLane`."""
         for monitor in self._monitors:  # noqa: SIM110  for each batch: half the price of a generator
             if monitor.enabled and (monitor.held or not monitor.seen):
                 return False
@@ -322,9 +276,7 @@ class Walker:
         source: int = 0,
         changed: dict[int, int] | None = None,
     ) -> Prepared:
-        """See `Prepared`: while `loud` no message may be changed; `told` says for each event whether it may drop none,
-        `counted` for each verdict whether there may be more. Good until the engine is asked for anything.
-        """
+        """See `FastLane`."""
         bits = sum(1 << number for number, silent in enumerate(told) if silent) - (LOUD if loud else 0)
         enabled = sum(1 << number for number, monitor in enumerate(self._monitors) if monitor.enabled)
         only = sum(1 << number for number, silent in enumerate(counted) if silent)
@@ -333,11 +285,7 @@ class Walker:
     def walk(  # noqa: PLR0912, PLR0917  called for every batch: calls and keywords would cost a tenth of it
         self, view: memoryview, position: int, run: int, pieces: list[Any], time_ns: int, prepared: Prepared
     ) -> Walked | None:
-        """Take messages from `position` on, as many as need nothing special. None: all, and all go on in their buffer.
-
-        Only while the walker is `ready` and nothing of the set is due. `view` has whole frames and can be written: the
-        beginning of `Walks.area`, or others. What goes on before a dropped message is appended to `pieces`.
-        """
+        """See `FastLane`."""
         if view.obj is not self._owner:
             return self._walk_elsewhere(view, position, run, pieces, time_ns, prepared)
         if self._home.prepared is not prepared:
@@ -388,7 +336,7 @@ class Walker:
         prepared: Prepared,
         fuel: int = MESSAGE_FUEL,
     ) -> Walked:
-        """As `walk`, but only the message at `position`, with so much fuel; `paused`: it was not enough."""
+        """See `FastLane`."""
         following = position + 4 + _LENGTH.unpack_from(view, position)[0]
         if self._home.prepared is not prepared:
             self._home.prepare(prepared)
@@ -400,11 +348,7 @@ class Walker:
     def take(
         self, message: Buffer, time_ns: int, prepared: Prepared, fuel: int = MESSAGE_FUEL
     ) -> Outcome | None:
-        """What is to be done with one message; None if it is left. Verdicts are not explained, and it is not said where
-        it was changed.
-
-        Only as `walk`, with what is prepared for this alone, and where nobody asks what has `happened`.
-        """
+        """See `FastLane`."""
         end = self._frames + 4 + len(message)
         if end > self._frames + AREA:
             return None
@@ -536,55 +480,55 @@ def _verdict(monitor: Monitor, place: int, handler: int) -> Verdict:
     return Verdict(monitor.name, monitor.properties[place].index, source.logic, code.order[handler], source)
 
 
-class Walks(NamedTuple):
-    """The walkers of a set by topic (see `EventCode.way`), and the part of their module's memory to receive frames
-    into, if there is one.
-    """
+class WasmFastPath:
+    """Runs the module of a set; implements `FastPath`."""
 
-    of_topic: Mapping[str, Walker] = MappingProxyType({})
-    area: memoryview | None = None
+    def __init__(self, module: FeedModule) -> None:
+        self._module = module
 
-
-def walks_of(
-    compiled: Compiled, module: FeedModule, interpreter: Interpreter, monitors: Sequence[Monitor], due: Due
-) -> Walks:
-    """The walkers of all topics that the module of a set has; their monitors are told where their state is."""
-    if not module.feeds:
-        return Walks()
-    found = list(groups(compiled.specifications))
-    machine = Machine(module.code, module.memory)
-    walks: dict[str, Walker] = {}
-    for group, cells in zip(found, module.cells, strict=True):
-        running = [monitors[number].properties[index] for number, index in group.properties]
-        for number, address in cells.exits.items():
-            kept = running[number].history
-            assert isinstance(kept, Exits | ClockedSteps)  # noqa: S101  it has tables
-            kept.move(machine, machine.memory[address:])
-        contexts = {compiled.specifications[number].context for number in group.specifications}
-        throttles = [
-            (interpreter.contexts[context], site, address)
-            for (context, site), address in module.throttles.items()
-            if context in contexts
-        ]
-        specifications = [compiled.specifications[number] for number in group.specifications]
-        home = Home(
-            machine,
-            cells,
-            interpreter,
-            running,
-            throttles,
-            due=due,
-            properties=[(monitors[number].name, index) for number, index in group.properties],
-            known={code: (one.name, name) for one in specifications for name, code in one.variables.items()},
-        )
-        for number in group.specifications:
-            monitors[number].home = home
-        for (topic, _), events in zip(group.component.topics, group.events, strict=True):
-            if topic in module.feeds:
-                own = [monitors[number] for number, _ in events]
-                names = [
-                    f"{monitors[number].name}.{monitors[number].code.events[index].name}"
-                    for number, index in events
-                ]
-                walks[topic] = Walker(home, module, module.feeds[topic], own, names)
-    return Walks(walks, machine.memory[module.frames : module.frames + AREA])
+    def lanes(
+        self, compiled: Compiled, interpreter: Interpreter, monitors: Sequence[Monitor], due: Due
+    ) -> Lanes:
+        """Instantiate the module and return a lane for each topic that it takes; set `home` of its monitors."""
+        module = self._module
+        if not module.feeds:
+            return Lanes()
+        found = list(groups(compiled.specifications))
+        machine = Machine(module.code, module.memory)
+        walks: dict[str, Walker] = {}
+        for group, cells in zip(found, module.cells, strict=True):
+            running = [monitors[number].properties[index] for number, index in group.properties]
+            for number, address in cells.exits.items():
+                kept = running[number].history
+                assert isinstance(kept, Exits | ClockedSteps)  # noqa: S101  it has tables
+                kept.move(machine, machine.memory[address:])
+            contexts = {compiled.specifications[number].context for number in group.specifications}
+            throttles = [
+                (interpreter.contexts[context], site, address)
+                for (context, site), address in module.throttles.items()
+                if context in contexts
+            ]
+            specifications = [compiled.specifications[number] for number in group.specifications]
+            home = Home(
+                machine,
+                cells,
+                interpreter,
+                running,
+                throttles,
+                due=due,
+                properties=[(monitors[number].name, index) for number, index in group.properties],
+                known={
+                    code: (one.name, name) for one in specifications for name, code in one.variables.items()
+                },
+            )
+            for number in group.specifications:
+                monitors[number].home = home
+            for (topic, _), events in zip(group.component.topics, group.events, strict=True):
+                if topic in module.feeds:
+                    own = [monitors[number] for number, _ in events]
+                    names = [
+                        f"{monitors[number].name}.{monitors[number].code.events[index].name}"
+                        for number, index in events
+                    ]
+                    walks[topic] = Walker(home, module, module.feeds[topic], own, names)
+        return Lanes(walks, machine.memory[module.frames : module.frames + AREA])

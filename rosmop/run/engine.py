@@ -7,8 +7,9 @@ Theory of operation:
 3. Time is what the caller says: nanoseconds, with every message. Ticks and deadlines that are due (`agenda.py`) happen
    before a message; `process` returns them in `before`. While no message comes, the caller calls `advance` when
    `next_due` has come; a deadline may have been put off since.
-4. `walker` offers, for most topics, a walk that does what `process` does to many messages at once (`walks.py`), as
-   far as these need nothing that is recorded or explained. Its results differ in nothing but the time that they take.
+4. `walker` offers, for most topics, a lane of the fast path (`fast_path.py`), which does what `process` does to many
+   messages at once, as far as these need nothing that is recorded or explained. Its results differ in nothing but
+   the time that they take.
 5. A new set takes the place of another one with `succeed`, in one swap between two messages. Specifications whose
    text is the same keep their variables and runs.
 6. Specifications on trial are sets of their own (`trials`), one for those that share variables: nothing that one does
@@ -24,14 +25,13 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from rosmop.fast.abi import FeedModule
-from rosmop.fast.wasm_runner import MESSAGE_FUEL, Prepared, Walker, Walks, walks_of
 from rosmop.form.compiled import Compiled, EventCode
 from rosmop.form.connected_groups import way_of
 from rosmop.form.positions import Finding, Position
 from rosmop.form.specification_groups import groups
 from rosmop.run.causes import NOBODY, Sender
 from rosmop.run.execution import Asked, Execution, OnFault
+from rosmop.run.fast_path import MESSAGE_FUEL, FastLane, FastPath, Lanes, Prepared
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import Group, Monitor, Step, monitors_of
 from rosmop.run.outcomes import Outcome
@@ -120,12 +120,14 @@ class MonitorSet:
         patience: Patience,
         trials: Sequence["MonitorSet"] = (),
         *,
+        fast: FastPath | None = None,
         slices: int = LIMIT,
         deadlines: int = sys.maxsize,
         holder_of: HolderOf = no_holder,
     ) -> None:
-        """`compiled` is all of them in their order; what is on trial is in `trials`. At most so many `deadlines` of
-        slices pass at a time. Slices are charged to `holder_of` the source whose message makes them (`quota.py`).
+        """`compiled` is all of them in their order; what is on trial is in `trials`. `fast` was compiled from the
+        others; without it the engine processes every message. At most so many `deadlines` of slices pass at a time.
+        Slices are charged to `holder_of` the source whose message makes them (`quota.py`).
         """
         tried = {name for trial in trials for name in trial.names}
         self.names: tuple[str, ...] = tuple(one.name for one in compiled.specifications)
@@ -154,7 +156,6 @@ class MonitorSet:
         self._execution = Execution(self.interpreter, on_fault)
         self._agenda = Agenda(self._monitors, self._execution, patience, deadlines)
         self.began: tuple[str, ...] = ()
-        self._walks = Walks()
         self._broken = False
         for comparison in (
             comparison
@@ -164,6 +165,11 @@ class MonitorSet:
             for left, right in (comparison.when_true, comparison.when_false):
                 self.interpreter.variables |= {left: math.inf, right: 0.0}
         self._index()
+        self._lanes = Lanes()
+        if fast is not None:
+            self._lanes = fast.lanes(compiled, self.interpreter, self._monitors, self._agenda.when_due)
+            for group in self.groups:
+                group.home = group.monitors[0].home
         # What is replaced goes at once: a garbage collector that had to look for it would hold up all messages.
         for part in (self._agenda, self.interpreter):
             weakref.finalize(self, part.let_go).atexit = False
@@ -175,6 +181,7 @@ class MonitorSet:
         on_fault: OnFault = "drop",
         patience: Patience = lambda: _never,
         *,
+        fast: FastPath | None = None,
         trials: Collection[str] = (),
         trial_patience: Patience = lambda: _never,
         slices: int = LIMIT,
@@ -200,7 +207,14 @@ class MonitorSet:
                 monitor.context.most = TRIAL_BUDGET
             tried.append(trial)
         return cls(
-            compiled, on_fault, patience, tried, slices=slices, deadlines=deadlines, holder_of=holder_of
+            compiled,
+            on_fault,
+            patience,
+            tried,
+            fast=fast,
+            slices=slices,
+            deadlines=deadlines,
+            holder_of=holder_of,
         )
 
     # What there is
@@ -295,19 +309,6 @@ class MonitorSet:
                     return step.event.service_type
         return None
 
-    def write_module(self) -> None:
-        """Have the module written that `walker` offers the walks of."""
-        from rosmop.fast.wasm_build import module_of  # noqa: PLC0415  the compiler: not in a relay
-
-        self.take_module(module_of(self.compiled))
-
-    def take_module(self, module: FeedModule) -> None:
-        """Offer the walks of this module, which was written of these specifications without those on trial."""
-        self._silent.clear()
-        self._walks = walks_of(self.compiled, module, self.interpreter, self._monitors, self._agenda.when_due)
-        for group in self.groups:
-            group.home = group.monitors[0].home
-
     def limit_time(self, clock: Callable[[], float], seconds: float) -> None:
         """Bound the processor time that a message may take, over all monitors, by a clock that shows it (seconds).
 
@@ -335,17 +336,17 @@ class MonitorSet:
     @property
     def area(self) -> memoryview | None:
         """Where to receive frames that walks take without a copy; None where there are no walks."""
-        return self._walks.area
+        return self._lanes.area
 
     def contexts(self, topic: str) -> tuple[Context, ...]:
         """What the monitors of a topic have left of their budgets after a message of it."""
         return self._contexts.get(topic, ())
 
-    def walker(self, topic: str) -> Walker | None:
+    def walker(self, topic: str) -> FastLane | None:
         """The walk for messages on this topic, or `way_of` a service; None if there is none."""
-        return self._walks.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
+        return self._lanes.of_topic.get(topic) if topic in self.steps and not self.taps(topic) else None
 
-    def walks(self, walker: Walker, time_ns: int) -> bool:
+    def walks(self, walker: FastLane, time_ns: int) -> bool:
         """Whether walks may be used now: nothing is due, no monitor waits for its first message or could not begin."""
         return not self._agenda.has_come(time_ns) and not self._broken and walker.ready()
 
@@ -593,7 +594,7 @@ class MonitorSet:
     def judge(self, topic: str, buffer: Buffer, time_ns: int, sender: Sender = NOBODY) -> Outcome:
         """What `process` says, by the walk where that takes the message: as in the relay."""
 
-        def silent(walker: Walker) -> Prepared:
+        def silent(walker: FastLane) -> Prepared:
             key = topic, sender.source
             if key not in self._silent:
                 told = [True] * len(walker.events)
@@ -608,11 +609,11 @@ class MonitorSet:
         topic: str,
         buffer: Buffer,
         time_ns: int,
-        prepare: Callable[[Walker], Prepared],
+        prepare: Callable[[FastLane], Prepared],
         fuel: int = MESSAGE_FUEL,
     ) -> Outcome | None:
-        """What `process` says of a message on a topic, or `way_of` a service, if its walk takes it (`Walker.take`, with
-        what `prepare` says, and so many instructions); None: nothing was done.
+        """What `process` says of a message on a topic, or `way_of` a service, if its lane takes it (`FastLane.take`,
+        with what `prepare` says, and so many instructions); None: nothing was done.
         """
         walker = self.walker(topic)
         if walker is None or not self.walks(walker, time_ns):

@@ -16,6 +16,7 @@ from rosmop.runtime.values import Values
 from rosmop.tests.acting import message
 from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
+from rosmop.tests.on_module import on_module
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
 from rosmop.text.errors import SpecificationError
 from rosmop.types import value_types
@@ -27,10 +28,9 @@ MONITORS = Path(__file__).parents[2] / "monitors"
 FEW = settings(max_examples=examples(120), suppress_health_check=list(HealthCheck))
 
 
-def check(monitors: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> None:
+def check(given: MonitorSet, traffic: list[tuple[str, bytes]], step_ns: int) -> None:
     """Fail if the two ways differ anywhere on the way of these messages, or in the variables at the end."""
-    other = beside(monitors)
-    monitors.write_module()
+    other, monitors = beside(given), on_module(given.compiled, given.on_fault)
     check_same(monitors.start(0), other.start(0))
     for number, (topic, body) in enumerate(traffic):
         time = number * step_ns

@@ -16,6 +16,7 @@ from rosmop.check.sources import compiled_from
 from rosmop.fast.serialization import decoded_part, encoded_part
 from rosmop.fast.wasm_build import part_of
 from rosmop.fast.wasm_instance import MachineError
+from rosmop.fast.wasm_runner import WasmFastPath
 from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
@@ -105,8 +106,7 @@ def test_it_does_what_its_specifications_do_in_the_set(seed: int) -> None:
         part = encoded_part(part_of(whole, names, ()))
         sent = decoded_part(part)
         assert encoded_part(sent) == part
-        own = MonitorSet.of(sent.compiled)
-        own.take_module(sent.module)
+        own = MonitorSet.of(sent.compiled, fast=WasmFastPath(sent.module))
         among = MonitorSet.of(whole.part(names))
         stories = [[*story(one.start(0), names)] for one in (own, among)]
         messages, time = Messages(seed), 0
@@ -130,10 +130,8 @@ def test_only_what_is_not_on_trial_has_a_module() -> None:
 def test_what_is_no_machine_code_of_this_library(wrong: bytes) -> None:
     """It is refused, and nothing of it is run."""
     part = part_of(compiled("a"), ["a"], [])
-    monitors = MonitorSet.of(part.compiled)
     with pytest.raises(MachineError):
-        monitors.take_module(replace(part.module, code=wrong))
-    assert monitors.walker("/a") is None
+        MonitorSet.of(part.compiled, fast=WasmFastPath(replace(part.module, code=wrong)))
 
 
 @pytest.mark.parametrize("length", [0, 1, 100])

@@ -2,16 +2,19 @@
 
 import gc
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from rosmop.check.sources import compiled_from
+from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
 from rosmop.run.interpreter import Interpreter
 from rosmop.run.monitor import Monitor
 from rosmop.run.outcomes import Outcome
 from rosmop.tests.acting import fields, message
+from rosmop.tests.on_module import on_module
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
 
@@ -20,12 +23,12 @@ MONITORS = ROOT / "monitors"
 SECOND = 10**9
 
 
-def shipped(*names: str) -> MonitorSet:
+def shipped(*names: str, made: Callable[[Compiled], MonitorSet] = MonitorSet.of) -> MonitorSet:
     """Shipped specifications, started at time 0."""
     trigger = MONITORS / "msg" / "landshark_msgs" / "PaintballTrigger.msg"
     own = Definitions.from_files({"landshark_msgs/PaintballTrigger.msg": trigger.read_text()})
     sources = {f"{name}.rv": (MONITORS / f"{name}.rv").read_text() for name in names}
-    monitors = MonitorSet.of(compiled_from(sources, standard_definitions().extended(own)))
+    monitors = made(compiled_from(sources, standard_definitions().extended(own)))
     started = monitors.start(0)
     assert not started.faults
     return monitors
@@ -222,8 +225,7 @@ def test_an_id_is_that_of_one_goal() -> None:
 
 def test_a_set_that_is_gone_leaves_nothing_to_the_garbage_collector() -> None:
     """It would hold up all messages for as long as it looks: a tenth of a second after some loads of fifty."""
-    monitors = shipped(*(path.stem for path in MONITORS.glob("*.rv")))
-    monitors.write_module()
+    monitors = shipped(*(path.stem for path in MONITORS.glob("*.rv")), made=on_module)
     monitors.process("/landshark_control/base_velocity", drive(1.0), SECOND)
     assert monitors.process("/landshark_control/base_velocity", b"", SECOND).faults
     known = {id(part) for part in (*monitors.monitors, monitors.interpreter)}

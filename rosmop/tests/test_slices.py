@@ -23,6 +23,7 @@ from rosmop.tests.acting import definitions, load, message, refused
 from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
 from rosmop.tests.logics.driving import seeded
+from rosmop.tests.on_module import on_module
 from rosmop.tests.reload import replaced
 from rosmop.text.parser import parse
 
@@ -448,8 +449,7 @@ def test_runs_that_may_grow_are_fewer() -> None:
 def test_topics_with_parametric_specifications_are_the_engines_and_others_have_a_walk() -> None:
     """The module does not know slices; it takes the messages of other topics."""
     other = "other() { bool b = false; event e(bool x) /o std_msgs/Bool '{data:x}' { b = x; } }"
-    monitors = MonitorSet.of(compiled_from({"x.rv": GOALS, "y.rv": other}, definitions()))
-    monitors.write_module()
+    monitors = on_module(compiled_from({"x.rv": GOALS, "y.rv": other}, definitions()))
     monitors.start(0)
     assert monitors.walker("/goal") is None
     assert monitors.walker("/o") is not None

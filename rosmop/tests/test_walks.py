@@ -15,17 +15,19 @@ from rosmop.fast.abi import AREA
 from rosmop.fast.batch_codegen import MAX_EFFECTS
 from rosmop.fast.codegen_access import MOST_TEXTS
 from rosmop.fast.memory_layout import LINES
-from rosmop.fast.wasm_runner import BEGINNING, Walker
+from rosmop.fast.wasm_runner import BEGINNING
 from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.causes import Sender
 from rosmop.run.engine import MonitorSet
 from rosmop.run.execution import OnFault
+from rosmop.run.fast_path import FastLane
 from rosmop.run.outcomes import Outcome, Verdict, named
 from rosmop.runtime.action_context import LogLine, Published
 from rosmop.runtime.wire import Buffer
 from rosmop.tests.acting import message
 from rosmop.tests.examples import examples
 from rosmop.tests.interpreted import beside, check_same
+from rosmop.tests.on_module import on_module
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
 from rosmop.tests.reload import replaced
 from rosmop.text.errors import SpecificationError
@@ -49,9 +51,8 @@ class Fed:
 
     def __init__(self, *texts: str, on_fault: OnFault = "drop", margins: bool = False) -> None:
         sources = {f"{place}.rv": text for place, text in enumerate(texts)}
-        self.monitors = MonitorSet.of(compiled_from(sources, definitions(), margins=margins), on_fault)
+        self.monitors = on_module(compiled_from(sources, definitions(), margins=margins), on_fault)
         self.interpreter = beside(self.monitors)
-        self.monitors.write_module()
         for one in (self.monitors, self.interpreter):
             one.start(0)
             for monitor in one.monitors:
@@ -72,7 +73,7 @@ class Fed:
         self._inside = False
         """Whether messages stand in the module's memory, every other time."""
 
-    def walker(self, topic: str = "/plain") -> Walker:
+    def walker(self, topic: str = "/plain") -> FastLane:
         """The walk of a topic; there is one."""
         found = self.monitors.walker(topic)
         assert found is not None
@@ -625,10 +626,9 @@ def test_a_topic_of_which_every_message_would_be_left_has_no_walk(body: str, has
 
 def test_walks_wait_until_a_monitor_has_begun() -> None:
     """Not before the first message, not while it is held."""
-    monitors = MonitorSet.of(
+    monitors = on_module(
         compiled_from({"x.rv": "hold s() { event e() /plain own/Plain '{}' { } }"}, definitions())
     )
-    monitors.write_module()
     monitors.start(0, restarted=True)
     walker = monitors.walker("/plain")
     assert walker is not None

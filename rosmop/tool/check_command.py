@@ -34,7 +34,7 @@ def check(
             f"--prove needs the package z3-solver: pip install '{program.package}[prove]'"
         )
     try:
-        monitors = load(program, files, folders)
+        monitors = MonitorSet.of(load(program, files, folders))
         certificates, wrong = certificates_of(monitors.monitors)
         findings = [*wrong, *monitors.warnings]
     except SpecificationError as error:

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rosmop.check.sources import compiled_from
+from rosmop.form.compiled import Compiled
 from rosmop.form.positions import Position
-from rosmop.run.engine import MonitorSet
 from rosmop.text.errors import SpecificationError
 from rosmop.tool.program import Program
 from roswire.definitions import Definitions
@@ -18,7 +18,7 @@ BESIDE = "msg"
 
 def load(
     program: Program, files: list[Path], folders: list[Path], recorded: Definitions | None = None
-) -> MonitorSet:
+) -> Compiled:
     """Compile specifications. Raises `SpecificationError`.
 
     Definitions that were recorded apply to the types that no file defines.
@@ -26,7 +26,7 @@ def load(
     definitions = read_definitions(program, files, folders)
     if recorded is not None:
         definitions = recorded.extended(definitions)
-    return MonitorSet.of(compiled_from(read_specifications(program, files), definitions))
+    return compiled_from(read_specifications(program, files), definitions)
 
 
 def read_specifications(program: Program, files: Sequence[Path]) -> dict[str, str]:

@@ -20,6 +20,7 @@ from appliance.cli.progress_bar import progress
 from appliance.cli.tables import say_table, table_of
 from appliance.cli.target import Appliance, speaks
 from rosmop.check.sources import compiled_from
+from rosmop.fast.wasm_build import fast_path_of
 from rosmop.form.connected_groups import sharing
 from rosmop.form.positions import Position, line_of
 from rosmop.run.engine import Margin, MonitorSet
@@ -115,10 +116,10 @@ def replay_monitor(
             for piece in pieces:
                 with closing(open_bag(piece.bag)) as reader:
                     known = definitions_of(reader).extended(definitions)
-                    monitors = _only(chosen, MonitorSet.of(compiled_from(texts, known, margins=margins)))
+                    compiled = compiled_from(texts, known, margins=margins)
+                    monitors = _only(chosen, MonitorSet.of(compiled, fast=fast_path_of(compiled)))
                     for text in refusals(monitors, reader, patterns):
                         raise MONITOR.usage_error(f"{piece.name}: {text}")
-                    monitors.write_module()
                     messages += report.of(monitors, reader, piece, patterns)
     except SpecificationError as error:
         raise refused(error.findings) from None

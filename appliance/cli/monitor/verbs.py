@@ -14,6 +14,7 @@ from appliance.cli.monitor.bounded_bag import BoundedReader
 from appliance.cli.monitor.monitor_program import MONITOR
 from appliance.cli.output import Json
 from appliance.cli.progress_bar import progress
+from rosmop.fast.wasm_build import fast_path_of
 from rosmop.run.engine import MonitorSet
 from rosmop.text.errors import SpecificationError
 from rosmop.tool import check_command
@@ -61,10 +62,10 @@ def run(
     """
     with closing(open_bag(bag)) as reader:
         try:
-            monitors = load(MONITOR, files, msg or [], definitions_of(reader))
+            compiled = load(MONITOR, files, msg or [], definitions_of(reader))
         except SpecificationError as error:
             raise refused(error.findings) from None
-        monitors.write_module()
+        monitors = MonitorSet.of(compiled, fast=fast_path_of(compiled))
         for text in refusals(monitors, reader):
             MONITOR.warn(f"{text}; its messages are dropped")
         if output is None:

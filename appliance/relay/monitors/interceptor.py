@@ -43,8 +43,8 @@ from rosmop.run.causes import Sender
 from rosmop.runtime.action_context import Published
 
 if TYPE_CHECKING:
-    from rosmop.fast.wasm_runner import Prepared, Walker
     from rosmop.run.engine import MonitorSet
+    from rosmop.run.fast_path import FastLane, Prepared
     from rosmop.run.monitor import Monitor
     from rosmop.run.outcomes import Outcome
 
@@ -393,7 +393,7 @@ class Middle:
         """What the module says, if nothing is to be told of it but how much there was; a refusal is told its client."""
         observer = self.observer
 
-        def prepare(walker: Walker) -> Prepared:
+        def prepare(walker: FastLane) -> Prepared:
             prepared = self._prepared.get((place, way))
             if prepared is None:
                 prepared = self._prepared[place, way] = walker.prepare(

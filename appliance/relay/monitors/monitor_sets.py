@@ -10,6 +10,7 @@ from appliance.relay.monitors.loader import Result
 from rosmop.fast.abi import FeedModule, Part
 from rosmop.fast.serialization import decoded_part
 from rosmop.fast.wasm_instance import load
+from rosmop.fast.wasm_runner import WasmFastPath
 from rosmop.form.compiled import Compiled
 from rosmop.run.engine import MonitorSet
 from rosmop.run.slice_quota import HolderOf
@@ -27,18 +28,17 @@ def monitor_set(message: SpecificationsStated, holder_of: HolderOf) -> Result:
         part = decoded_part(message.part) if message.part else _NOTHING
     except msgspec.MsgspecError as error:
         return [f"what control states is no set of specifications: {error}"]
-    monitors = MonitorSet.of(
+    return MonitorSet.of(
         part.compiled,
         message.on_fault,
         _patience,
+        fast=WasmFastPath(part.module),
         trials=message.trials,
         trial_patience=lambda: _patience(_TRIAL_TICKS_SECONDS),
         slices=message.slices,
         deadlines=_DEADLINES,
         holder_of=holder_of,
     )
-    monitors.take_module(part.module)
-    return monitors
 
 
 def prepare() -> None:

@@ -27,8 +27,8 @@ from appliance.relay.monitors.shadow import Trials
 from rosmop.run.outcomes import Outcome
 
 if TYPE_CHECKING:
-    from rosmop.fast.wasm_runner import Prepared, Walked, Walker
     from rosmop.run.engine import MonitorSet
+    from rosmop.run.fast_path import FastLane, Prepared, Walked
 
 _unpack_length = struct.Struct("<I").unpack_from
 _NEVER = 1 << 63
@@ -85,10 +85,10 @@ class Lane:
         self._place = place
         self._sight: object = None
         self._until = 0
-        self._walker: Walker | None = None
+        self._walker: FastLane | None = None
         self._prepared: Prepared | None = None
         self._counts: Counts | None = None
-        self._defect: Walker | None = None
+        self._defect: FastLane | None = None
         self._source = middle.senders.number(place)
 
     def through(self, batch: Batch) -> Batch | None:
@@ -127,7 +127,7 @@ class Lane:
             middle.look_again()
         return self._through(batch, passage)
 
-    def _failed(self, error: Exception, walker: Walker, now: int) -> None:
+    def _failed(self, error: Exception, walker: FastLane, now: int) -> None:
         """The walk of this topic is not right: tell it, and leave everything to the engine from now on."""
         self._middle.observer.defect(error, self._place, now)
         self._defect = walker
@@ -148,7 +148,7 @@ class Lane:
         middle.schedule()
         return passage.result()
 
-    def _walk(self, monitors: MonitorSet, walker: Walker, passage: Passage) -> bool:
+    def _walk(self, monitors: MonitorSet, walker: FastLane, passage: Passage) -> bool:
         """Take messages that need nothing but the common, for a quantum; False if the next one needs more."""
         middle = self._middle
         if walker is self._defect or not monitors.walks(walker, passage.time):
@@ -191,7 +191,7 @@ class Lane:
             sighting = Sighting(passage, position, bytes(passage.view[first : first + min(size, head)]))
             middle.observer.said(said, self._place, passage.time, sighting)
 
-    def _prepare(self, monitors: MonitorSet, walker: Walker) -> tuple[Prepared, Counts]:
+    def _prepare(self, monitors: MonitorSet, walker: FastLane) -> tuple[Prepared, Counts]:
         """Ask once what holds for all batches until something happens."""
         observer, place = self._middle.observer, self._place
         prepared, counts = self._prepared, self._counts

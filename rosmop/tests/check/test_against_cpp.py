@@ -11,9 +11,11 @@ from random import Random
 
 import pytest
 
+from rosmop.check.sources import compiled_from
 from rosmop.runtime.numbers import MATH
-from rosmop.tests.acting import act, load, message
+from rosmop.tests.acting import act, definitions, message
 from rosmop.tests.examples import examples
+from rosmop.tests.on_module import on_module
 from tests.support.requirements import need_program
 
 TYPES = (
@@ -183,8 +185,8 @@ def in_module(body: str) -> list[str]:
             lines.append(line)
     variables = " ".join(f"double {name} = 0;" for name in names)
     text = "\n".join((f"s() {{ {variables} {FUNCTIONS} event e() /t std_msgs/Int32 '{{}}' {{", *lines, "} }"))
-    monitors = load(text)
-    monitors.write_module()
+    monitors = on_module(compiled_from({"x.rv": text}, definitions()))
+    monitors.start(0)
     monitors.monitor("s").seen = True
     walker = monitors.walker("/t")
     assert walker is not None

@@ -8,6 +8,7 @@ import pytest
 from rosmop.check.margins import MOST_NOTED
 from rosmop.check.sources import compiled_from
 from rosmop.run.engine import Margin, MonitorSet
+from rosmop.tests.on_module import on_module
 from roswire.standard import standard_definitions
 
 NEAR = """near() {
@@ -24,8 +25,7 @@ NEAR = """near() {
 
 def started(text: str, *, margins: bool = True) -> MonitorSet:
     """The specifications in `text`, begun; with the module where there is one."""
-    monitors = MonitorSet.of(compiled_from({"a.rv": text}, standard_definitions(), margins=margins))
-    monitors.write_module()
+    monitors = on_module(compiled_from({"a.rv": text}, standard_definitions(), margins=margins))
     monitors.start(0)
     return monitors
 

@@ -19,11 +19,12 @@ from appliance.relay.monitors.observation_points import Place
 from appliance.relay.monitors.topic_pipeline import Lane
 from appliance.relay.report import Reporter
 from rosmop.check.sources import compiled_from
-from rosmop.fast.wasm_runner import Walked
 from rosmop.logics.interface import ClockedRun, FiniteRun
 from rosmop.run.engine import MonitorSet
+from rosmop.run.fast_path import Walked
 from rosmop.runtime.action_context import Published
 from rosmop.tests.acting import message
+from rosmop.tests.on_module import on_module
 from rosmop.tests.random_specifications import (
     Messages,
     Specifications,
@@ -85,9 +86,8 @@ class Monitored:
         self.middle.over = lambda: False
         self.middle.now = lambda: self.time  # type: ignore[method-assign]  # the test sets the time
         self._lanes: dict[tuple[str, str], Lane] = {}
-        self.set = MonitorSet.of(compiled_from(texts, known, margins=True), on_fault, trials=trials)
-        if together:
-            self.set.write_module()
+        compiled, make = compiled_from(texts, known, margins=True), on_module if together else MonitorSet.of
+        self.set = make(compiled, on_fault, trials=trials)
         self.middle.loaded(stated(1, [], {}, {}, restarted=restarted), self.set)
 
     def close(self) -> None:

@@ -14,6 +14,7 @@ from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome
 from rosmop.tests.interpreted import check_same
+from rosmop.tests.on_module import on_module
 from rosmop.tests.random_specifications import Messages, Specifications, definitions
 from rosmop.text.errors import SpecificationError
 from roswire.standard import standard_definitions
@@ -44,9 +45,7 @@ def begun(monitors: MonitorSet, memory: bytearray, given: StateGiven = GIVEN) ->
 
 def again(monitors: MonitorSet) -> MonitorSet:
     """The same specifications in another process."""
-    following = MonitorSet.of(monitors.compiled, monitors.on_fault)
-    following.write_module()
-    return following
+    return on_module(monitors.compiled, monitors.on_fault)
 
 
 def unexplained(outcome: Outcome) -> Outcome:
@@ -66,12 +65,11 @@ def test_random_specifications_go_on_where_a_killed_process_was(seed: int, step_
     messages = Messages(seed)
     traffic = [(one.topic, body) for one in (messages.traffic() for _ in range(6)) for body in one.bodies()]
     try:
-        monitors = MonitorSet.of(compiled_from(sources, definitions()))
+        monitors = on_module(compiled_from(sources, definitions()))
     except SpecificationError:
         return  # a draw that means nothing
     whole, memory = again(monitors), bytearray(SIZE)
     whole.start(0)
-    monitors.write_module()
     keeper = begun(monitors, memory)
     for number, (topic, body) in enumerate(traffic):
         now = number * step_ns
@@ -91,9 +89,7 @@ def test_random_specifications_go_on_where_a_killed_process_was(seed: int, step_
 def stop(modifier: str = "", more: str = "") -> MonitorSet:
     """An emergency stop that is latched."""
     text = STOP.format(modifier=modifier, more=more)
-    monitors = MonitorSet.of(compiled_from({"stop.rv": text}, standard_definitions()))
-    monitors.write_module()
-    return monitors
+    return on_module(compiled_from({"stop.rv": text}, standard_definitions()))
 
 
 def press(monitors: MonitorSet, keeper: Keeper) -> None:

@@ -8,6 +8,7 @@ from appliance.channel.messages import Approach, MarginRow
 from appliance.relay.monitors.margin_counts import Margins
 from rosmop.check.sources import compiled_from
 from rosmop.run.engine import MonitorSet
+from rosmop.tests.on_module import on_module
 from roswire.standard import standard_definitions
 from tests.unit.relay.monitors.test_interceptor import string
 from tests.unit.relay.monitors.test_shadow import Trying
@@ -37,8 +38,7 @@ def world() -> Iterator[Trying]:
 
 def offline() -> list[tuple[int, int, bool, float, float]]:
     """What `rosrv monitor replay --margins` finds in these messages."""
-    monitors = MonitorSet.of(compiled_from({"0.rv": NEAR}, standard_definitions(), margins=True))
-    monitors.write_module()
+    monitors = on_module(compiled_from({"0.rv": NEAR}, standard_definitions(), margins=True))
     monitors.start(0)
     for word in WORDS:
         monitors.judge("/chatter", string(word)[4:], 1)

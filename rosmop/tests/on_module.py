@@ -1,0 +1,13 @@
+"""Make a set whose messages a module takes, as in the relay."""
+
+from collections.abc import Collection
+
+from rosmop.fast.wasm_build import fast_path_of
+from rosmop.form.compiled import Compiled
+from rosmop.run.engine import MonitorSet
+from rosmop.run.execution import OnFault
+
+
+def on_module(compiled: Compiled, on_fault: OnFault = "drop", trials: Collection[str] = ()) -> MonitorSet:
+    """Return the set of what was compiled, with a module of its own; not started."""
+    return MonitorSet.of(compiled, on_fault, fast=fast_path_of(compiled.without(trials)), trials=trials)
