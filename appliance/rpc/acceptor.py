@@ -1,8 +1,7 @@
-"""Accepts the connections of a listening socket, several in a turn of the loop.
+"""Accept the connections of a listening socket, several in a turn of the event loop.
 
-The kernel's queue is one for all hosts, first come, first served. It is emptied quickly and cheaply: whether a
-connection may wait, and when it is opened, is decided behind it, by host. So a host that connects without end fills
-no queue that others need.
+The kernel has one queue for all hosts, in order of arrival. The acceptor empties it quickly. Later code decides by host
+whether a connection may wait and when it is opened, so a host that connects without end fills no shared queue.
 """
 
 import asyncio
@@ -21,15 +20,15 @@ BACKLOG = 4096
 _CLOSING_SECONDS = 15e-6  # of processor time, to accept and close a connection
 _AT_ONCE = 256  # connections in one turn of the loop
 _GONE = frozenset({errno.ECONNABORTED, errno.EINTR, errno.EPROTO})
-_PAUSE_SECONDS = 0.2  # when the process has no descriptor left
+_PAUSE_SECONDS = 0.2  # after the process ran out of descriptors
 
 _log = structlog.get_logger()
 
 
 class Acceptor:
-    """Hands each connection, and its host, to `accepted`, which owns the socket then; the time is the host's.
+    """Pass each connection and its host to `accepted`, which then owns the socket; charge the time to the host.
 
-    Where `accepted` says that the host has too many (False), more of the same turn are closed without asking.
+    If `accepted` returns False (too many), further connections of that host in the same turn are closed at once.
     """
 
     def __init__(
@@ -45,7 +44,7 @@ class Acceptor:
         self._loop.add_reader(sock, self._accept)
 
     def close(self) -> None:
-        """Accept no more; the listening socket is closed."""
+        """Stop accepting, and close the listening socket."""
         if self._pause is not None:
             self._pause.cancel()
         self._loop.remove_reader(self._sock)
@@ -79,7 +78,7 @@ class Acceptor:
             self._time.end(host)
 
     def _wait(self, error: OSError) -> None:
-        """Accept again in a while."""
+        """Pause accepting for a while."""
         _log.error("no connection can be accepted", reason=str(error))
         self._loop.remove_reader(self._sock)
         self._pause = self._loop.call_later(_PAUSE_SECONDS, self._loop.add_reader, self._sock, self._accept)

@@ -1,7 +1,7 @@
-"""Large bodies and answers: few at a time, host by host, so that memory and the event loop are there for others.
+"""Limit the number of large bodies and answers in progress, by host, to save memory and the event loop.
 
-A tree of parameters takes ten times its size while it is read from ROSMaster and written for a node. What one request
-needs for that is its *bulk*: there is room for the bulk of `AT_ONCE` requests, one of each host, and hosts take turns.
+A parameter tree takes ten times its size while it is read from the ROS master and written for a node. A request's
+*bulk* is its need for that. `AT_ONCE` requests may have their bulk, one of each host, and hosts take turns.
 """
 
 import asyncio
@@ -22,18 +22,18 @@ T = TypeVar("T")
 
 AT_ONCE = 2
 _BOUNDS = Bounds(whole=AT_ONCE, host=1, strangers=1, kept=1)
-_VALUE, _TEXT, _MEMBER, _ARRAY, _STRUCT = 45, 35, 40, 50, 40  # about what XML-RPC writes around a value
+_VALUE, _TEXT, _MEMBER, _ARRAY, _STRUCT = 45, 35, 40, 50, 40  # approximate bytes that XML-RPC adds to a value
 
 
 def bulk_turns(standing: Callable[[Address], Standing]) -> Turns:
-    """The turns that all requests share."""
+    """Return the turns that all requests share."""
     return Turns(_BOUNDS, standing)
 
 
 class Bulk:
-    """The bulk of one request of a host: room for it is taken when it is needed, and given back at the end.
+    """Reserve the bulk of one request when it is needed, and release it at the end.
 
-    What is done beside the request's own steps (in a thread, in another task) is charged to the host here.
+    Work outside the request's own steps (in a thread, in another task) is charged to the host here.
     """
 
     def __init__(self, turns: Turns, host: Address, processor: ProcessorTime) -> None:
@@ -41,7 +41,7 @@ class Bulk:
         self._host = host
         self._processor = processor
         self.taken = False
-        self.large = False  # whether the request itself is
+        self.large = False  # whether the request itself is large
 
     def __enter__(self) -> Self:
         return self
@@ -50,13 +50,13 @@ class Bulk:
         self.give_back()
 
     async def take(self) -> None:
-        """Wait for room, unless it is taken already."""
+        """Wait for room, unless the request already has it."""
         if not self.taken:
             await self._turns.enter(self._host)
             self.taken = True
 
     async def in_thread(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in a thread, whose processor time is the host's."""
+        """Call a function in a thread, and charge its processor time to the host."""
         used = 0.0
 
         def measured() -> T:
@@ -73,17 +73,17 @@ class Bulk:
             self._processor.charge_beside(self._host, used)
 
     def give_back(self) -> None:
-        """Make room for others."""
+        """Release the room."""
         if self.taken:
             self.taken = False
             self._turns.leave(self._host)
 
 
 class LargeWrites:
-    """Large values on their way to ROSMaster: few at a time, one of each host.
+    """Limit the number of large values on their way to the ROS master, to one of each host.
 
-    ROSMaster is one Python process: what many of its threads read at once, all others wait for. Whoever has a turn
-    waits for nothing but ROSMaster.
+    The ROS master is one Python process: many threads that read large values would block all others. A call with a
+    turn waits only for the ROS master.
     """
 
     def __init__(self, enough: int, standing: Callable[[Address], Standing]) -> None:
@@ -92,7 +92,7 @@ class LargeWrites:
 
     @contextlib.asynccontextmanager
     async def turn(self, host: Address, values: list[Value]) -> AsyncIterator[bool]:
-        """Carry out what brings these values to ROSMaster; small ones wait for nobody, large ones may (True)."""
+        """Surround a write of these values to the ROS master; yield whether they are large and had to take a turn."""
         if weigh(values, self._enough) < self._enough:
             yield False
             return
@@ -104,7 +104,7 @@ class LargeWrites:
 
 
 def text_weight(text: str) -> int:
-    """About how many bytes a text takes on the wire, where `&`, `<` and `>` are written out."""
+    """Return the approximate bytes of a string on the wire, with `&`, `<` and `>` escaped."""
     if text.isascii() and not ("&" in text or "<" in text or ">" in text):
         return len(text)
     size = len(text.encode("utf-8", "surrogatepass"))
@@ -112,7 +112,7 @@ def text_weight(text: str) -> int:
 
 
 def weigh(value: Value, enough: int) -> int:
-    """About how many bytes a value takes on the wire; counting ends when it is `enough`."""
+    """Return the approximate bytes of a value on the wire; stop counting at `enough`."""
     total = 0
     waiting: list[Value] = [value]
     while waiting and total < enough:

@@ -1,9 +1,8 @@
-"""Whose request is served next: hosts take turns, so that one host's flood costs the others little.
+"""Serve requests of hosts in turn, so that one host's flood costs the others little.
 
-Slots are a pool of `appliance/quotas`; when none is left for a host, it waits, and the next goes to the host that
-waited longest since its last turn, however many requests another has waiting and however long each of them takes.
-Hosts that are alike (that the policy names as one network) take their turns as one and have half of the slots together:
-nobody comes first more often by having many addresses.
+Slots are a pool of `appliance/quotas`. A host without a free slot waits. The next slot goes to the host with the
+longest wait since its last turn, whatever the number and duration of other hosts' requests. Hosts that are alike (the
+policy names them as one network) share one turn and half of the slots, so many addresses bring no advantage.
 """
 
 import asyncio
@@ -17,17 +16,16 @@ Queue = deque[asyncio.Future[None]]
 
 
 def itself(host: Address) -> Hashable:
-    """Of hosts that are like no other."""
+    """Return the host itself, for hosts without others alike."""
     return host
 
 
 class Turns:
-    """Slots for requests being served, within the shares of `bounds`; who gets none waits in turn.
+    """Give slots to requests within the shares of `bounds`; other requests wait in turn.
 
-    Whenever a slot is free, everybody who waits does so because of his host's share, or that of hosts like it.
-    `alike(host)` is the same for hosts that take their turns as one. `pause(host)` is for how many seconds a host that
-    owes for its audit records waits before it is asked again, without a slot: who waits for its own debt keeps nothing
-    that others need.
+    While a slot is free, requests wait only because of their host's share, or that of hosts alike. `alike(host)` is
+    equal for hosts that share turns. `pause(host)` returns the seconds until the next check of a host that owes for its
+    audit records; it waits without a slot.
     """
 
     def __init__(
@@ -41,12 +39,12 @@ class Turns:
         self._alike = alike
         self.pause = pause
         self._together = max(bounds.host, bounds.whole // 2)
-        self._taken: Counter[Hashable] = Counter()  # by hosts that are alike
+        self._taken: Counter[Hashable] = Counter()  # by group of hosts alike
         self._taken_as: dict[Address, Hashable] = {}
         self.waiting: OrderedDict[Hashable, OrderedDict[Address, Queue]] = OrderedDict()
 
     async def enter(self, host: Address) -> None:
-        """Take a slot, once this host's records are paid, waiting for its turn when there is none."""
+        """Wait until this host's records are paid, then take a slot or wait for a turn."""
         while seconds := self.pause(str(host)):
             await asyncio.sleep(seconds)
         kind = self._alike(host)
@@ -64,7 +62,7 @@ class Turns:
             raise
 
     def leave(self, host: Address) -> None:
-        """Give the slot back: of the hosts that may have one, that which waited longest gets it."""
+        """Release the slot to the longest waiting host that may have it."""
         self._give_back(host)
         while (following := self._next()) is not None:
             kind, host = following
@@ -72,16 +70,16 @@ class Turns:
             queue = hosts.pop(host)
             turn = queue.popleft()
             if queue:
-                hosts[host] = queue  # to the end of the line: its next request waits a round
+                hosts[host] = queue  # at the end of the line: the next request waits a round
             if hosts:
                 self.waiting[kind] = hosts
-            if turn.done():  # its task was cancelled, and has not run since to give up its place
+            if turn.done():  # its task was cancelled, and has not yet run to give up its place
                 self._give_back(host)
             else:
                 turn.set_result(None)
 
     def _next(self) -> tuple[Hashable, Address] | None:
-        """The host whose turn it is, and its kind; its slot is taken."""
+        """Take a slot for the next host, and return its group and the host."""
         for kind, hosts in self.waiting.items():
             if self._taken[kind] < self._together:
                 for host in hosts:
@@ -90,7 +88,7 @@ class Turns:
         return None
 
     def _take(self, host: Address, kind: Hashable) -> bool:
-        kind = self._taken_as.get(host, kind)  # as whose its other slots count
+        kind = self._taken_as.get(host, kind)  # the group of its other slots
         if self._taken[kind] >= self._together or self.slots.take(host):
             return False
         self._taken[kind] += 1
