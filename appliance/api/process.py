@@ -29,7 +29,6 @@ from appliance.api.journal import FOLD_SECONDS, Journal
 from appliance.api.listener import Listener
 from appliance.api.request_gate import Gate
 from appliance.api.services import Services
-from appliance.base import lazy_imports
 from appliance.channel import messages
 from appliance.channel.channel import Channel, ChannelClosedError
 from appliance.channel.messages.api import ApiLink
@@ -61,8 +60,9 @@ class _Application:
         await self._made(scope, receive, send)
 
     def _make(self) -> ASGIApp:
-        made: ASGIApp = lazy_imports.load("appliance.api.app").build_app(self._services)
-        return made
+        from appliance.api.app import build_app  # noqa: PLC0415  only for a process that is asked
+
+        return build_app(self._services)
 
 
 class _Api:

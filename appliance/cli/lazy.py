@@ -6,6 +6,7 @@ the files of the verbs.
 """
 
 import functools
+import importlib
 import inspect
 import os.path
 import re
@@ -18,7 +19,6 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from appliance.base import lazy_imports
 from appliance.base.validation_messages import refusal
 
 
@@ -185,7 +185,7 @@ class _Deferred(TyperCommand):
 def loaded(verb: Verb, name: str) -> Any:
     """The real command of a verb."""
     module, _colon, attribute = verb.place.partition(":")
-    found = getattr(lazy_imports.load(f"appliance.cli.{module}"), attribute)
+    found = getattr(importlib.import_module(f"appliance.cli.{module}"), attribute)
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
     app.command(name, cls=_Command, help="\n\n".join(filter(None, (verb.first, inspect.getdoc(found)))))(
         found

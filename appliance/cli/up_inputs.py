@@ -69,9 +69,9 @@ def _require_specifications(folder: Path, site_keys: Sequence[str]) -> None:
 
 
 def _wrong_with(folder: Path, site_keys: Sequence[str]) -> str:
-    from appliance.specifications.specification_files import (  # noqa: PLC0415  the compiler: not where there are none
+    from appliance.specifications.checking import check  # noqa: PLC0415  the compiler: only in this child
+    from appliance.specifications.specification_files import (  # noqa: PLC0415  as above
         SpecificationsRefusedError,
-        check,
         read_folder,
     )
 

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from ipaddress import ip_address, ip_network
 
-from appliance.base import lazy_imports
 from appliance.channel import messages
 from appliance.configuration.settings import Settings
 from appliance.control.listener_limits import Doors, value_limits
@@ -387,7 +386,6 @@ def _make_mirror(base: Foundation) -> ParameterMirror:
 
 
 def _header_of_rosout() -> messages.OwnHeaderStated:
-    stated: messages.OwnHeaderStated = rosout.header(
-        lazy_imports.load("roswire.standard").standard_definitions()
-    )
-    return stated
+    from roswire.standard import standard_definitions  # noqa: PLC0415  only where it is configured
+
+    return rosout.header(standard_definitions())

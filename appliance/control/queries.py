@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import msgspec
 
 import appliance
-from appliance.base import lazy_imports
 from appliance.channel import admin
 from appliance.channel.answers.graph_answers import (
     Graph,
@@ -77,9 +76,9 @@ class Looks:
 
     async def inventory(self, _request: admin.InventoryWanted) -> Inventory:
         """What runs, and what it uses of the kernel."""
-        found: Inventory = await asyncio.to_thread(
-            lazy_imports.load("appliance.configuration.inventory").inventory
-        )
+        from appliance.configuration.inventory import inventory  # noqa: PLC0415  only when it is asked for
+
+        found = await asyncio.to_thread(inventory)
         around = self.surroundings
         used = InUse(
             firewall=around.firewall.report.backend,

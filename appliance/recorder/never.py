@@ -8,8 +8,6 @@ that fits may still be false, so a recording without such a topic says by whose 
 from collections.abc import Collection, Iterable, Mapping
 from fnmatch import fnmatchcase
 
-from appliance.base import lazy_imports
-
 NAMED = "recorder.never has its name"
 
 _SHIPPED = {
@@ -26,7 +24,9 @@ def known_sums(never: Collection[str]) -> dict[str, str]:
     """The md5sums of the types with known definitions that a glob of `never` fits."""
     if all(glob in _SHIPPED or glob.startswith("/") for glob in never):
         return {name: md5sum for name, md5sum in _SHIPPED.items() if name in never}
-    definitions = lazy_imports.load("roswire.standard").standard_definitions()
+    from roswire.standard import standard_definitions  # noqa: PLC0415  only where it is configured
+
+    definitions = standard_definitions()
     known = {name: definitions.md5sum(name) for name in definitions.message_types if fits(never, name)}
     return known | {name: md5sum for name, md5sum in _SHIPPED.items() if fits(never, name)}
 

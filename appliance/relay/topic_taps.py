@@ -10,15 +10,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from appliance.base import lazy_imports
 from appliance.channel.messages import LookWanted, Message, MessageSeen
 from appliance.relay.connections.frames import Batch
 from appliance.relay.connections.relayed_topic import RelayedTopic
-
-if TYPE_CHECKING:
-    from roswire.message_view import PublisherReader
 
 MOST_LOOKS = 8
 MOST_MESSAGES = 20
@@ -73,12 +69,14 @@ class _Reader:
     def __init__(self, topic: RelayedTopic) -> None:
         self._topic = topic
         self._header: Mapping[str, str] | None = None
-        self._view = lazy_imports.load("roswire.message_view")
-        self._reader: PublisherReader = self._view.PublisherReader({})
+        from roswire.message_view import PublisherReader  # noqa: PLC0415  only for a topic that is looked into
+
+        self._made_for = PublisherReader
+        self._reader = PublisherReader({})
 
     def read(self, data: bytes) -> tuple[str, dict[str, Any], str]:
         """The type, the fields, and why there are none but the first bytes."""
         header = self._topic.header or {}
         if header is not self._header:
-            self._header, self._reader = header, self._view.PublisherReader(header)
+            self._header, self._reader = header, self._made_for(header)
         return self._reader.type, *self._reader.read(data)

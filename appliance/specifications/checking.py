@@ -1,10 +1,16 @@
-"""Specifications compiled as a whole: in the process `compiler` for control, and where `files.check` is called."""
+"""Specifications compiled as a whole: in the process `compiler` for control, and where `check` is called."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
 
 from appliance.channel.messages import Contents, PartNames
-from appliance.specifications.specification_files import SpecificationsRefusedError
+from appliance.specifications.specification_files import (
+    Checked,
+    Sources,
+    SpecificationsRefusedError,
+    checked,
+    require_bounded,
+)
 from rosmop.certify.properties import DEFECT, certificates_of
 from rosmop.certify.steps import StepDiffersError
 from rosmop.check.sources import compiled_from
@@ -17,6 +23,17 @@ from roswire.errors import DefinitionError
 from roswire.standard import standard_definitions
 
 _LONGEST = 32 << 20  # bytes: half of what a channel takes
+
+
+def check(sources: Sources, site_keys: Sequence[str]) -> Checked:
+    """Compile everything here. Raises `SpecificationsRefusedError` with all that is wrong; takes a moment.
+
+    Where there are `site_keys`, each text must be signed with one of them.
+    """
+    if not sources.files:
+        return Checked()
+    require_bounded(sources)
+    return checked(contents(sources.files, sources.definitions), sources, site_keys)
 
 
 def contents(files: Mapping[str, str], texts: Mapping[str, str]) -> Contents:

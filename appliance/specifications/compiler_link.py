@@ -61,7 +61,7 @@ class SpecificationCompiler:
         self._there.set()
 
     async def check(self, sources: Sources, site_keys: Sequence[str]) -> Checked:
-        """As `files.check`. Raises `SpecificationsRefusedError`, also when the compiler does not answer."""
+        """As `checking.check`. Raises `SpecificationsRefusedError`, also when the compiler does not answer."""
         if not sources.files:
             return Checked()
         require_bounded(sources)

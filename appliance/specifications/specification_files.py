@@ -10,7 +10,6 @@ from typing import Any
 
 import msgspec
 
-from appliance.base import lazy_imports
 from appliance.base.input_files import read_given_text
 from appliance.channel import messages
 from appliance.signing.site_keys import UnsignedError, read_signature, signer
@@ -119,19 +118,6 @@ def _definitions(name: str, text: str) -> Definitions | None:
         return Definitions.from_full_text(name, text)
     except DefinitionError:
         return None
-
-
-def check(sources: Sources, site_keys: Sequence[str]) -> Checked:
-    """Compile everything here. Raises `SpecificationsRefusedError` with all that is wrong; takes a moment.
-
-    Where there are `site_keys`, each text must be signed with one of them.
-    """
-    if not sources.files:
-        return Checked()
-    require_bounded(sources)
-    # The compiler, half a second of a small machine: not where there is nothing to compile.
-    checking = lazy_imports.load("appliance.specifications.checking")
-    return checked(checking.contents(sources.files, sources.definitions), sources, site_keys)
 
 
 def checked(contents: messages.Contents, sources: Sources, site_keys: Sequence[str]) -> Checked:

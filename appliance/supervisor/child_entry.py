@@ -7,6 +7,8 @@ in words for the person who started it.
 """
 
 import contextlib
+import gc
+import importlib
 import os
 import signal
 import socket
@@ -17,7 +19,6 @@ import msgspec
 import setproctitle
 
 import appliance
-from appliance.base import lazy_imports
 from appliance.channel.channel import Channel
 from appliance.channel.messages import Failed, Lifeline, Walled
 from appliance.supervisor import privileges
@@ -132,8 +133,11 @@ def _call(role: str, plan: Plan, secret: int | None) -> None:
     assert plan.entry is not None  # noqa: S101  a plan has either argv or entry
     _require(plan.account, str(Path(appliance.__file__).parent), os.R_OK | os.X_OK)
     module, _, function = plan.entry.partition(":")
-    lazy_imports.load("appliance.supervisor.logs").configure_logs(role)
-    entry = getattr(lazy_imports.load(module), function)
+    from appliance.supervisor.logs import configure_logs  # noqa: PLC0415  not for somebody else's program
+
+    configure_logs(role)
+    entry = getattr(importlib.import_module(module), function)
+    gc.freeze()  # what is imported stays
     arguments: list[int | Path | None] = [plan.lifeline]
     if plan.index is not None:
         arguments.append(plan.index)

@@ -22,7 +22,8 @@ from appliance.policy.judgement import Known, judge
 from appliance.policy.policy import Policy
 from appliance.policy.policy_findings import PolicyError
 from appliance.signing.site_keys import read_signature
-from appliance.specifications.specification_files import SpecificationsRefusedError, check, read_folder
+from appliance.specifications.checking import check
+from appliance.specifications.specification_files import SpecificationsRefusedError, read_folder
 from appliance.supervisor.state_directory import foreign
 
 _LITTLE_SPACE, _NO_SPACE = 1 << 30, 50 << 20

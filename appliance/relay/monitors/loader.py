@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Union
 
-from appliance.base import lazy_imports
 from appliance.channel.messages import SpecificationsStated
 from appliance.relay.loop import READ, Loop
 
@@ -88,9 +87,10 @@ class Loader:
     @staticmethod
     def load(message: SpecificationsStated, holder_of: "HolderOf") -> Result:
         """The set that these specifications make, or what is wrong with them."""
-        try:  # it is loaded late, for that takes half a second of a small machine
-            sets = lazy_imports.load("appliance.relay.monitors.monitor_sets", "prepare")
-            result: Result = sets.monitor_set(message, holder_of)
+        try:
+            from appliance.relay.monitors import monitor_sets  # noqa: PLC0415  half a second of a small machine
+
+            monitor_sets.prepare()
+            return monitor_sets.monitor_set(message, holder_of)
         except Exception as error:  # noqa: BLE001  a defect is a reason to refuse, no more
             return [f"a defect of rosrv, please report it: {type(error).__name__}: {error}"]
-        return result

@@ -1,12 +1,13 @@
 """Monitors of what the compiler made: what `Loader` does, beside the loop."""
 
+import functools
+import gc
 import time
 from collections.abc import Callable
 
 import msgspec
 
 from appliance.channel.messages import SpecificationsStated
-from appliance.relay.monitors.loader import Result
 from rosmop.fast.abi import FeedModule, Part
 from rosmop.fast.serialization import decoded_part
 from rosmop.fast.wasm_instance import load
@@ -22,7 +23,7 @@ _TRIAL_TICKS_SECONDS = 0.02
 _DEADLINES = 100  # of slices that pass in one go: some milliseconds
 
 
-def monitor_set(message: SpecificationsStated, holder_of: HolderOf) -> Result:
+def monitor_set(message: SpecificationsStated, holder_of: HolderOf) -> MonitorSet | list[str]:
     """Return the set that these specifications make, or why there is none."""
     try:
         part = decoded_part(message.part) if message.part else _NOTHING
@@ -41,9 +42,11 @@ def monitor_set(message: SpecificationsStated, holder_of: HolderOf) -> Result:
     )
 
 
+@functools.cache
 def prepare() -> None:
-    """Make what every set needs: the library of modules."""
+    """Load the library of modules, and keep the garbage collector, which holds up messages, from all of it."""
     load()
+    gc.freeze()
 
 
 _NOTHING = Part(

@@ -9,7 +9,11 @@ from random import Random
 import pytest
 
 import rosmop.certify
-from appliance.specifications.specification_files import Sources, SpecificationsRefusedError, check
+from appliance.specifications.checking import check
+from appliance.specifications.specification_files import (
+    Sources,
+    SpecificationsRefusedError,
+)
 from rosmop.certify.check import MOST_STEPS, Tables, certify
 from rosmop.certify.properties import certificate_of
 from rosmop.form.positions import Position

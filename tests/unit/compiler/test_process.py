@@ -16,7 +16,12 @@ import pytest
 from appliance.channel import messages
 from appliance.channel.channel import Channel
 from appliance.compiler import process
-from appliance.specifications.specification_files import Sources, SpecificationsRefusedError, check, checked
+from appliance.specifications.checking import check
+from appliance.specifications.specification_files import (
+    Sources,
+    SpecificationsRefusedError,
+    checked,
+)
 from rosmop.fast.serialization import decoded_part
 from tests.support.waiting import eventually
 
@@ -117,10 +122,9 @@ def test_texts_that_take_too_much_are_no_burden(memory: int, seconds: int) -> No
     program = f"""
 import resource, sys
 from pathlib import Path
-from appliance.base import lazy_imports
 from appliance.channel import messages
 from appliance.compiler import process
-lazy_imports.load("appliance.specifications.checking")
+from appliance.specifications import checking
 size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (size + {memory}, size + {memory}))
 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

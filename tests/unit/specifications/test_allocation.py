@@ -5,7 +5,11 @@ import json
 import pytest
 
 from appliance.specifications.allocation import SERVICE, TOPIC, Allocation, Move, groups_of
-from appliance.specifications.specification_files import Checked, Sources, check
+from appliance.specifications.checking import check
+from appliance.specifications.specification_files import (
+    Checked,
+    Sources,
+)
 
 
 def spec(name: str, *topics: str, body: str = "", variables: str = "") -> str:

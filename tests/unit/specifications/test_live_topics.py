@@ -4,8 +4,12 @@ from collections.abc import Collection
 
 import pytest
 
+from appliance.specifications.checking import check
 from appliance.specifications.live_topics import judge_topics
-from appliance.specifications.specification_files import Checked, Sources, check
+from appliance.specifications.specification_files import (
+    Checked,
+    Sources,
+)
 
 TEXT = """\
 a() {

@@ -10,8 +10,12 @@ import pytest
 from appliance.audit.log import AuditLog
 from appliance.channel import messages
 from appliance.specifications.allocation import TOPIC, Allocation, Move, Resource
+from appliance.specifications.checking import check
 from appliance.specifications.rollout import Revision, Rollout
-from appliance.specifications.specification_files import Sources, SpecificationsRefusedError, check
+from appliance.specifications.specification_files import (
+    Sources,
+    SpecificationsRefusedError,
+)
 from appliance.telemetry.audit_trail import AuditTrail
 from tests.support.audit import HeardTrail
 from tests.support.stated import parts_here

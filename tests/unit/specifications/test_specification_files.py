@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from appliance.specifications.checking import check
 from appliance.specifications.specification_files import (
     Sources,
     SpecificationsRefusedError,
-    check,
     read_folder,
 )
 

@@ -14,8 +14,13 @@ from appliance.audit.log import AuditLog
 from appliance.base.withdrawal import WithdrawnError, awaited
 from appliance.channel import admin, messages
 from appliance.specifications.allocation import Allocation, Move, Resource
+from appliance.specifications.checking import check
 from appliance.specifications.live_topics import Published
-from appliance.specifications.specification_files import Checked, Sources, SpecificationsRefusedError, check
+from appliance.specifications.specification_files import (
+    Checked,
+    Sources,
+    SpecificationsRefusedError,
+)
 from appliance.specifications.specification_revisions import Check
 from appliance.specifications.specifications import (
     DryRunUnderWayError,
