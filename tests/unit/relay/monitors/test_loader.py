@@ -12,8 +12,8 @@ from appliance.channel.messages import SpecificationsStated
 from appliance.relay.monitors.loader import Loader
 monitors = Loader.load(SpecificationsStated(1, bytes.fromhex(sys.argv[1]), {"m": True}, False), lambda _: None)
 assert monitors.monitors, monitors
-ir = tuple(f"rosmop.ir.{name}" for name in ("feed", "module", "layout", "wasm"))
-compiler = ("lark", "rosmop.text", "rosmop.check.", "rosmop.fast.wasm_build", *ir)
+written = tuple(f"rosmop.fast.{name}" for name in ("wasm_build", "batch_codegen", "codegen", "memory_layout"))
+compiler = ("lark", "rosmop.text", "rosmop.check.", *written)
 assert not [name for name in sys.modules if name.startswith(compiler)]
 gc.collect()
 print(len(gc.get_objects()))
