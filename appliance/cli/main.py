@@ -63,9 +63,9 @@ VERBS: dict[str, Verb | Group] = {
         {
             "check": Verb("monitor.verbs:check"),
             "run": Verb("monitor.verbs:run"),
-            "learn": Verb("monitor.learning:learn_monitors"),
+            "learn": Verb("monitor.verbs:learn_monitors"),
             "replay": Verb("monitor.replay:replay_monitor"),
-            "coverage": Verb("monitor.coverage:coverage"),
+            "coverage": Verb("monitor.verbs:coverage"),
             "list": Verb("monitor.in_force:list_monitors"),
             "margins": Verb("monitor.in_force:margins"),
             "enable": Verb("monitor.in_force:enable"),

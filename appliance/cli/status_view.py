@@ -9,7 +9,7 @@ from rich.text import Text
 
 from appliance.channel.answers.status import ClockState, ProcessInfo
 from appliance.channel.status_summary import process_names
-from appliance.cli.tables import table_of
+from rosmop.tool.tables import table_of
 
 _YELLOW = "yellow"
 _COLUMN = 38  # columns that one process takes

@@ -12,11 +12,13 @@ from rosmop.tool.terminal import printable
 
 @dataclass(frozen=True)
 class Program:
-    """`name` begins each message, `package` is what pip installs. `read` raises `OSError`."""
+    """`name` begins each message, `package` is what pip installs. `read`, `open` and `write` raise `OSError`."""
 
     name: str
     package: str
     read: Callable[[Path], bytes]
+    open: Callable[[Path], io.BufferedReader]
+    write: Callable[[Path, bytes], object]
 
     def read_text(self, path: Path) -> str:
         """Return the text of a file, its lines ended by LF; other bytes than UTF-8 as surrogates. Raises `OSError`."""

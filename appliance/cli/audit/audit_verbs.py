@@ -31,8 +31,8 @@ from appliance.cli.audit.record_table import (
     print_verification,
     write,
 )
-from appliance.cli.progress_bar import progress
 from appliance.cli.target import Appliance, speaks
+from rosmop.tool.progress_bar import progress
 
 _CHECKPOINT_SECONDS = 5.0  # between two looks: one is made a minute, and a look over REST is itself recorded
 _TOLD_EVERY = 1000

@@ -17,8 +17,8 @@ from appliance.cli import completion
 from appliance.cli.commit_confirm import ConfirmWithin, say_deadline, seconds_within
 from appliance.cli.durations import span_given
 from appliance.cli.output import moment, say_json, usage_error
-from appliance.cli.tables import say_table, table_of
 from appliance.cli.target import Appliance, speaks
+from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import counted, printable, say
 
 _Names = Annotated[

@@ -11,13 +11,9 @@ import typer
 from rich.table import Column
 
 from appliance.channel import admin
-from appliance.cli.monitor.bag import Replayed, definitions_of, open_bag, refusals, replay
-from appliance.cli.monitor.bounded_bag import BoundedReader
 from appliance.cli.monitor.monitor_program import MONITOR
 from appliance.cli.monitor.recorder_input import EVER, Piece, Span, gaps, pieces_of, require_recorded, span_of
 from appliance.cli.output import say_json
-from appliance.cli.progress_bar import progress
-from appliance.cli.tables import say_table, table_of
 from appliance.cli.target import Appliance, speaks
 from rosmop.check.sources import compiled_from
 from rosmop.fast.wasm_build import fast_path_of
@@ -28,9 +24,13 @@ from rosmop.run.outcomes import Outcome, bound
 from rosmop.text import tree
 from rosmop.text.errors import SpecificationError
 from rosmop.text.parser import parse
+from rosmop.tool.bag import Replayed, definitions_of, open_bag, refusals, replay
+from rosmop.tool.bounded_bag import BoundedReader
 from rosmop.tool.monitor_output import BILLION, because
 from rosmop.tool.options import Folders
+from rosmop.tool.progress_bar import progress
 from rosmop.tool.specification_input import read_definitions, read_specifications
+from rosmop.tool.tables import say_table, table_of
 from rosmop.tool.terminal import counted, refused, say
 from roswire.definitions import Definitions
 from roswire.standard import standard_definitions
@@ -114,7 +114,7 @@ def replay_monitor(
                 pieces = fetched.enter_context(pieces_of(appliance, recorded, span))
                 report.cover(pieces, span)
             for piece in pieces:
-                with closing(open_bag(piece.bag)) as reader:
+                with closing(open_bag(MONITOR, piece.bag)) as reader:
                     known = definitions_of(reader).extended(definitions)
                     compiled = compiled_from(texts, known, margins=margins)
                     monitors = _only(chosen, MonitorSet.of(compiled, fast=fast_path_of(compiled)))

@@ -15,10 +15,10 @@ from rich.text import Text
 from appliance.cli.admin_client import ADMIN_SOCKET, AdminSocket
 from appliance.cli.output import say_json
 from appliance.cli.selftest.selftest_findings import Found, fail
-from appliance.cli.tables import say_table
 from appliance.cli.target import Appliance, speaks
 from appliance.configuration.config_sources import ConfigError, resolve
 from appliance.configuration.settings import Settings, load_resolved
+from rosmop.tool.tables import say_table
 from rosmop.tool.terminal import counted, printable
 
 _STYLES = {"ok": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}

@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from rosbags.rosbag1 import Writer
+
+from rosmop.tests.acting import message
+from roswire.standard import standard_definitions
 
 FOLDER = Path(__file__).parents[2]
 MONITORS = sorted((FOLDER.parent / "monitors").glob("*.rv"))
@@ -85,3 +89,29 @@ def test_errors_name_the_command(environment: Path, tmp_path: Path) -> None:
     )
     unproved = run(environment / "bin/rosmop", "check", "a.rv", "--prove", folder=tmp_path)
     assert "pip install 'rosmop[prove]'" in unproved.stderr
+
+
+def test_recordings_go_through_monitors(environment: Path, tmp_path: Path) -> None:
+    """The monitor is interpreted; what is learnt is right and says what recordings exercise."""
+    definitions = standard_definitions()
+    with Writer(tmp_path / "a.bag") as writer:
+        text, digest = definitions.full_text("std_msgs/Int32"), definitions.md5sum("std_msgs/Int32")
+        numbers = writer.add_connection("/n", "std_msgs/msg/Int32", msgdef=text, md5sum=digest)
+        for second in range(100):
+            writer.write(numbers, (1000 + second) * 10**9, message("std_msgs/Int32", data=second))
+    (tmp_path / "a.rv").write_text(
+        "a() {\n  event e(int x) /n std_msgs/Int32 '{data:x}' { if (x > 97) return; }\n}\n"
+    )
+
+    def rosmop(*arguments: str) -> str:
+        done = run(environment / "bin/rosmop", *arguments, folder=tmp_path)
+        assert (done.returncode, done.stderr) == (0, "")
+        return done.stdout
+
+    *lines, total = rosmop("run", "a.rv", "--bag", "a.bag", "--output", "b.bag").splitlines()
+    assert len(lines) == 2
+    assert total == "100 messages: 98 passed, 0 changed, 2 dropped; 0 verdicts, 0 faults"
+    assert rosmop("run", "a.rv", "--bag", "b.bag").startswith("98 messages: 98 passed")
+    assert rosmop("coverage", "a.rv", "--bag", "a.bag").endswith("exercised: 100.0 %\n")
+    rosmop("learn", "--bag", "a.bag", "--out", "learnt.rv")
+    assert "right" in rosmop("check", "learnt.rv")

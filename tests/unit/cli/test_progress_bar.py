@@ -1,4 +1,4 @@
-"""Tests of `appliance.cli.progress_bar`: a bar for people, nothing for programs."""
+"""Tests of `rosmop.tool.progress_bar`: a bar for people, nothing for programs."""
 
 import os
 import pty
@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 PROGRAM = """
-from appliance.cli.progress_bar import progress
+from rosmop.tool.progress_bar import progress
 with progress("working", lambda: 10, shares_screen={shares}) as told:
     for done in range(11):
         told(done)

@@ -10,8 +10,9 @@ import pytest
 import typer
 from rosbags.rosbag1 import Writer
 
-from appliance.cli.monitor import bounded_bag
-from appliance.cli.monitor.bag import Recorded
+from appliance.cli.monitor.monitor_program import MONITOR
+from rosmop.tool import bounded_bag
+from rosmop.tool.bag import Recorded
 from tests.unit.cli.monitor.test_verbs import invoke, make_bag, number
 
 Part = tuple[dict[str, bytes], bytes]
@@ -63,7 +64,7 @@ def message(seconds: int, text: bytes) -> bytes:
 def refusal(place: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """Return the message for a bag that is rejected."""
     with pytest.raises(typer.Exit) as ended:
-        list(Recorded(place, ["*"]).messages())
+        list(Recorded(MONITOR, place, ["*"]).messages())
     assert ended.value.exit_code == 2
     return capsys.readouterr().err
 
@@ -79,7 +80,9 @@ def test_a_chunk_is_unpacked_under_a_bound(
     one = message(1, b"x" * 1000)
     place = bag(tmp_path / "x.bag", [(name, pack(one), [(1, 0)])])
     monkeypatch.setattr(bounded_bag, "LARGEST_CHUNK", len(one))
-    assert [data for _topic, _time, data in Recorded(place, ["*"]).messages()] == [U32(1000) + b"x" * 1000]
+    assert [data for _topic, _time, data in Recorded(MONITOR, place, ["*"]).messages()] == [
+        U32(1000) + b"x" * 1000
+    ]
     place = bag(tmp_path / "x.bag", [(name, pack(message(1, bytes(2000))), [(1, 0)])])
     assert f"more than {len(one)} bytes" in refusal(place, capsys)
 
@@ -102,7 +105,7 @@ def test_what_is_read_again_and_again_is_counted(
     monkeypatch.setattr(bounded_bag, "PER_BYTE", 4)
     large = bz2.compress(message(0, b"") * 1 + bytes(1 << 17))
     turns = [("bz2", large, [(0, 0)] * 40), ("bz2", large, [(0, 0)] * 40)]
-    assert Recorded(bag(tmp_path / "x.bag", turns), ["*"]).message_count == 80
+    assert Recorded(MONITOR, bag(tmp_path / "x.bag", turns), ["*"]).message_count == 80
     one = bag(tmp_path / "one.bag", [("none", message(1, bytes(1 << 17)), [(1, 0)] * 100)])
     assert "more than 4 times its size" in refusal(one, capsys)
     chain = record(*CONNECTION)

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import typer
 
-from appliance.cli.monitor.bag import Recorded
+from appliance.cli.monitor.monitor_program import MONITOR
+from rosmop.tool.bag import Recorded
 from tests.unit.cli.monitor.test_verbs import make_bag, number
 
 
@@ -20,7 +21,7 @@ def test_a_damaged_bag_ends_with_the_reason(tmp_path: Path) -> None:
             data[chance.randrange(4100, len(data))] = chance.randrange(256)
         place.write_bytes(data)
         try:
-            list(Recorded(place, ["*"]).messages())
+            list(Recorded(MONITOR, place, ["*"]).messages())
         except typer.Exit as end:
             assert end.exit_code == 2
             ended += 1

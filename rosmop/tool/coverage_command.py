@@ -1,53 +1,46 @@
-"""`rosrv monitor coverage`: what of specifications recordings ever exercised, and what never happened."""
+"""Report what of specifications recordings exercised, and what never happened."""
 
 from collections.abc import Iterable
 from contextlib import closing
-from typing import Annotated
+from pathlib import Path
 
-import typer
 from rich.console import Console
 from rich.table import Column
 
-from appliance.cli.monitor.bag import Recorded, open_bag, refusals
-from appliance.cli.monitor.monitor_program import MONITOR
-from appliance.cli.output import Json, say_json
-from appliance.cli.tables import table_of
 from rosmop.check.sources import compiled_from
 from rosmop.learn.exercised import Item, covered
 from rosmop.run.engine import MonitorSet
 from rosmop.text.errors import SpecificationError
-from rosmop.tool.options import Bags, Files, Folders
+from rosmop.tool.bag import Recorded, open_bag, refusals
+from rosmop.tool.program import Program
 from rosmop.tool.specification_input import read_definitions, read_specifications
-from rosmop.tool.terminal import refused, say
+from rosmop.tool.tables import table_of
+from rosmop.tool.terminal import refused, say, say_json
 
 _KINDS = ("event", "branch", "function", "handler", "state", "transition")
 
 
 def coverage(
-    files: Files,
+    program: Program,
+    files: list[Path],
+    folders: list[Path],
+    bags: list[Path],
     *,
-    bags: Bags,
-    msg: Folders = None,
-    fail_under: Annotated[
-        float, typer.Option(min=0.0, max=100.0, metavar="PERCENT", help="Exit status 1 below it")
-    ] = 0.0,
-    as_json: Json = False,
-) -> None:
-    """Say which events, branches, handlers, states and transitions recordings exercised, and what never happened.
-
-    Example: rosrv monitor coverage monitors/*.rv --bag drive.bag --fail-under 80
-    """
-    recordings = [Recorded(bag, ["*"]) for bag in bags]
+    fail_under: float,
+    as_json: bool,
+) -> int:
+    """Report what the recordings exercised, and what never happened; return the exit status."""
+    recordings = [Recorded(program, bag, ["*"]) for bag in bags]
     try:
-        definitions = read_definitions(MONITOR, files, msg or [])
+        definitions = read_definitions(program, files, folders)
         for recording in recordings:
             definitions = recording.definitions.extended(definitions)
-        texts = read_specifications(MONITOR, files)
+        texts = read_specifications(program, files)
         monitors = MonitorSet.of(compiled_from(texts, definitions))
         for bag in bags:
-            with closing(open_bag(bag)) as reader:
+            with closing(open_bag(program, bag)) as reader:
                 for text in refusals(monitors, reader):
-                    raise MONITOR.usage_error(f"{bag}: {text}")
+                    raise program.usage_error(f"{bag}: {text}")
         counts = covered(texts, definitions, recordings)
     except SpecificationError as error:
         raise refused(error.findings) from None
@@ -62,7 +55,7 @@ def coverage(
     else:
         _show(counts)
         say(f"{exercised} of {len(counts)} exercised: {percent:.1f} %")
-    raise typer.Exit(1 if percent < fail_under else 0)
+    return 1 if percent < fail_under else 0
 
 
 def _show(counts: dict[Item, int]) -> None:

@@ -19,7 +19,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader, ReaderError
 from rosbags.rosbag1.reader import Header, IndexData, RecordType, decompressors, read_bytes, read_uint32
 
-from appliance.base.input_files import open_given
+from rosmop.tool.program import Program
 
 LARGEST_CHUNK = 256 << 20
 PER_BYTE = 256
@@ -46,18 +46,22 @@ class _BoundedFile(BufferedReader):
 
 
 class _BagPath(PosixPath):
-    """The path of a bag, which is a regular file."""
+    """The path of a bag, which the program opens."""
+
+    program: Program
 
     def open(self, *_mode: object) -> BinaryIO:  # type: ignore[override] # rosbags asks for bytes
         """Open it to be read."""
-        return _BoundedFile(open_given(self).detach())
+        return _BoundedFile(self.program.open(Path(self)).detach())
 
 
 class BoundedReader(Reader):
     """The reader of `rosbags`; beyond a bound it raises `ReaderError`."""
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(_BagPath(path))
+    def __init__(self, program: Program, path: Path) -> None:
+        bag = _BagPath(path)
+        bag.program = self.program = program
+        super().__init__(bag)
         self._size = path.stat().st_size
         self._left = PER_BYTE * self._size + LARGEST_CHUNK
         self._entries = 0

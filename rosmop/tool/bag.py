@@ -15,11 +15,11 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag1 import ReaderError, Writer
 from rosbags.rosbag1.writer import WriterError
 
-from appliance.cli.monitor.bounded_bag import BoundedReader
-from appliance.cli.monitor.monitor_program import MONITOR
 from rosmop.run.causes import Sender
 from rosmop.run.engine import MonitorSet
 from rosmop.run.outcomes import Outcome, Verdict, bound
+from rosmop.tool.bounded_bag import BoundedReader
+from rosmop.tool.program import Program
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_text import MessageDefinition
@@ -47,10 +47,10 @@ def ros_type(name: str) -> str:
     return f"{package}/{kind.rpartition('/')[2]}"
 
 
-def open_bag(path: Path) -> BoundedReader:
+def open_bag(program: Program, path: Path) -> BoundedReader:
     """An open recording, or an end with the reason."""
     try:
-        reader = BoundedReader(path)
+        reader = BoundedReader(program, path)
         reader.open()
     except _DAMAGE as error:
         mend = (
@@ -58,7 +58,7 @@ def open_bag(path: Path) -> BoundedReader:
             if path.is_file()
             else ""
         )
-        raise MONITOR.usage_error(
+        raise program.usage_error(
             f"cannot read the bag {path}: {_said_by(error).rstrip('.')}{mend}"
         ) from error
     return reader
@@ -69,7 +69,7 @@ def messages_of(reader: BoundedReader) -> Iterator[tuple[Connection, int, bytes]
     try:
         yield from reader.in_order()
     except _DAMAGE as error:
-        raise MONITOR.usage_error(f"the bag {reader.path} is damaged: {_said_by(error)}") from error
+        raise reader.program.usage_error(f"the bag {reader.path} is damaged: {_said_by(error)}") from error
 
 
 def _said_by(error: Exception) -> str:
@@ -96,15 +96,16 @@ class Recorded:
     two types on one topic.
     """
 
-    def __init__(self, path: Path, patterns: Sequence[str]) -> None:
+    def __init__(self, program: Program, path: Path, patterns: Sequence[str]) -> None:
+        self._program = program
         self._path = path
         self.name = path.name
         self.topics: dict[str, str] = {}
-        with closing(open_bag(path)) as reader:
+        with closing(open_bag(program, path)) as reader:
             self.began, self.ended = reader.start_time, reader.end_time - 1
             self.message_count = reader.message_count
             if not self.message_count:
-                raise MONITOR.usage_error(f"the bag {path} has no messages")
+                raise program.usage_error(f"the bag {path} has no messages")
             self.definitions = definitions_of(reader)
             for connection in reader.connections:
                 if not _fits(connection, patterns):
@@ -112,11 +113,11 @@ class Recorded:
                 kind = ros_type(connection.msgtype)
                 other = self.topics.setdefault(connection.topic, kind)
                 if other != kind:
-                    raise MONITOR.usage_error(f"{path}: {connection.topic} carries both {other} and {kind}")
+                    raise program.usage_error(f"{path}: {connection.topic} carries both {other} and {kind}")
 
     def messages(self) -> Iterator[tuple[str, int, bytes]]:
         """Topic, nanoseconds and bytes of every message, in the order of the bag."""
-        with closing(open_bag(self._path)) as reader:
+        with closing(open_bag(self._program, self._path)) as reader:
             for connection, time_ns, data in messages_of(reader):
                 if connection.topic in self.topics:
                     yield connection.topic, time_ns, data
@@ -129,7 +130,7 @@ _Header = tuple[str, str, str, str, str | None, int | None]
 class Recording:
     """The bag that is written: what subscribers would have received."""
 
-    def __init__(self, path: Path, definitions: Definitions) -> None:
+    def __init__(self, program: Program, path: Path, definitions: Definitions) -> None:
         self._path = path
         self._definitions = definitions
         self._connections: dict[_Header, Connection] = {}
@@ -137,7 +138,7 @@ class Recording:
             self._writer = Writer(path)
             self._writer.open()
         except (WriterError, OSError) as error:
-            raise MONITOR.usage_error(f"cannot write the bag {path}: {error}") from error
+            raise program.usage_error(f"cannot write the bag {path}: {error}") from error
 
     def __enter__(self) -> "Recording":
         return self

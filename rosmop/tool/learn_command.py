@@ -1,22 +1,16 @@
-"""`rosrv monitor learn`: specifications out of recordings of a robot that behaves."""
+"""Learn specifications from recordings of a robot that behaves."""
 
 import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from appliance.base.input_files import read_given_text
-from appliance.cli.monitor.bag import Recorded
-from appliance.cli.monitor.monitor_program import MONITOR
-from appliance.cli.output import Json, say_json, write_told
-from appliance.cli.progress_bar import progress
 from rosmop.learn.learner import LearningError, Learnt, learn
-from rosmop.tool.options import Bags
+from rosmop.tool.bag import Recorded
+from rosmop.tool.program import Program
+from rosmop.tool.progress_bar import progress
 from rosmop.tool.specification_input import BESIDE
-from rosmop.tool.terminal import counted, say
+from rosmop.tool.terminal import counted, say, say_json
 from roswire.definitions import Definitions
 from roswire.errors import DefinitionError
 from roswire.message_text import BUILTINS
@@ -24,34 +18,23 @@ from roswire.standard import standard_definitions
 
 
 def learn_monitors(
-    bags: Bags,
-    topics: Annotated[
-        list[str] | None,
-        typer.Option("--topic", metavar="PATTERN", help="Only such topics, as /arm/* (repeatable)"),
-    ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.rv", help="Write it here (must not exist), definitions into msg/ beside it"
-        ),
-    ] = None,
-    hold_out: Annotated[
-        float, typer.Option(min=0.0, max=0.9, help="The share of the recordings that is its test")
-    ] = 0.3,
-    as_json: Json = False,
+    program: Program,
+    bags: list[Path],
+    topics: list[str],
+    out: Path | None,
+    *,
+    hold_out: float,
+    as_json: bool,
 ) -> None:
-    """Propose specifications out of recordings of a robot that behaves, for a person to edit.
-
-    Example: rosrv monitor learn --bag monday.bag --bag tuesday.bag --out learnt.rv
-    """
+    """Propose specifications from recordings of a robot that behaves."""
     if out is not None and out.exists():
-        raise MONITOR.usage_error(f"{out} is there already")
+        raise program.usage_error(f"{out} is there already")
     if len({os.path.realpath(bag) for bag in bags}) < len(bags):
-        raise MONITOR.usage_error("a recording is given twice: it would be its own test")
-    recordings = [Recorded(bag, topics or ["*"]) for bag in bags]
+        raise program.usage_error("a recording is given twice: it would be its own test")
+    recordings = [Recorded(program, bag, topics or ["*"]) for bag in bags]
     recorded = Definitions({})
     for recording in recordings:
-        _check_same(recording, recorded)
+        _check_same(program, recording, recorded)
         recorded = recorded.extended(recording.definitions)
     definitions = standard_definitions().extended(recorded)
     total = sum(recording.message_count for recording in recordings)
@@ -59,9 +42,9 @@ def learn_monitors(
         with progress("learning", lambda: 2 * total, shares_screen=out is None) as told:
             learnt = learn(recordings, definitions, hold_out, told)
     except LearningError as error:
-        raise MONITOR.usage_error(str(error)) from error
+        raise program.usage_error(str(error)) from error
     if out is not None:
-        _write(out, learnt, recorded)
+        _write(program, out, learnt, recorded)
     if as_json:
         _say_rows(learnt)
     elif out is None:
@@ -74,11 +57,11 @@ def learn_monitors(
             say(f"alarms on what was held out: {widened} widened, {len(learnt.left_out)} left out")
 
 
-def _check_same(recording: Recorded, others: Definitions) -> None:
+def _check_same(program: Program, recording: Recorded, others: Definitions) -> None:
     """A type has one definition in all recordings, or their messages would be read wrongly."""
     for kind in set(recording.topics.values()) & set(recording.definitions.message_types):
         if kind in others.message_types and others.md5sum(kind) != recording.definitions.md5sum(kind):
-            raise MONITOR.usage_error(
+            raise program.usage_error(
                 f"{recording.name} has another definition of {kind} than the recordings before it"
             )
 
@@ -94,21 +77,21 @@ def _say_rows(learnt: Learnt) -> None:
             })  # fmt: skip
 
 
-def _write(out: Path, learnt: Learnt, recorded: Definitions) -> None:
+def _write(program: Program, out: Path, learnt: Learnt, recorded: Definitions) -> None:
     """The text, and beside it the definitions that are not ROS's own."""
     files = {out: learnt.text}
     for name in _needed(learnt, recorded):
         path = out.parent / BESIDE / f"{name}.msg"
         text = recorded.message(name).text
-        if path.exists() and read_given_text(path, errors="surrogateescape") != text:
-            raise MONITOR.usage_error(f"{path} is there already and is another than the recordings have")
+        if path.exists() and program.read_text(path) != text:
+            raise program.usage_error(f"{path} is there already and is another than the recordings have")
         files[path] = text
     try:
         for path, text in files.items():
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_told(path, text.encode("utf-8", "surrogateescape"))
+            program.write(path, text.encode("utf-8", "surrogateescape"))
     except OSError as error:
-        raise MONITOR.usage_error(f"cannot write {out}: {error.strerror}") from error
+        raise program.usage_error(f"cannot write {out}: {error.strerror}") from error
 
 
 def _needed(learnt: Learnt, recorded: Definitions) -> list[str]:
