@@ -48,11 +48,11 @@ class _BoundedFile(BufferedReader):
 class _BagPath(PosixPath):
     """The path of a bag, which the program opens."""
 
-    program: Program
+    tool: Program
 
     def open(self, *_mode: object) -> BinaryIO:  # type: ignore[override] # rosbags asks for bytes
         """Open it to be read."""
-        return _BoundedFile(self.program.open(Path(self)).detach())
+        return _BoundedFile(self.tool.open(Path(self)).detach())
 
 
 class BoundedReader(Reader):
@@ -60,7 +60,7 @@ class BoundedReader(Reader):
 
     def __init__(self, program: Program, path: Path) -> None:
         bag = _BagPath(path)
-        bag.program = self.program = program
+        bag.tool = self.program = program
         super().__init__(bag)
         self._size = path.stat().st_size
         self._left = PER_BYTE * self._size + LARGEST_CHUNK
