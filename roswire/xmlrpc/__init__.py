@@ -7,7 +7,7 @@ decided on, and written afresh (`writer`).
 from dataclasses import dataclass
 
 from roswire.errors import LimitExceededError, PeerError, ProtocolError
-from roswire.xmlrpc.fast_path import usual_answer, usual_call
+from roswire.xmlrpc.common_documents import usual_answer, usual_call
 from roswire.xmlrpc.xmlrpc_reader import Document
 from roswire.xmlrpc.xmlrpc_values import DEFAULT_LIMITS, Limits, Value
 from roswire.xmlrpc.xmlrpc_writer import build_call, build_fault, build_response

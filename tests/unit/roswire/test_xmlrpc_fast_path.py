@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from roswire.errors import PeerError
 from roswire.xmlrpc import Limits, Value, build_response, parse_call
-from roswire.xmlrpc.fast_path import usual_answer, usual_call
+from roswire.xmlrpc.common_documents import usual_answer, usual_call
 from roswire.xmlrpc.xmlrpc_reader import Document
 from tests.support.examples import examples
 
