@@ -41,8 +41,8 @@ class Revisions(ABC, Generic[R]):
     """Keep the revisions of one thing, and change the one in force one change at a time.
 
     A change can have a time limit: it goes back automatically unless it is confirmed, over restarts of control and of
-    the appliance. Where going back raises `refusal`, it is tried again after `_AGAIN_SECONDS`, because no person may be
-    there to do it.
+    the appliance. Where going back raises `refusal` or `StoreError` and changes nothing, it is tried again after
+    `_AGAIN_SECONDS`, because no person may be there to do it.
     """
 
     refusal: ClassVar[type[Exception]]
@@ -140,7 +140,7 @@ class Revisions(ABC, Generic[R]):
 
     @contextlib.asynccontextmanager
     async def _changing(self, expected: int | str | None) -> AsyncIterator[None]:
-        """Wait for other changes, then make one that is meant for this tag. Raises `outdated`."""
+        """Hold the lock for one change. Raise `outdated` unless `expected` is the present tag or None."""
         async with self._one_change:
             require_awaited()
             if expected not in (None, self.tag):
@@ -178,10 +178,11 @@ class Revisions(ABC, Generic[R]):
         while True:
             try:
                 await self._go_back(back_to)
-            except self.refusal as error:
+            except (self.refusal, StoreError) as error:
+                if self.confirm_by is None:  # it went back before the error
+                    _log.error("an unconfirmed change went back, and this is not kept", reason=str(error))
+                    return
                 _log.error("an unconfirmed change cannot go back yet", revision=back_to, error=str(error))
                 await asyncio.sleep(_AGAIN_SECONDS)
-                continue
-            except StoreError as error:
-                _log.error("an unconfirmed change went back, and this is not kept", reason=str(error))
-            return
+            else:
+                return

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from appliance.store import revisions
 from appliance.store.revisions import Revisions
 from appliance.store.state_file import MonitorRevisionRow, StateStore
+from appliance.store.writer_thread import StoreError
 
 pytestmark = pytest.mark.anyio
 
@@ -107,3 +109,29 @@ async def test_only_a_start_of_the_appliance_reads_the_disk_in_place_of_its_revi
     again = Keeper(keeper.store)
     assert again.started(restarted=restarted) is taken
     assert again.in_force == row(8, who)
+
+
+class Returning(Keeper):
+    """Revisions that go back when the disk takes it, at the third attempt."""
+
+    attempts = 0
+
+    async def _go_back(self, revision: int) -> None:
+        self.attempts += 1
+        if self.attempts < 3:
+            raise StoreError("the disk is full")
+        self.change(row(9, "not confirmed in time"))
+        raise StoreError("the disk is full again")
+
+
+async def test_a_change_that_cannot_go_back_is_tried_again_until_it_has(
+    keeper: Keeper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error of the disk before the change is no return; one after the change ends the attempts."""
+    monkeypatch.setattr(revisions, "_AGAIN_SECONDS", 0.0)
+    again = Returning(keeper.store)
+    again.started(restarted=True)
+    again.change(row(8), 0.0)
+    assert again.going_back is not None
+    await again.going_back
+    assert (again.attempts, again.in_force.revision, again.confirm_by) == (3, 9, None)
