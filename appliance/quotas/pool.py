@@ -77,12 +77,20 @@ class Bounds:
 class Pool(Generic[Holder]):
     """Count the holdings of each host in one finite resource.
 
-    `what` is the noun of refusals, with its unit: "connections", "bytes of parameters". `standing` returns the
-    present standing of a host. For a machine with many addresses (IPv6), give its network as the host.
+    `what` is the noun of refusals, with its unit: "connections", "bytes of parameters". `strangers` is the noun for
+    hosts with the standing of a stranger. `standing` returns the present standing of a host. For a machine with many
+    addresses (IPv6), give its network as the host.
     """
 
-    def __init__(self, what: str, bounds: Bounds, standing: Callable[[Holder], Standing]) -> None:
+    def __init__(
+        self,
+        what: str,
+        bounds: Bounds,
+        standing: Callable[[Holder], Standing],
+        strangers: str = "addresses that no rule of the policy names",
+    ) -> None:
         self.what = what
+        self.strangers = strangers
         self.bounds = bounds
         self._standing = standing
         self._held: dict[Holder, tuple[Standing, int]] = {}
@@ -98,10 +106,7 @@ class Pool(Generic[Holder]):
         if mine + amount > bounds.host:
             return f"{host} has {mine} {what}; the share of one host is {bounds.host}"
         if standing is Standing.STRANGER and strangers + amount > bounds.strangers:
-            return (
-                f"addresses that no rule of the policy names have {strangers} {what}; "
-                f"their share together is {bounds.strangers}"
-            )
+            return f"{self.strangers} have {strangers} {what}; their share together is {bounds.strangers}"
         others = strangers + named
         if standing is not Standing.REGISTERED and others + amount > bounds.whole - bounds.kept:
             return (

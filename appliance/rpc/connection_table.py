@@ -88,7 +88,10 @@ class Visitors(Generic[Holder]):
         self.held: Pool[Holder] = Pool("bytes in requests and answers under way", held, standing)
         self.farewells: Pool[Holder] = Pool("connections that are turned away", farewells, standing)
         self.arriving: Pool[Holder] = Pool(
-            "connections that wait to be opened", arriving, standing_of_arrivals or standing
+            "connections that wait to be opened",
+            arriving,
+            standing_of_arrivals or standing,
+            "hosts that no rule or only * names, without a registration,",
         )
         self._of: dict[Connection, tuple[Holder, Pool[Holder]]] = {}
         self._queues: dict[Stage, Queue[Holder, Connection]] = {stage: Queue(standing) for stage in Stage}
