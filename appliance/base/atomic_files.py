@@ -36,8 +36,8 @@ def remove_unfinished(folder: str, place: int) -> None:
 def write_whole(path: Path, data: bytes, mode: int, owner: tuple[int, int] | None = None) -> None:
     """Replace a file, on the disk when this returns. Raises `OSError`; the file before is then as it was.
 
-    The file gets its `owner` (user and group; default: the writer) before its name. Of several concurrent writers one
-    wins, with its whole file. Raises `NotLastingError` if the file is replaced, but not surely on the disk.
+    The file gets its `owner` (user and group; default: the writer) before its name. If several processes write at
+    once, one of their files remains, whole. Raises `NotLastingError` if the file is replaced, but perhaps not on disk.
     """
     making = name_to_make(path)
     try:

@@ -283,7 +283,7 @@ class Liveness:
 
 @_section
 class Relay:
-    """What the relay accepts and holds; each key is a field of `appliance.relay.bounds.Limits`."""
+    """The limits of the relay; each key is a field of `appliance.relay.bounds.Limits`."""
 
     connections: Count = key(default=16_384, description="of all hosts")
     connections_per_host: Count = 8_192

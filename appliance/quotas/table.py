@@ -117,7 +117,7 @@ PROBES = Share(
 NODE_CALLS_UNDER_WAY = Share(
     "calls that are being made to nodes for ROSMaster",
     Bounds(whole=512, host=128, strangers=64, kept=192),
-    "the node is told when it is its host's turn",
+    "the call waits for the turn of its host",
     "none: nothing is refused",
     ("unit/master/endpoints/test_delivery.py::test_silent_nodes_of_a_host_delay_no_call_to_anothers",),
 )
@@ -391,7 +391,7 @@ NAMES = Share(
     setting="limits.topics_per_host (a host's)",
 )
 GRANTS = Share(
-    "grants of the relays (who may subscribe to what, who may call what)",
+    "grants of the relays (permissions to subscribe to a topic or to call a service)",
     Bounds(whole=200_000, host=20_000, strangers=0, kept=0),
     "the host, or of all hosts that with most, loses its oldest grants that nobody is connected by",
     "none: a node that asks again gets it again",

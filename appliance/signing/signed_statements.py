@@ -83,7 +83,7 @@ _LIMIT = re.compile(rb"\nlimit ([0-9][0-9.e+-]{0,31} (?:days|bytes))\n\Z")
 
 
 def limit_of_removal(text: bytes) -> str:
-    """Return the limit in a removal's text. Raises `ValueError` if there is none."""
+    """Return the limit in the text of a removal, or raise `ValueError`."""
     match = _LIMIT.search(text)
     if match is None:
         raise ValueError("not the text of a removal")

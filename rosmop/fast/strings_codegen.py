@@ -61,7 +61,7 @@ from rosmop.runtime.action_context import BYTES_PER_INSTRUCTION
 from rosmop.types import value_types
 
 _LOADS = {1: (I32, i32_load8_u), 2: (I32, i32_load16_u), 4: (I32, i32_load), 8: (I64, i64_load)}
-"""The type and the instruction that loads so many bytes."""
+"""The type and the load instruction for a number of bytes."""
 
 
 class Texts(Places):

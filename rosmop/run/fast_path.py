@@ -19,13 +19,13 @@ MESSAGE_FUEL = FUEL_PER_SECOND // 100
 
 
 class Walked(NamedTuple):
-    """What a walk has done.
+    """The result of one walk.
 
-    `position` is where the first message begins that is left; `run` where what goes on in its buffer begins (behind the
-    last dropped message). `dropped` are counts for each of the lane's events, if any was, `told` for each of its
-    verdicts, if there was any. `sooner`: something is due earlier than it was. `output` are the lines that were put
-    out, in order, each with where the frame begins of the message that it is about.
-    `paused`: the walk used up its fuel, and the message at `position` may be walked next.
+    `position` is the offset of the first message that was not processed. `run` is the offset behind the last dropped
+    message. `dropped` counts dropped messages for each event of the lane, `told` verdicts for each verdict of the
+    lane; both are empty if there were none. `sooner`: a deadline is earlier than before. `output` has the lines that
+    were printed, in order, each with the offset of its message.
+    `paused`: the walk used up its fuel; the next walk may begin with the message at `position`.
     """
 
     position: int
@@ -38,9 +38,11 @@ class Walked(NamedTuple):
 
 
 class Prepared(NamedTuple):
-    """What holds for all walks of a topic until the engine, or anything else, has done something: the sender of
-    the messages; bits of `told` (and whether no message may be changed), `enabled` and `counted`, as the module takes
-    them; and where walks add up how many messages a set of events (see `FastLane.writers`) has changed.
+    """The arguments of all walks of a topic until the state of the engine changes.
+
+    `source` is the sender of the messages. `told`, `enabled` and `counted` are bits as the module takes them; `told`
+    includes whether messages may be changed. Walks count in `changed` how many messages each set of events (see
+    `FastLane.writers`) has changed.
     """
 
     source: int
@@ -51,10 +53,10 @@ class Prepared(NamedTuple):
 
 
 class Due(Protocol):
-    """Says when the next tick or deadline is due (ns; None: nothing is waited for)."""
+    """Returns the time of the next tick or deadline (ns; None if there is none)."""
 
     def __call__(self, *, anew: bool) -> int | None:
-        """`anew`: find out, as there may be an earlier deadline."""
+        """`anew`: compute the time again, because there may be an earlier deadline."""
 
 
 class FastLane(Protocol):
