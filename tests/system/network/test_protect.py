@@ -292,8 +292,8 @@ def test_without_root_the_error_says_so(robot: Host) -> None:
     program = (
         "import os; os.setgroups([]); os.setgid(61099); os.setuid(61099)\n"
         "from appliance.network.namespaces import NetworkError\n"
-        "from appliance.network import protect\n"
-        "try: protect.apply('table inet x { }')\n"
+        "from appliance.network import close_ports\n"
+        "try: close_ports.apply('table inet x { }')\n"
         "except NetworkError as error: print(error)\n"
     )
     process = robot.popen(
