@@ -1,10 +1,10 @@
-"""Message and service types: definitions by name, their md5sums, full texts and layouts.
+"""Message and service types: definitions by name, with their md5sums, full texts and layouts.
 
-Definitions come as text: ROS's own (`standard.py`), an operator's `.msg` and `.srv` files, or the
-`message_definition` of a publisher's connection header. What is asked of a type is worked out once and kept.
+Definitions come as text: from ROS (`standard.py`), from `.msg` and `.srv` files, or from the `message_definition` of a
+publisher's connection header. Results are cached for each type.
 
-A type that contains itself, or nests deeper than `MAX_DEPTH`, is refused; work and memory are bounded by the
-size of the text and by the limits of `message_text` and `layout`.
+A type that contains itself, or nests deeper than `MAX_DEPTH`, is rejected. The size of the text and the limits of
+`message_text` and `message_layout` bound work and memory.
 """
 
 import difflib
@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Self, TypeVar
 
 from roswire.errors import DefinitionError
-from roswire.message_layout import Layout, LayoutBuilder, LayoutTooLargeError
+from roswire.message_layout import LayoutBuilder, LayoutTooLargeError, MessageLayout
 from roswire.message_text import (
     BUILTINS,
     PRIMITIVES,
@@ -27,7 +27,7 @@ from roswire.message_text import (
 )
 
 MAX_DEPTH = 64
-"""Messages nested in each other."""
+"""Most levels of nested messages."""
 
 _FILE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:(msg|srv)/)?([A-Za-z][A-Za-z0-9_]*)\.(msg|srv)\Z")
 _TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/[A-Za-z][A-Za-z0-9_]*\Z")
@@ -50,7 +50,7 @@ class Definitions:
             self._messages[service.request.name] = service.request
             self._messages[service.response.name] = service.response
         self._md5sums: dict[str, str] = {}
-        self._layouts: dict[str, Layout] = {}
+        self._layouts: dict[str, MessageLayout] = {}
 
     @classmethod
     def from_files(cls, files: Mapping[str, str]) -> Self:
@@ -77,29 +77,31 @@ class Definitions:
     def from_full_text(cls, name: str, text: str) -> Self:
         """Parse the full text of the message type `name`, as a connection header has it.
 
-        The types it is made of must be in the text too. Raises `DefinitionError`.
+        The text must also have the types in it. Raises `DefinitionError`.
         """
         messages: dict[str, MessageDefinition] = {}
         for section, body, line in split_full_text(name, text):
             if _TYPE.match(section) is None:
-                raise DefinitionError(f"{section[:80]!a} is no message type; write package/Type", name, line)
+                raise DefinitionError(
+                    f"{section[:80]!a} is not a message type; write package/Type", name, line
+                )
             if section in messages:
                 raise DefinitionError(f"{section} is defined twice", name, line)
             messages[section] = parse_message(section, body, name, line)
         return cls(messages)
 
     def extended(self, other: "Definitions") -> "Definitions":
-        """Return these types and those of `other`, which win where both have one."""
+        """Return these types and those of `other`; if both have a type, that of `other` wins."""
         return Definitions(self._messages | other._messages, self._services | other._services)
 
     @property
     def message_types(self) -> list[str]:
-        """The names of all message types, requests and responses included."""
+        """Return the names of all message types, requests and responses included."""
         return sorted(self._messages)
 
     @property
     def service_types(self) -> list[str]:
-        """The names of all service types."""
+        """Return the names of all service types."""
         return sorted(self._services)
 
     def message(self, name: str) -> MessageDefinition:
@@ -120,8 +122,8 @@ class Definitions:
         return _fingerprint(self._md5_text(service.request, ()) + self._md5_text(service.response, ()))
 
     def full_text(self, name: str) -> str:
-        """Return the text of a message type and of all types it is made of, as connection headers have it."""
-        self.md5sum(name)  # all types are there, and none contains itself
+        """Return the text of a message type and of all types in it, as connection headers have it."""
+        self.md5sum(name)  # raises if a type is missing or contains itself
         order: dict[str, MessageDefinition] = {}
         waiting = [name]
         while waiting:
@@ -133,11 +135,11 @@ class Definitions:
         own, *parts = order.values()
         return "\n".join([own.text, *(f"{_RULE}\nMSG: {part.name}\n{part.text}" for part in parts)])
 
-    def layout(self, name: str) -> Layout:
-        """Return how messages of the type `name` lie in their bytes; raises `DefinitionError`."""
+    def layout(self, name: str) -> MessageLayout:
+        """Return the layout of messages of the type `name`; raises `DefinitionError`."""
         return self._layout(name, ())
 
-    # `outer` is always the types that are being worked out, outermost first.
+    # `outer` is always the types that contain this one, outermost first.
 
     def _md5sum(self, name: str, outer: tuple[str, ...]) -> str:
         if name not in self._md5sums:
@@ -151,7 +153,7 @@ class Definitions:
             lines.append(f"{nested or field.notation} {field.name}")
         return "\n".join(lines).strip()
 
-    def _layout(self, name: str, outer: tuple[str, ...]) -> Layout:
+    def _layout(self, name: str, outer: tuple[str, ...]) -> MessageLayout:
         if name not in self._layouts:
             message = self.message(name)
             try:
@@ -160,7 +162,7 @@ class Definitions:
                 raise DefinitionError(str(error), name) from None
         return self._layouts[name]
 
-    def _build_layout(self, message: MessageDefinition, outer: tuple[str, ...]) -> Layout:
+    def _build_layout(self, message: MessageDefinition, outer: tuple[str, ...]) -> MessageLayout:
         builder = LayoutBuilder()
         for field in message.fields:
             nested = self._nested(message, field, outer, self._layout)
@@ -181,7 +183,7 @@ class Definitions:
         outer: tuple[str, ...],
         ask: Callable[[str, tuple[str, ...]], _Answer],
     ) -> _Answer | None:
-        """Return the answer of `ask` for the type of a field, None if it is built in."""
+        """Return the result of `ask` for the type of a field; None for a built-in type."""
         if field.type in BUILTINS:
             return None
         if field.type not in self._messages:

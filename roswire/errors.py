@@ -1,16 +1,16 @@
-"""What can be wrong with ROS traffic, named by who is at fault.
+"""Errors in ROS traffic, by the side that is at fault.
 
-A `PeerError` is the sender's fault: its text says what was wrong, where, and what to do, and may be sent back
-to the sender as it stands. An `EncodingError` is ours: we tried to write what ROS has no notation for.
+A `PeerError` is the sender's fault: its text says what was wrong, where, and what to do, and may be sent back to the
+sender. An `EncodingError` is a fault of this side: ROS has no notation for the value.
 """
 
 
 class RosError(Exception):
-    """Base of every error of `roswire`."""
+    """The base of all errors of `roswire`."""
 
 
 class EncodingError(RosError):
-    """What we were about to send has no notation on the wire (a control character, an integer of 64 bits)."""
+    """A value that ROS cannot encode (a control character, an integer of 64 bits)."""
 
 
 class PeerError(RosError):
@@ -26,17 +26,17 @@ class InvalidUriError(PeerError):
 
 
 class ProtocolError(PeerError):
-    """Bytes that are not the protocol they should be."""
+    """Bytes that violate their protocol."""
 
 
 class LimitExceededError(ProtocolError):
-    """Well-formed as far as it was read, but larger, deeper or longer than the limits allow."""
+    """Data that is larger, deeper or longer than the limits allow; the part that was read is well-formed."""
 
 
 class DefinitionError(PeerError):
     """A message or service definition that cannot be used.
 
-    `source` names the file or the type it stands in, `line` counts from 1 (0: no line of its own).
+    `source` names the file or type, `line` counts from 1 (0: unknown).
     """
 
     def __init__(self, text: str, source: str, line: int = 0) -> None:
@@ -47,5 +47,5 @@ class DefinitionError(PeerError):
 
 
 def quoted(text: str) -> str:
-    """As much of a refused name or URI as its error repeats."""
+    """Return the part of a rejected name or URI that its error repeats."""
     return ascii(text if len(text) <= 80 else text[:80] + "...")

@@ -11,7 +11,7 @@ _LENGTH = struct.Struct("<I")
 def log_message(
     sequence: int, time_ns: int, level: int, name: str, text: str, *, file: str, function: str
 ) -> bytes:
-    """A `rosgraph_msgs/Log` as its bytes on the wire; `time_ns` is since the epoch, `level` as in its definition."""
+    """Return the bytes of a `rosgraph_msgs/Log`; `time_ns` is since the epoch, `level` as in its definition."""
     seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
     fields = (name, text, file, function)
     return b"".join((
@@ -20,7 +20,7 @@ def log_message(
         bytes([level]),
         *map(_string, fields),
         _LENGTH.pack(0),  # line
-        _LENGTH.pack(0),  # topics: how many
+        _LENGTH.pack(0),  # number of topics
     ))  # fmt: skip
 
 

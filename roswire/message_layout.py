@@ -1,9 +1,9 @@
-"""How a message lies in its bytes: what a compiler needs to read a few fields without decoding the rest.
+"""The layout of a message in its bytes, for reading a few fields without decoding the rest.
 
-A serialised ROS 1 message is its fields one after another, little-endian, without padding. A layout flattens
-the nested messages: all leaves of fixed size that follow each other form one `FixedPart`, in which every leaf
-has an offset; strings and arrays of variable size stand between them. In a layout two fixed parts are never
-neighbours, so whatever precedes the first string or array is at a known place in every message.
+A serialised ROS 1 message is its fields one after another, little-endian, without padding. A layout flattens the nested
+messages: consecutive fields of fixed size form one `FixedPart`, in which each has an offset; strings and arrays of
+variable size separate these parts. Two fixed parts are never adjacent, so everything before the first string or array
+has the same offset in every message.
 """
 
 from collections.abc import Mapping
@@ -12,18 +12,18 @@ from dataclasses import dataclass, field, replace
 from roswire.message_text import PRIMITIVES
 
 MAX_ITEMS = 20_000
-"""Leaves, strings and arrays in one layout; nested definitions can ask for exponentially many."""
+"""Most leaves, strings and arrays in one layout; nested definitions can need exponentially many."""
 
 MAX_SIZE = 1 << 32
-"""Bytes of one fixed part or array of fixed length; a TCPROS message is never longer."""
+"""Most bytes of one fixed part or array of fixed length; a TCPROS message is never longer."""
 
 
 @dataclass(frozen=True, slots=True)
-class Leaf:
+class FixedField:
     """A value of fixed size in a `FixedPart`.
 
-    `type` is a primitive, or, for arrays only, a message type of fixed size with its `layout`. `count` is the
-    number of elements of a fixed array, None for a scalar. `offset` and `size` are bytes in the part.
+    `type` is a primitive, or, for arrays only, a message type of fixed size with its `layout`. `count` is the number of
+    elements of a fixed array, None for a scalar. `offset` and `size` are in bytes.
     """
 
     path: str
@@ -31,15 +31,15 @@ class Leaf:
     offset: int
     size: int
     count: int | None = None
-    layout: "Layout | None" = None
+    layout: "MessageLayout | None" = None
 
 
 @dataclass(frozen=True, slots=True)
 class FixedPart:
-    """Leaves that follow each other; `size` is their bytes together."""
+    """Consecutive leaves; `size` is the number of their bytes."""
 
     size: int
-    leaves: tuple[Leaf, ...]
+    leaves: tuple[FixedField, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,32 +51,32 @@ class StringPart:
 
 @dataclass(frozen=True, slots=True)
 class ArrayPart:
-    """An array that is of variable length or whose elements are of variable size.
+    """An array of variable length, or of elements of variable size.
 
-    `count` is the number of elements of a fixed array; with None the number (4 bytes) stands in front.
-    `element_size` is the bytes of an element, None if they vary; `layout` is for elements that are messages.
+    `count` is the number of elements of a fixed array; if it is None, the number (4 bytes) comes first. `element_size`
+    is in bytes, None if it varies; `layout` is that of elements that are messages.
     """
 
     path: str
     type: str
     count: int | None
     element_size: int | None
-    layout: "Layout | None" = None
+    layout: "MessageLayout | None" = None
 
 
 Part = FixedPart | StringPart | ArrayPart
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where a field is: the index of its part, and the leaf, string or array it is."""
+class FieldLocation:
+    """The location of a field: the index of its part, and the leaf, string or array."""
 
     part: int
-    item: Leaf | StringPart | ArrayPart
+    item: FixedField | StringPart | ArrayPart
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class MessageLayout:
     """The parts of a message in order.
 
     `size` is the bytes of every such message, None if they vary; `minimum` the bytes of the shortest.
@@ -86,7 +86,7 @@ class Layout:
     parts: tuple[Part, ...]
     size: int | None
     minimum: int
-    places: Mapping[str, Place] = field(repr=False, compare=False)
+    places: Mapping[str, FieldLocation] = field(repr=False, compare=False)
 
 
 class LayoutTooLargeError(Exception):
@@ -94,34 +94,34 @@ class LayoutTooLargeError(Exception):
 
 
 class LayoutBuilder:
-    """Takes the fields of a message in order; `finish` returns the layout."""
+    """A builder of layouts: takes the fields of a message in order; `finish` returns the layout."""
 
     def __init__(self) -> None:
         self._parts: list[Part] = []
-        self._leaves: list[Leaf] = []  # of the fixed part that is open
+        self._leaves: list[FixedField] = []  # of the open fixed part
         self._offset = 0
         self._items = 0
 
     def add_primitive(self, path: str, type_name: str, count: int | None) -> None:
         """Add a value of a primitive type, or a fixed array of `count` of them."""
         size = PRIMITIVES[type_name][1] * (1 if count is None else count)
-        self._add_leaf(Leaf(path, type_name, self._offset, size, count))
+        self._add_leaf(FixedField(path, type_name, self._offset, size, count))
 
     def add_string(self, path: str) -> None:
         """Add a string."""
         self._add_part(StringPart(path))
 
-    def add_array(self, path: str, type_name: str, count: int | None, layout: Layout | None) -> None:
+    def add_array(self, path: str, type_name: str, count: int | None, layout: MessageLayout | None) -> None:
         """Add an array; `layout` is that of its elements if they are messages."""
         size = PRIMITIVES[type_name][1] if type_name in PRIMITIVES else None
         if layout is not None:
             size = layout.size
         if count is not None and size is not None:
-            self._add_leaf(Leaf(path, type_name, self._offset, size * count, count, layout))
+            self._add_leaf(FixedField(path, type_name, self._offset, size * count, count, layout))
         else:
             self._add_part(ArrayPart(path, type_name, count, size, layout))
 
-    def add_message(self, path: str, layout: Layout) -> None:
+    def add_message(self, path: str, layout: MessageLayout) -> None:
         """Add the items of a nested message; their paths get `path` in front."""
         for part in layout.parts:
             if isinstance(part, FixedPart):
@@ -130,18 +130,18 @@ class LayoutBuilder:
             else:
                 self._add_part(replace(part, path=f"{path}.{part.path}"))
 
-    def finish(self) -> Layout:
+    def finish(self) -> MessageLayout:
         """Return the layout of what was added."""
         self._close()
-        places: dict[str, Place] = {}
+        places: dict[str, FieldLocation] = {}
         for index, part in enumerate(self._parts):
             for item in part.leaves if isinstance(part, FixedPart) else (part,):
-                places[item.path] = Place(index, item)
+                places[item.path] = FieldLocation(index, item)
         minimum = sum(map(_minimum, self._parts))
         fixed = all(isinstance(part, FixedPart) for part in self._parts)
-        return Layout(tuple(self._parts), minimum if fixed else None, minimum, places)
+        return MessageLayout(tuple(self._parts), minimum if fixed else None, minimum, places)
 
-    def _add_leaf(self, leaf: Leaf) -> None:
+    def _add_leaf(self, leaf: FixedField) -> None:
         self._count()
         self._leaves.append(leaf)
         self._offset += leaf.size

@@ -1,8 +1,7 @@
-"""The text of `.msg` and `.srv` files: lines to fields and constants.
+"""Parse the text of `.msg` and `.srv` files into fields and constants.
 
-Reads what genmsg reads, with its rules for comments, constants and names of types, because the md5sum of a
-type is made from what these rules leave. A definition comes from an operator's file or from a stranger's
-connection header: text is only ever data here, nothing is generated or executed from it.
+The rules for comments, constants and names of types are those of genmsg, because the md5sum of a type depends on
+them. A definition may come from the connection header of an unknown host: its text is data only, never executed.
 """
 
 import itertools
@@ -74,7 +73,7 @@ class Field:
 
     @property
     def notation(self) -> str:
-        """The type as it is written: `float64[36]`, `std_msgs/Header`."""
+        """Return the type as it is written: `float64[36]`, `std_msgs/Header`."""
         if not self.is_array:
             return self.type
         return f"{self.type}[{'' if self.length is None else self.length}]"
@@ -103,7 +102,7 @@ class ServiceDefinition:
 def parse_message(name: str, text: str, source: str, first_line: int = 1) -> MessageDefinition:
     """Parse the text of a `.msg` file for the type `name`.
 
-    `source` and `first_line` say in errors where the text stands. Raises `DefinitionError`.
+    `source` and `first_line` are the position of the text for errors. Raises `DefinitionError`.
     """
     fields: dict[str, Field] = {}
     constants: dict[str, Constant] = {}
@@ -131,7 +130,7 @@ def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
     lines = text.split("\n")
     breaks = [index for index, line in enumerate(lines) if line.startswith("---")]
     if len(breaks) != 1:
-        raise DefinitionError(f"{len(breaks)} lines '---'; one stands between request and response", source)
+        raise DefinitionError(f"{len(breaks)} lines '---'; write one between request and response", source)
     middle = breaks[0]
     request = parse_message(f"{name}Request", "\n".join(lines[:middle]), source)
     response = parse_message(f"{name}Response", "\n".join(lines[middle + 1 :]), source, middle + 2)
@@ -141,8 +140,8 @@ def parse_service(name: str, text: str, source: str) -> ServiceDefinition:
 def split_full_text(name: str, text: str) -> list[tuple[str, str, int]]:
     """Split the full text of a type, as a connection header has it, into types.
 
-    Returns (type, text, number of its first line) for `name` and then for each type it is made of, which
-    follow as `===…`, `MSG: package/Type` and their text. Raises `DefinitionError`.
+    Returns (type, text, number of its first line) for `name`, then for each type in it; in the text these follow after
+    `===…` and `MSG: package/Type`. Raises `DefinitionError`.
     """
     lines = text.split("\n")
     starts = [index for index, line in enumerate(lines) if _SEPARATOR.match(line)]
@@ -160,14 +159,14 @@ def split_full_text(name: str, text: str) -> list[tuple[str, str, int]]:
 def _field(code: str, package: str, source: str, line: int) -> Field:
     words = code.split()
     if len(words) != 2:
-        raise DefinitionError(f"{code[:80]!a} is no field; write 'type name'", source, line)
+        raise DefinitionError(f"{code[:80]!a} is not a field; write 'type name'", source, line)
     notation, name = words
     found = _TYPE.match(notation)
     if found is None:
-        raise DefinitionError(f"{notation[:80]!a} is no type; write type, type[] or type[3]", source, line)
+        raise DefinitionError(f"{notation[:80]!a} is not a type; write type, type[] or type[3]", source, line)
     if _FIELD_NAME.match(name) is None:
         raise DefinitionError(
-            f"{name[:80]!a} is no field name; it starts with a letter and has letters, digits and '_'",
+            f"{name[:80]!a} is not a field name; it starts with a letter and has letters, digits and '_'",
             source,
             line,
         )
@@ -182,17 +181,17 @@ def _field(code: str, package: str, source: str, line: int) -> Field:
 def _constant(line: str, code: str, source: str, number: int) -> Constant:
     type_name = code.split(maxsplit=1)[0]
     if type_name not in _CONSTANT_TYPES:
-        raise DefinitionError(f"{type_name[:80]!a} is no type of a constant", source, number)
-    # The value of a string goes to the end of the line, '#' and all.
+        raise DefinitionError(f"{type_name[:80]!a} is not a type of a constant", source, number)
+    # The value of a string extends to the end of the line, including '#'.
     rest = (line if type_name == "string" else code).lstrip()[len(type_name) :]
     name, _, text = rest.partition("=")
     name, text = name.strip(), text.strip()
     if _FIELD_NAME.match(name) is None:
-        raise DefinitionError(f"{name[:80]!a} is no name of a constant", source, number)
+        raise DefinitionError(f"{name[:80]!a} is not a name of a constant", source, number)
     try:
         value = _value(type_name, text)
     except ValueError:
-        raise DefinitionError(f"{text[:80]!a} is no {type_name}", source, number) from None
+        raise DefinitionError(f"{text[:80]!a} is not of type {type_name}", source, number) from None
     return Constant(type_name, name, value, text)
 
 

@@ -1,7 +1,7 @@
-"""A message as fields and values, for people: as far as its bytes go, and within bounds.
+"""Show a message as fields and values for a person, within limits and as far as its bytes go.
 
-What cannot be read is said (`…`): the bytes may be cut off, or a stranger's. Long strings, arrays and messages are
-shortened, and it is said how much is left out (`… 344 more`); the result is plain values that a log can hold.
+A value that cannot be read is shown as `…`: the bytes may be cut off, or malicious. Long strings, arrays and messages
+are shortened, with the omitted number (`… 344 more`). The result is plain values that a log can hold.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ _OF_NOTHING = hashlib.md5(b"", usedforsecurity=False).hexdigest()  # the md5sum 
 
 
 class _EndError(Exception):
-    """There are no more bytes, or enough has been read."""
+    """The bytes end here, or the limit is reached."""
 
 
 class _Reader:
@@ -36,7 +36,7 @@ class _Reader:
         self._data = data
         self._position = 0
         self._left = MOST_FIELDS  # values that are shown
-        self._steps = _MOST_STEPS  # values that are read, shown or not
+        self._steps = _MOST_STEPS  # values that are read, whether shown or not
         self._sizes: dict[str, int | None] = {}
 
     def message(self, name: str) -> dict[str, Any]:
@@ -75,7 +75,7 @@ class _Reader:
         return values
 
     def _pass_over(self, kind: str, count: int) -> None:
-        """Read this many more values of a type, for what comes after them."""
+        """Skip this many values of a type, to reach what comes after them."""
         size = self._size(kind)
         if size is not None:
             self._take(size * count)
@@ -86,7 +86,7 @@ class _Reader:
         self._left = left
 
     def _size(self, kind: str) -> int | None:
-        """The bytes of each value of a type; None where they differ."""
+        """Return the bytes of each value of a type; None if they differ."""
         if kind in PRIMITIVES:
             return PRIMITIVES[kind][1]
         if kind == "string":
@@ -130,7 +130,7 @@ class _Reader:
 
 
 class _CutError(Exception):
-    """The end came inside a value; `value` is what there was of it."""
+    """The bytes end inside a value; `value` is the part that was read."""
 
     def __init__(self, value: Any) -> None:
         super().__init__()
@@ -138,17 +138,17 @@ class _CutError(Exception):
 
 
 def read_bytes(data: bytes) -> str:
-    """The first of them as hexadecimal digits, and how many more there are."""
+    """Return the first bytes as hexadecimal digits, and how many more there are."""
     return data[:MOST_BYTES].hex() + _more(len(data) - MOST_BYTES)
 
 
 def _more(count: int) -> str:
-    """How many elements, bytes or characters are left out."""
+    """Return the note on omitted elements, bytes or characters."""
     return f"{CUT} {count} more" if count > 0 else ""
 
 
 def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, Any] | None:
-    """The fields of a message of the type `name` as far as `data` goes; None if the type is not known."""
+    """Return the fields of a message of the type `name` as far as `data` goes; None if the type is not known."""
     try:
         return _Reader(definitions, data).message(name)
     except _CutError as cut:
@@ -159,7 +159,7 @@ def read_fields(definitions: Definitions, name: str, data: bytes) -> dict[str, A
 
 
 class PublisherReader:
-    """Reads the messages of one publisher by the definition in its connection header, which is read once."""
+    """A reader of one publisher's messages, by the definition in its connection header."""
 
     def __init__(self, header: Mapping[str, str]) -> None:
         self.type = header.get("type", "")
@@ -171,7 +171,7 @@ class PublisherReader:
             self._why = f": {str(error)[:300]}"
 
     def read(self, data: bytes) -> tuple[dict[str, Any], str]:
-        """The fields of a message, and why there are none but the first bytes (else empty)."""
+        """Return the fields of a message, and why there are only the first bytes (else empty)."""
         fields = read_fields(self._definitions, self.type, data) if self._definitions is not None else None
         if fields is not None:
             return fields, ""
@@ -184,5 +184,5 @@ def _definitions(kind: str, header: Mapping[str, str]) -> Definitions:
     if not text.strip() and header.get("md5sum") != _OF_NOTHING:
         raise DefinitionError("there is none", kind[:200])
     definitions = Definitions.from_full_text(kind, text)
-    definitions.md5sum(kind)  # all types are there, and none contains itself
+    definitions.md5sum(kind)  # raises if a type is missing or contains itself
     return definitions

@@ -1,15 +1,15 @@
-"""ROS graph names: the one spelling that ROSMaster would act on, or a refusal.
+"""ROS graph names: the spelling that `rosmaster` acts on, or an error.
 
-ROSMaster resolves the names of topics, services, nodes and parameters against the `caller_id`, folds `//` and
-drops a trailing slash, but checks almost no characters. A decision must be made on the name it will act on.
+`rosmaster` resolves the names of topics, services, nodes and parameters against the `caller_id`, folds `//` and drops a
+trailing slash, but checks almost no characters. A decision must be about the name that `rosmaster` acts on.
 
 Invariants:
 
-1. `resolve` returns what ROSMaster's own `resolve_name` makes of the same arguments, or raises.
+1. `resolve` returns the same as `resolve_name` of `rosmaster`, or raises.
 2. A returned name is canonical: it starts with `/`, has no empty segment, and resolves to itself.
-3. Two different returned names are different things to ROSMaster and look different: ASCII only, no control
-   characters. Nothing is repaired or folded but slashes.
-4. A `caller_id` is never resolved by ROSMaster, so it must be canonical as it comes.
+3. Two different returned names mean different things to `rosmaster` and look different: ASCII only, no control
+   characters. Only slashes are normalised.
+4. `rosmaster` never resolves a `caller_id`, so it must already be canonical.
 """
 
 import re
@@ -17,7 +17,7 @@ import re
 from roswire.errors import InvalidNameError, quoted
 
 MAX_NAME_LENGTH = 1024
-"""Characters in one name; the longest that robots use are far below a quarter of it."""
+"""Most characters in one name; the longest names on robots have far less than a quarter of it."""
 
 _NAME = re.compile(r"[A-Za-z/~][A-Za-z0-9_/]*\Z")
 _CANONICAL = re.compile(r"(?:/[A-Za-z0-9_]+)+\Z")
@@ -33,9 +33,9 @@ _SLASHES = re.compile("/{2,}")
 def resolve(name: str, caller_id: str) -> str:
     """Return the canonical global name of the topic, service or node that `name` is for `caller_id`.
 
-    `/a` is global, `~a` private to the caller, `a` relative to the caller's namespace. An empty `caller_id`
-    is the global namespace, as for ROSMaster. Raises `InvalidNameError` for a name outside the ROS grammar,
-    for the global namespace itself, and for a relative name of a caller that has no valid name.
+    `/a` is global, `~a` private to the caller, `a` relative to the caller's namespace. An empty `caller_id` is the
+    global namespace, as for `rosmaster`. Raises `InvalidNameError` for a name outside the ROS grammar, for the global
+    namespace itself, and for a relative name of a caller that has no valid name.
     """
     resolved = _resolve(name, caller_id, _NAME)
     if resolved == "/":
@@ -44,14 +44,14 @@ def resolve(name: str, caller_id: str) -> str:
 
 
 def resolve_namespace(name: str, caller_id: str) -> str:
-    """Like `resolve`, for arguments that may be a whole namespace (`subgraph`): `/` is allowed."""
+    """Resolve an argument that may be a whole namespace (`subgraph`): like `resolve`, but `/` is allowed."""
     return _resolve(name, caller_id, _NAME)
 
 
 def resolve_parameter(name: str, caller_id: str) -> str:
-    """Like `resolve_namespace`, for parameter keys: their segments may hold printable ASCII as YAML keys do.
+    """Resolve a parameter key: like `resolve_namespace`, but segments may hold printable ASCII as YAML keys do.
 
-    Not allowed are `~` (but in front), `*`, `?`, quotes, backslash, and spaces at the ends of a segment.
+    Not allowed are `~` (except in front), `*`, `?`, quotes, backslash, and spaces at the ends of a segment.
     """
     return _resolve(name, caller_id, _PARAMETER)
 
@@ -67,7 +67,7 @@ def check_caller_id(caller_id: str) -> str:
 
 
 def check_tool_id(caller_id: str) -> str:
-    """Like `check_caller_id`, for callers that are no nodes: `rosparam` calls itself `/rosparam-4711`."""
+    """Check the id of a caller that need not be a node, such as `/rosparam-4711`."""
     if _TOOL.match(caller_id) is None or len(caller_id) > MAX_NAME_LENGTH:
         return check_caller_id(caller_id)
     return caller_id
@@ -133,7 +133,5 @@ def _refusal(name: str, grammar: re.Pattern[str]) -> str:
             )
             return f"name {quoted(name)}: character {position + 1} is {character!a}; allowed are {allowed}"
     if grammar is _PARAMETER:
-        return (
-            f"name {quoted(name)}: '~' stands in front only, and no part of a key starts or ends with a space"
-        )
-    return f"name {quoted(name)}: a ROS name starts with a letter, '/' or '~', and '~' stands nowhere else"
+        return f"name {quoted(name)}: '~' is only allowed first, and no part of a key starts or ends with a space"
+    return f"name {quoted(name)}: a ROS name starts with a letter, '/' or '~', and '~' is allowed only there"

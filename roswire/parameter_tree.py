@@ -1,4 +1,4 @@
-"""The tree of parameters as ROSMaster has it: what stands at a key, and in the way of one."""
+"""The parameter tree as in `rosmaster`: lookups by key, and values that block a key."""
 
 from collections.abc import Iterator
 from functools import lru_cache
@@ -10,19 +10,19 @@ Tree = dict[str, Value]
 
 @lru_cache(256)
 def parts_of(key: str) -> tuple[str, ...]:
-    """The segments of a key; whoever sets it asks for them again and again."""
+    """Return the segments of a key; cached, because setters call it often."""
     return tuple([part for part in key.split("/") if part])
 
 
 def holds_others(value: Value) -> bool:
-    """Whether a value is a namespace with something in it: whose rights are asked, too."""
+    """Whether a value is a namespace with keys, for which rights are also needed."""
     return isinstance(value, dict) and bool(value)
 
 
 def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
-    """What `key` (canonical) has, None for nothing; and its parent that has a value and is no namespace, if any.
+    """Return the value at a canonical `key` (or None), and the name of a parent that is a value (or None).
 
-    Such a parent is in the way: ROSMaster replaces it by a namespace when something below it is set.
+    `rosmaster` replaces such a parent by a namespace when a key below it is set.
     """
     node: Value = tree
     passed = ""
@@ -37,9 +37,9 @@ def standing_at(tree: Tree, key: str) -> tuple[Value, str | None]:
 
 
 def names_in(tree: Tree, above: str = "/") -> Iterator[str]:
-    """The names of all values in a tree that stands at `above`, as ROSMaster tells them; a namespace is none.
+    """Yield the names of all values in a tree at `above`, as `rosmaster` lists them; namespaces are not listed.
 
-    A key of a dictionary may begin with `/` or `~`: ROSMaster tells it as it is.
+    A key of a dictionary may begin with `/` or `~`: `rosmaster` lists it unchanged.
     """
     for key, value in tree.items():
         name = key if key.startswith(("/", "~")) else above + key

@@ -1,11 +1,13 @@
 """The definitions that ROS Noetic ships: messages from the type store of `rosbags`, and the common services.
 
-The store has no services, no messages of actions, and not the message of `/tf`; the common ones are written here.
+The store lacks services, the messages of actions, and the message of `/tf`; the common ones are written here. The
+definitions of mavros_msgs are in `mavros`.
 """
 
 from rosbags.typesys import Stores, get_typestore
 
 from roswire.definitions import Definitions
+from roswire.mavros import MAVROS
 
 _ADDITIONAL = {
     "std_srvs/Empty.srv": "---\n",
@@ -69,15 +71,15 @@ _ACTIONS = {
     ),
     "control_msgs/GripperCommand": ("GripperCommand command\n", _GRIPPER, _GRIPPER),
 }
-"""Goal, result and feedback of actions; `actionlib` sends them in messages that are made of these."""
+"""Goal, result and feedback of actions; the messages that `actionlib` sends are made from these."""
 
-_NOT_ROS_1 = "builtin_interfaces"  # the store keeps `time` and `duration` as messages of ROS 2
+_NOT_ROS_1 = "builtin_interfaces"  # where the store has `time` and `duration`, as messages of ROS 2
 
 
 def standard_definitions() -> Definitions:
     """Return the definitions of ROS's own message packages and services."""
     store = get_typestore(Stores.ROS1_NOETIC)
-    files = _ADDITIONAL | _messages_of_actions()
+    files = _ADDITIONAL | MAVROS | _messages_of_actions()
     for name in store.fielddefs:
         package, _, type_name = name.split("/")
         if package != _NOT_ROS_1:
@@ -86,7 +88,7 @@ def standard_definitions() -> Definitions:
 
 
 def _messages_of_actions() -> dict[str, str]:
-    """The messages that genaction makes of each action."""
+    """Return the messages that genaction makes of each action."""
     files = {}
     for name, parts in _ACTIONS.items():
         short = name.partition("/")[2]

@@ -6,10 +6,10 @@ for an error, whose text is the body. All lengths are little-endian and of 32 bi
 
 Invariants:
 
-1. A length is checked against its limit, and a field's against its header, before any byte of it is kept.
+1. A length is checked against its limit, and a field's also against its header, before any byte of the data is kept.
 2. A header that is accepted has each field once, and every field has a name.
-3. Header text is UTF-8. Only `message_definition` may hold other bytes (roscpp copies comments as they stand
-   in the `.msg` file); they survive decoding and encoding as surrogate escapes.
+3. Header text is UTF-8. Only `message_definition` may hold other bytes (roscpp copies comments
+   unchanged); they survive decoding and encoding as surrogate escapes.
 """
 
 import struct
@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from roswire.errors import LimitExceededError, ProtocolError
 
 HEADER_LIMIT = 65536
-"""Bytes in one connection header; the largest message definitions of MoveIt fill about half of it."""
+"""Most bytes in one connection header; the largest message definitions of MoveIt fill about half of it."""
 
 MESSAGE_LIMIT = 256 << 20
-"""Bytes in one message, request or response."""
+"""Most bytes in one message, request or response."""
 
 _LENGTH = struct.Struct("<I")
 _ANY_BYTES = frozenset({"message_definition"})
@@ -36,7 +36,7 @@ def encode_header(fields: Mapping[str, str]) -> bytes:
 
 
 def encode_frame(body: bytes | bytearray | memoryview) -> bytes:
-    """Write one message, service request or response: its length and itself."""
+    """Write one message, service request or response: its length, then its bytes."""
     return _LENGTH.pack(len(body)) + body
 
 
@@ -51,7 +51,7 @@ def encode_service_error(text: str) -> bytes:
 
 
 def decode_header(body: bytes) -> dict[str, str]:
-    """Parse the fields of a connection header, its own length already taken off; raises `ProtocolError`."""
+    """Parse the fields of a connection header without its length; raises `ProtocolError`."""
     fields: dict[str, str] = {}
     position = 0
     while position < len(body):
@@ -75,9 +75,9 @@ def decode_header(body: bytes) -> dict[str, str]:
 
 
 class HeaderParser:
-    """Takes bytes as they arrive until the connection header is whole; what follows it is in `rest`.
+    """A parser of one connection header, from bytes as they arrive; the bytes after it are in `rest`.
 
-    `limit` is the largest header, in bytes, that is accepted.
+    `limit` is the most bytes of a header that is accepted.
     """
 
     def __init__(self, limit: int = HEADER_LIMIT) -> None:
@@ -115,7 +115,7 @@ class HeaderParser:
 
 
 class FrameParser:
-    """Takes bytes as they arrive and returns whole frames (service requests); `limit` is in bytes each."""
+    """A parser of frames (messages, service requests), from bytes as they arrive, each of at most `limit` bytes."""
 
     def __init__(self, limit: int = MESSAGE_LIMIT) -> None:
         self._limit = limit
@@ -148,7 +148,7 @@ class ServiceReply:
 
 
 class ServiceReplyParser:
-    """Takes bytes as they arrive and returns whole service replies; `limit` is in bytes each."""
+    """A parser of service replies, from bytes as they arrive, each of at most `limit` bytes."""
 
     def __init__(self, limit: int = MESSAGE_LIMIT) -> None:
         self._limit = limit
@@ -157,7 +157,7 @@ class ServiceReplyParser:
     def feed(self, data: bytes) -> list[ServiceReply]:
         """Take `data`; return the replies that are complete now.
 
-        Raises `ProtocolError` when the first byte is neither 0 nor 1, `LimitExceededError` for the length.
+        Raises `ProtocolError` if the first byte is neither 0 nor 1, and `LimitExceededError` for the length.
         """
         buffer = self._buffer
         buffer += data

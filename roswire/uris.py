@@ -1,9 +1,8 @@
 """Node API URIs (`http://host:port/`) and service URIs (`rosrpc://host:port`), as nodes announce them.
 
-Invariants: the host is a host name, an IPv4 address or an IPv6 address and nothing else; the port is there and
-between 1 and 65535; there is no user info, query or fragment. What two parsers could read in two ways is refused.
-rospy writes an IPv6 address without brackets (`http://::1:4000/`): as the port is always there, it is what follows
-the last colon.
+Invariants: the host is a host name, an IPv4 address or an IPv6 address; the port is given and between 1 and 65535;
+there is no user info, query or fragment. A URI that two parsers could read differently is rejected. rospy writes an
+IPv6 address without brackets (`http://::1:4000/`): the port follows the last colon.
 """
 
 import ipaddress
@@ -14,7 +13,7 @@ from functools import lru_cache
 from roswire.errors import InvalidUriError, quoted
 
 MAX_URI_LENGTH = 1024
-"""Characters in one URI."""
+"""Most characters in one URI."""
 
 _URI = re.compile(
     r"(?P<scheme>[A-Za-z][A-Za-z0-9+.-]*)://"
@@ -34,7 +33,7 @@ class NodeUri:
     path: str
 
 
-@lru_cache(4096)  # a node says its own with every call
+@lru_cache(4096)  # a node sends its own URI with every call
 def parse_node_uri(text: str) -> NodeUri:
     """Parse the URI of a node's XML-RPC API; raises `InvalidUriError`."""
     return _parse(text, "http", "node API", "http://host:port/")

@@ -1,23 +1,23 @@
-"""XML-RPC as ROS 1 speaks it, without I/O: requests and answers from bytes, under limits, and to bytes.
+"""XML-RPC as ROS 1 uses it, without I/O: parse requests and answers under limits, and build them.
 
-Nothing that was received is sent on as bytes: it is parsed into values (`reader`, and `usual` for what is plain),
-decided on, and written afresh (`writer`).
+Received bytes are never forwarded: they are parsed into values (`xmlrpc_reader`, or `common_documents` for simple
+documents), decided on, and encoded again (`xmlrpc_writer`).
 """
 
 from dataclasses import dataclass
 
 from roswire.errors import LimitExceededError, PeerError, ProtocolError
-from roswire.xmlrpc.common_documents import usual_answer, usual_call
-from roswire.xmlrpc.xmlrpc_reader import Document
-from roswire.xmlrpc.xmlrpc_values import DEFAULT_LIMITS, Limits, Value
+from roswire.xmlrpc.common_documents import read_common_answer, read_common_call
+from roswire.xmlrpc.xmlrpc_reader import XmlRpcDocument
+from roswire.xmlrpc.xmlrpc_values import DEFAULT_LIMITS, Value, XmlRpcLimits
 from roswire.xmlrpc.xmlrpc_writer import build_call, build_fault, build_response
 
 __all__ = [
     "DEFAULT_LIMITS",
     "FaultReceived",
-    "Limits",
     "MethodCall",
     "Value",
+    "XmlRpcLimits",
     "build_call",
     "build_fault",
     "build_response",
@@ -28,14 +28,14 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class MethodCall:
-    """A request: the name of the method, as it came, and its parameters."""
+    """A request: the name of the method as received, and its parameters."""
 
     method: str
     params: tuple[Value, ...]
 
 
 class FaultReceived(PeerError):  # noqa: N818 - named as the event it is: the answer was a fault
-    """The answer was a fault: the method could not be carried out."""
+    """The answer was a fault: the method failed."""
 
     def __init__(self, code: int, text: str) -> None:
         super().__init__(f"fault {code}: {text}")
@@ -43,13 +43,13 @@ class FaultReceived(PeerError):  # noqa: N818 - named as the event it is: the an
         self.text = text
 
 
-def parse_call(body: bytes, limits: Limits = DEFAULT_LIMITS) -> MethodCall:
+def parse_call(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> MethodCall:
     """Parse a request; raises `ProtocolError` or `LimitExceededError`."""
-    usual = usual_call(body, limits)
-    if usual is None:
-        document = Document(body, limits, "methodCall")
-        usual = document.method, document.values
-    method, params = usual
+    parsed = read_common_call(body, limits)
+    if parsed is None:
+        document = XmlRpcDocument(body, limits, "methodCall")
+        parsed = document.method, document.values
+    method, params = parsed
     if method == "system.multicall" and params:
         parts = params[0]
         if isinstance(parts, list) and len(parts) > limits.parts:
@@ -59,12 +59,12 @@ def parse_call(body: bytes, limits: Limits = DEFAULT_LIMITS) -> MethodCall:
     return MethodCall(method, tuple(params))
 
 
-def parse_response(body: bytes, limits: Limits = DEFAULT_LIMITS) -> Value:
+def parse_response(body: bytes, limits: XmlRpcLimits = DEFAULT_LIMITS) -> Value:
     """Parse an answer; raises `FaultReceived` if it is a fault, `ProtocolError` or `LimitExceededError`."""
-    usual = usual_answer(body, limits)
-    if usual is not None:
-        return usual
-    document = Document(body, limits, "methodResponse")
+    parsed = read_common_answer(body, limits)
+    if parsed is not None:
+        return parsed
+    document = XmlRpcDocument(body, limits, "methodResponse")
     if len(document.values) != 1:
         raise ProtocolError(f"answer with {len(document.values)} values; it has one")
     value = document.values[0]

@@ -1,9 +1,9 @@
-"""Reading the documents that a ROS network is full of: names, numbers and lists of them, as its clients write them.
+"""Read common documents fast: names, numbers and lists of them, as ROS clients write them.
 
-One pattern has the whole document, or each part of a multicall, where `reader` walks through its elements. It takes
-nothing that `reader` would not take, and as the same values; what it does not know, whatever may be in it, is left to
-`reader`, which also has all errors. A part that is another struct is left to it alone: one long text among thousands of
-parameters costs no other. Texts are printable ASCII without a character that means something in XML.
+One pattern matches the whole document, or each part of a multicall, while `xmlrpc_reader` visits its elements. It
+accepts a subset of what `xmlrpc_reader` accepts, with the same values. Other documents, and all errors, are left to
+`xmlrpc_reader`. So is a single complex part of a multicall, which therefore does not slow the others. Strings are
+printable ASCII without characters that XML escapes.
 """
 
 import re
@@ -11,13 +11,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from roswire.errors import PeerError, ProtocolError
-from roswire.xmlrpc.xmlrpc_reader import Document
-from roswire.xmlrpc.xmlrpc_values import Limits, Value
+from roswire.xmlrpc.xmlrpc_reader import XmlRpcDocument
+from roswire.xmlrpc.xmlrpc_values import Value, XmlRpcLimits
 
-_LONGEST = 32 << 10  # bytes that one pattern has
-_MOST_ALONE = 256  # parts that are walked alone: if all are, that takes twice as long as one walk
+_LONGEST = 32 << 10  # bytes for one pattern
+_MOST_ALONE = 256  # parts that are read one by one: if all are, that takes twice as long as one pass
 _SMALLEST = len("<value></value>")
-# Of two stars that can take the same byte one gives nothing back (`*+`): time is linear in the document.
+# If two stars can match the same byte, one is possessive (`*+`), so time is linear in the document.
 _SPACE = rb"[ \t\r\n]*+"
 _TEXT = rb"[ -%'-;=?-~]*+"
 _INTEGER = rb"-?[0-9]{1,9}"
@@ -25,7 +25,7 @@ _DOUBLE = rb"-?[0-9]++(?:\.[0-9]++)?(?:e[-+]?[0-9]++)?"
 
 
 def _scalar(group: bytes = b"(?:") -> bytes:
-    """A scalar; what begins the group of each kind of content."""
+    """Return the pattern of a scalar; `group` begins the name of the group for each kind of content."""
     kinds = (
         (b"string", _TEXT), (b"int", _INTEGER), (b"i4", _INTEGER), (b"boolean", b"[01]"), (b"double", _DOUBLE)
     )  # fmt: skip
@@ -44,7 +44,7 @@ def _spaced(*parts: bytes) -> re.Pattern[bytes]:
 
 
 def _list_in(group: bytes) -> bytes:
-    """A list of scalars whose last may be such a list; what begins a group of each."""
+    """Return the pattern of a list of scalars whose last may be such a list; `group` begins the name of each group."""
     each = group + _EACH + b")"
     return _ARRAY + each + b"(?:" + _ARRAY + each + _END + b")?" + _END
 
@@ -79,8 +79,10 @@ _ALONE = b"<methodResponse><params><param>%b</param></params></methodResponse>"
 _STRUCT_END = re.compile(b"</struct>" + _SPACE + b"</value>" + _SPACE)
 
 
-def usual_call(body: bytes, limits: Limits) -> tuple[str, list[Value]] | None:
-    """The method and the parameters of a call, if they are scalars, or those of all parts of a multicall; else None."""
+def read_common_call(body: bytes, limits: XmlRpcLimits) -> tuple[str, list[Value]] | None:
+    """Return the method and the parameters of a call if they are scalars, or those of all parts of a multicall; else
+    None.
+    """
     if not _fits(body, limits):
         return None
     found = _CALL.match(body) if len(body) <= _LONGEST else None
@@ -90,8 +92,8 @@ def usual_call(body: bytes, limits: Limits) -> tuple[str, list[Value]] | None:
     return None if calls is None else ("system.multicall", [calls])
 
 
-def usual_answer(body: bytes, limits: Limits) -> list[Value] | None:
-    """The answer, if it is a list of scalars whose last may be such a list, or several of a multicall's."""
+def read_common_answer(body: bytes, limits: XmlRpcLimits) -> list[Value] | None:
+    """Return the answer, if it is a list of scalars whose last may be such a list, or several of a multicall's."""
     if not _fits(body, limits):
         return None
     found = _ANSWER.match(body) if len(body) <= _LONGEST else None
@@ -102,11 +104,11 @@ def usual_answer(body: bytes, limits: Limits) -> list[Value] | None:
 
 def _several(
     body: bytes,
-    limits: Limits,
+    limits: XmlRpcLimits,
     patterns: tuple[re.Pattern[bytes], re.Pattern[bytes], re.Pattern[bytes]],
     read: Callable[[re.Match[bytes]], Value],
 ) -> list[Value] | None:
-    """The parts of a document, if there is one at least and nothing else between its head and its end."""
+    """Return the parts of a document, if it has at least one and nothing else between head and end."""
     head, part, end = patterns
     found = head.match(body)
     if found is None:
@@ -123,10 +125,10 @@ def _several(
     return values if left else None
 
 
-def _struct(body: bytes, begin: int, limits: Limits) -> tuple[Value, int]:
-    """The struct that begins here, as `reader` has it, and where it ends. Raises `PeerError` where there is none.
+def _struct(body: bytes, begin: int, limits: XmlRpcLimits) -> tuple[Value, int]:
+    """Return the struct that begins here, as `reader` returns it, and its end. Raises `PeerError` if there is none.
 
-    What is one value in a document that has nothing else is one value in any place, a level deeper.
+    A value that is valid alone in a document is also valid in any other position, one level deeper.
     """
     depth, end = 0, None
     for tag in _STRUCT_TAG.finditer(body, begin) if body.startswith(_STRUCT, begin) else ():
@@ -137,7 +139,7 @@ def _struct(body: bytes, begin: int, limits: Limits) -> tuple[Value, int]:
     if end is None:
         raise ProtocolError("no struct")
     alone = _ALONE % body[begin : end.end()]
-    values = Document(alone, replace(limits, depth=limits.depth - 1), "methodResponse").values
+    values = XmlRpcDocument(alone, replace(limits, depth=limits.depth - 1), "methodResponse").values
     if len(values) != 1:
         raise ProtocolError("not one struct")
     return values[0], end.end()
@@ -151,8 +153,8 @@ def _answer(part: re.Match[bytes]) -> Value:
     return [_list(*part.groups())]
 
 
-def _fits(body: bytes, limits: Limits) -> bool:
-    """Whether a document is so short that nothing in it is beyond the limits."""
+def _fits(body: bytes, limits: XmlRpcLimits) -> bool:
+    """Whether a document is so short that nothing in it can exceed the limits."""
     return len(body) <= min(limits.body, limits.string, _SMALLEST * limits.elements) and limits.depth > 3
 
 

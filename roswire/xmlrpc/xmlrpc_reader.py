@@ -1,16 +1,16 @@
-"""Reading an XML-RPC document: bytes to values under limits.
+"""Parse an XML-RPC document into values, under limits.
 
-Reading is a walk over one table, `_GRAMMAR`: what may stand in which element, in which order. Elements,
-attributes, text between elements and values that the table or XML-RPC do not know are refused. Beside the
-specification it takes what ROS clients send: values without a type (strings; XmlRpc++), `<nil/>`, `inf` and
-`nan`, space around numbers, CDATA sections (rosnodejs), the extensions of Apache XML-RPC (rosjava).
+The parser follows one table, `_GRAMMAR`: the elements that each element may contain, in order. Unknown elements and
+attributes, text between elements, and invalid values are rejected. Beyond the specification it accepts what ROS
+clients send: values without a type (strings; XmlRpc++), `<nil/>`, `inf` and `nan`, space around numbers, CDATA
+sections (rosnodejs), the extensions of Apache XML-RPC (rosjava).
 
 Invariants:
 
-1. The document starts with an optional XML declaration and the root element. So there is no document type,
-   hence no entity but the five of XML, no external reference; processing instructions are refused anywhere.
-2. One pass in time linear in the body; only values are kept; their number, depth and size are bounded.
-3. Every error is a `PeerError`, with the byte where it was seen.
+1. The document starts with an optional XML declaration and the root element. There is no document type, so only the
+   five entities of XML exist and no external reference. Processing instructions are rejected.
+2. One pass takes time linear in the body, and keeps only values; their number, depth and size are bounded.
+3. Every error is a `PeerError` with its byte offset.
 """
 
 import binascii
@@ -20,7 +20,7 @@ from datetime import datetime
 from xml.parsers import expat
 
 from roswire.errors import LimitExceededError, ProtocolError
-from roswire.xmlrpc.xmlrpc_values import Limits, Value
+from roswire.xmlrpc.xmlrpc_values import Value, XmlRpcLimits
 
 _HEAD = re.compile(
     rb"(?:\xef\xbb\xbf)?"
@@ -28,7 +28,7 @@ _HEAD = re.compile(
     rb"(?:[ \t\r\n]+encoding[ \t\r\n]*=[ \t\r\n]*['\"]([A-Za-z0-9._-]{1,40})['\"])?"
     rb"(?:[ \t\r\n]+standalone[ \t\r\n]*=[ \t\r\n]*['\"](?:yes|no)['\"])?[ \t\r\n]*\?>)?"
     rb"[ \t\r\n]*<([A-Za-z]{1,40})"
-    # rosjava (Apache XML-RPC) declares its extensions always
+    # rosjava (Apache XML-RPC) always declares its extensions
     rb"(?:[ \t\r\n]+xmlns:ex=['\"]http://ws\.apache\.org/xmlrpc/namespaces/extensions['\"])?[ \t\r\n]*>"
 )
 _ENCODINGS = frozenset({b"utf-8", b"us-ascii", b"iso-8859-1"})
@@ -39,8 +39,8 @@ _SCALARS = ("i4", "int", "boolean", "double", "string", "dateTime.iso8601", "bas
             "ex:i1", "ex:i2", "ex:i8", "ex:float", "ex:nil")  # fmt: skip
 _TYPES = (*_SCALARS, "array", "struct")
 
-# Inside an element that is in this state, which child may start, and the state the element is in after it.
-# An element starts in the state of its own name.
+# For each state of an element: which child may start, and the element's state after it. An element starts in the state
+# of its own name.
 _GRAMMAR: Mapping[str, Mapping[str, str]] = {
     "document": {"methodCall": "full", "methodResponse": "full"},
     "methodCall": {"methodName": "methodCall, named"},
@@ -66,7 +66,7 @@ _INCOMPLETE = frozenset(
 
 _INTEGER = re.compile(r"[ \t\r\n]*([+-]?[0-9]{1,20})[ \t\r\n]*\Z")
 _DOUBLE = re.compile(
-    # Only one part can take a digit: two that both can try every way to share them out, quadratic in the digits.
+    # Only one part can match a digit: two such parts would try every split, quadratic in the digits.
     r"[ \t\r\n]*([+-]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|inf|infinity|nan))[ \t\r\n]*\Z",
     re.IGNORECASE | re.ASCII,
 )
@@ -78,20 +78,20 @@ _PIECE = 64 << 10  # bytes given to expat at once
 _NO_SPACE = str.maketrans("", "", _SPACE)
 
 
-class Document:
-    """One document while it is read; afterwards `method`, `values` and `is_fault` are what was in it."""
+class XmlRpcDocument:
+    """One document while it is read; afterwards `method`, `values` and `is_fault` have its contents."""
 
     __slots__ = ("_depth", "_elements", "_expat", "_follow", "_keys", "_limits", "_stack", "_state", "_text",
                  "_value", "is_fault", "method", "values")  # fmt: skip
 
-    def __init__(self, body: bytes, limits: Limits, root: str) -> None:
+    def __init__(self, body: bytes, limits: XmlRpcLimits, root: str) -> None:
         _check_head(body, limits, root)
         self.method = ""
         self.values: list[Value] = []
         self.is_fault = False
         self._limits = limits
         self._state = "document"
-        self._follow: list[str] = []  # the state each open element's parent goes on in
+        self._follow: list[str] = []  # the next state of each open element's parent
         self._text: list[str] = []
         self._value: Value = None  # the value that ended last
         self._stack: list[list[Value] | dict[str, Value]] = [self.values]  # open arrays and structs
@@ -115,11 +115,11 @@ class Document:
             del self._expat  # the parser refers to this object: no cycle is left behind
 
     def _parse(self, body: bytes) -> None:
-        """Feed the parser in pieces, and refuse a tag that is longer than one.
+        """Feed the parser in pieces, and reject a tag that is longer than a piece.
 
-        When a handler raises, expat still goes through the rest of its piece and keeps a stack of the
-        elements it sees there. A tag that a piece does not end is looked at again with the next one, and its
-        attributes are collected. Small pieces and short tags bound all three.
+        When a handler raises, expat still goes through the rest of its piece and keeps a stack of the elements there.
+        An unfinished tag is scanned again with the next piece, and its attributes are collected. Small pieces and short
+        tags bound all three.
         """
         parser = self._expat
         if len(body) <= _PIECE:
@@ -253,7 +253,7 @@ class Document:
         return self._state if self._state != "full" else "an element that is complete"
 
     def _pass_space(self) -> None:
-        """Between elements there is nothing else; ROS clients write a line feed."""
+        """Skip whitespace, which alone may be between elements; ROS clients write a line feed."""
         if self._text != _LINE_FEED:
             text = "".join(self._text).strip(_SPACE)
             if text:
@@ -267,26 +267,26 @@ class Document:
         return ProtocolError(f"not XML-RPC at byte {self._expat.CurrentByteIndex}: {what}")
 
 
-_READ: Mapping[str, Callable[[Document], Value]] = {
-    "string": Document._string,
-    "int": Document._integer,
-    "i4": Document._integer,
-    "boolean": Document._boolean,
-    "double": Document._double,
-    "dateTime.iso8601": Document._date_time,
-    "base64": Document._base64,
-    "nil": Document._nil,
-    "ex:i1": Document._integer,
-    "ex:i2": Document._integer,
-    "ex:i8": Document._integer,
-    "ex:float": Document._double,
-    "ex:nil": Document._nil,
-    "name": Document._member_name,
-    "methodName": Document._method_name,
+_READ: Mapping[str, Callable[[XmlRpcDocument], Value]] = {
+    "string": XmlRpcDocument._string,
+    "int": XmlRpcDocument._integer,
+    "i4": XmlRpcDocument._integer,
+    "boolean": XmlRpcDocument._boolean,
+    "double": XmlRpcDocument._double,
+    "dateTime.iso8601": XmlRpcDocument._date_time,
+    "base64": XmlRpcDocument._base64,
+    "nil": XmlRpcDocument._nil,
+    "ex:i1": XmlRpcDocument._integer,
+    "ex:i2": XmlRpcDocument._integer,
+    "ex:i8": XmlRpcDocument._integer,
+    "ex:float": XmlRpcDocument._double,
+    "ex:nil": XmlRpcDocument._nil,
+    "name": XmlRpcDocument._member_name,
+    "methodName": XmlRpcDocument._method_name,
 }
 
 
-def _check_head(body: bytes, limits: Limits, root: str) -> None:
+def _check_head(body: bytes, limits: XmlRpcLimits, root: str) -> None:
     if len(body) > limits.body:
         raise LimitExceededError(f"body of {len(body)} bytes; at most {limits.body} are allowed")
     head = _HEAD.match(body)

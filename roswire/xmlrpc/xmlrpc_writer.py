@@ -1,8 +1,7 @@
-"""Writing XML-RPC documents in the notation of Python's `xmlrpc.client`, which every ROS client reads.
+"""Build XML-RPC documents in the notation of Python's `xmlrpc.client`, which every ROS client reads.
 
-A value that was read has one notation, and what is written is read back as the same value by us, by rosmaster
-and rospy and, but for `\\r`, by roscpp (XmlRpc++ knows no character references). What XML-RPC or ROS has no
-notation for is an `EncodingError`.
+A parsed value has one notation. This module's output is read back as the same value here, by `rosmaster` and rospy and,
+except for `\\r`, by roscpp (XmlRpc++ knows no character references). Values without a notation raise `EncodingError`.
 """
 
 import binascii
